@@ -1,0 +1,53 @@
+"""Poses, boxes and polylines. Pure array functions; batch dimensions come first.
+
+A pose is [..., 3]: x and y in metres, heading in radians counter-clockwise from +x.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+
+def wrap_angle(angle_rad: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Bring angles to [-pi, pi)."""
+    turn = angle_rad.dtype.type(2 * np.pi)
+    half = angle_rad.dtype.type(np.pi)
+    wrapped = (angle_rad + half) % turn - half
+    # Rounding may lift an angle just below -pi to exactly +pi.
+    return np.where(wrapped >= half, -half, wrapped)
+
+
+def rotate(
+    xy_m: Float[np.ndarray, "... 2"], angle_rad: Float[np.ndarray, "..."]
+) -> Float[np.ndarray, "... 2"]:
+    """Turn points counter-clockwise about the origin."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    x_m, y_m = xy_m[..., 0], xy_m[..., 1]
+    return np.stack([cos * x_m - sin * y_m, sin * x_m + cos * y_m], axis=-1)
+
+
+def to_local(
+    pose: Float[np.ndarray, "... 3"], frame: Float[np.ndarray, "... 3"]
+) -> Float[np.ndarray, "... 3"]:
+    """Express world poses in the frame of other poses. Inverse of ``to_world``."""
+    xy_m = rotate(pose[..., :2] - frame[..., :2], -frame[..., 2])
+    heading_rad = wrap_angle(pose[..., 2] - frame[..., 2])
+    return np.concatenate([xy_m, heading_rad[..., None]], axis=-1)
+
+
+def to_world(
+    pose: Float[np.ndarray, "... 3"], frame: Float[np.ndarray, "... 3"]
+) -> Float[np.ndarray, "... 3"]:
+    """Bring poses given in the frame of other poses to the world."""
+    xy_m = rotate(pose[..., :2], frame[..., 2]) + frame[..., :2]
+    heading_rad = wrap_angle(pose[..., 2] + frame[..., 2])
+    return np.concatenate([xy_m, heading_rad[..., None]], axis=-1)
+
+
+def box_corners(
+    pose: Float[np.ndarray, "... 3"], size_lw_m: Float[np.ndarray, "... 2"]
+) -> Float[np.ndarray, "... 4 2"]:
+    """Corners [..., 4, 2] of boxes, counter-clockwise from front left."""
+    signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]], dtype=pose.dtype) / 2
+    local_m = size_lw_m[..., None, :] * signs  # [..., corner, 2]
+    turned_m = rotate(local_m, np.broadcast_to(pose[..., None, 2], local_m.shape[:-1]))
+    return turned_m + pose[..., None, :2]

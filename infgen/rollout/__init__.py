@@ -1,0 +1,1 @@
+"""Weights and a first second to a played future."""

@@ -1,0 +1,149 @@
+"""What the model reads of a scene: agents as tokens, newcomers, roads, and the stream.
+
+The agent matrix has one row per kept agent and one column per half-second token; a token's
+pose is the pose at its end. ``Presence`` says what each cell of the matrix is.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int8, Int16, Int32, UInt8
+
+NO_MOVE = -1
+"""Move of a token at which the agent is absent or not observed."""
+FIRST_MOVE = -2
+"""Move of the token at which an agent enters (the paper's BOS)."""
+NO_CELL = -1
+"""Cell of an absent agent, or of one outside the grid."""
+
+
+class Presence(IntEnum):
+    """Where an agent is in its life."""
+
+    ABSENT = 0
+    PRESENT = 1
+    ENTERING = 2
+    LEAVING = 3
+
+
+class SignalClass(IntEnum):
+    """Signal states merged to what a driver does about them."""
+
+    STOP = 0
+    GO = 1
+    CAUTION = 2
+    UNKNOWN = 3
+    NO_SIGNAL = 4
+
+
+class Word(IntEnum):
+    """Kinds of token in the interleaved stream."""
+
+    MOVE = 0
+    STAY = 1
+    LEAVE = 2
+    ADD = 3
+    CELL = 4
+    HEADING = 5
+    KIND = 6
+    BEGIN_MOTION = 7
+
+
+@dataclass(frozen=True, slots=True)
+class SceneTokens:
+    """One tokenized scene.
+
+    World frame of the scene (its local origin). Token ``now`` ends at the last step of the
+    history.
+
+    Attributes:
+        scenario_id: Id of the log.
+        origin_xyz_m: World position of the local origin.
+        now: Token that ends at the last step of the history (1 in WOMD).
+        ego: Row of the recording car.
+        track_id: Id of each kept agent's track.
+        kind: ``AgentKind``.
+        size_lwh_m: One box per agent (mean over its observed steps).
+        z_m: Height of the box centre at each token's end; meaningless where absent.
+        pose: Quantised x, y, heading at each token's end; zero where absent.
+        move: Row of the kind's codebook, ``FIRST_MOVE`` or ``NO_MOVE``.
+        presence: ``Presence``.
+        observed: Whether the log shows the agent at both ends of the token; False at
+            ``ENTERING`` (SPEC 3.3).
+        cell: Cell of the ego's grid that holds the agent, or ``NO_CELL``.
+        near: Whether the agent is ever observed within the motion-loss radius of the ego.
+        entry_token: Token at which each newcomer enters, ascending; within a token from
+            near to far. Who enters outside the grid has ``entry_cell`` ``NO_CELL``.
+        entry_agent: Row of the newcomer.
+        entry_offset_m: Position less the cell's centre, in the ego's grid frame.
+        entry_heading: Heading bin relative to the ego.
+        entry_residual_rad: Heading less the bin's centre.
+        road_pose: First point and heading of each road token.
+        road_z_m: Height of its first point.
+        road_token: Row of the map codebook.
+        road_point_kind: Kind of its points (``tokens.roads.PointKind``).
+        road_line_kind: Kind of the polyline it is part of (``tokens.roads.LineKind``).
+        road_line: Index of that polyline; consecutive tokens of one polyline are adjacent.
+        road_signal: ``SignalClass`` of its lane at ``now``.
+        signal_line: Polylines (as in ``road_line``) that ever have a signal.
+        signal_state: ``SignalClass`` of those at each token's end.
+        word: The interleaved stream: ``Word`` ...
+        word_value: ... its value (move, cell, heading bin or kind; else 0) ...
+        word_agent: ... the agent's row (-1 for ``BEGIN_MOTION``) ...
+        word_token: ... and the half second it belongs to.
+        anchor_agent: Rows whose chain of moves starts anew from the log: after a gap, and
+            the ego at its first token. ``anchor_token`` is when, ``anchor_pose`` where.
+    """
+
+    scenario_id: str
+    origin_xyz_m: Float64[np.ndarray, "3"]
+    now: int
+    ego: int
+    track_id: Int32[np.ndarray, " agent"]
+    kind: Int8[np.ndarray, " agent"]
+    size_lwh_m: Float32[np.ndarray, "agent 3"]
+    z_m: Float32[np.ndarray, "agent token"]
+    pose: Float32[np.ndarray, "agent token 3"]
+    move: Int16[np.ndarray, "agent token"]
+    presence: Int8[np.ndarray, "agent token"]
+    observed: Bool[np.ndarray, "agent token"]
+    cell: Int16[np.ndarray, "agent token"]
+    near: Bool[np.ndarray, " agent"]
+    entry_token: Int16[np.ndarray, " entry"]
+    entry_agent: Int16[np.ndarray, " entry"]
+    entry_cell: Int16[np.ndarray, " entry"]
+    entry_offset_m: Float32[np.ndarray, "entry 2"]
+    entry_heading: Int16[np.ndarray, " entry"]
+    entry_residual_rad: Float32[np.ndarray, " entry"]
+    road_pose: Float32[np.ndarray, "road 3"]
+    road_z_m: Float32[np.ndarray, " road"]
+    road_token: Int16[np.ndarray, " road"]
+    road_point_kind: Int8[np.ndarray, " road"]
+    road_line_kind: Int8[np.ndarray, " road"]
+    road_line: Int32[np.ndarray, " road"]
+    road_signal: Int8[np.ndarray, " road"]
+    signal_line: Int32[np.ndarray, " signal"]
+    signal_state: Int8[np.ndarray, "signal token"]
+    word: UInt8[np.ndarray, " word"]
+    word_value: Int16[np.ndarray, " word"]
+    word_agent: Int16[np.ndarray, " word"]
+    word_token: UInt8[np.ndarray, " word"]
+    anchor_agent: Int16[np.ndarray, " anchor"]
+    anchor_token: Int16[np.ndarray, " anchor"]
+    anchor_pose: Float32[np.ndarray, "anchor 3"]
+
+    @property
+    def num_agents(self) -> int:
+        """Number of kept agents."""
+        return int(self.pose.shape[0])
+
+    @property
+    def num_tokens(self) -> int:
+        """Number of half-second tokens."""
+        return int(self.pose.shape[1])
+
+    @property
+    def num_roads(self) -> int:
+        """Number of road tokens."""
+        return len(self.road_token)

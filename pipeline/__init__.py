@@ -1,0 +1,1 @@
+"""Stages, shards and workers. Knows nothing of traffic."""

@@ -1,0 +1,109 @@
+"""What a stage is: how it cuts its work into units, does one, and gathers them.
+
+The engine knows stages only through this file. A stage module (``pipeline/ingest.py`` ...)
+ends in one ``STAGE = Stage(...)``; ``pipeline.stages.STAGES`` lists them.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+Report = dict[str, Any]
+"""Few, JSON-able figures of one unit or of a whole stage."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One input file that no stage made.
+
+    Attributes:
+        url: Local path or fsspec URL.
+        name: File name without folders, unique among the sources.
+        fingerprint: Identity of the content.
+    """
+
+    url: str
+    name: str
+    fingerprint: str
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A piece of a stage's work, done whole or not at all.
+
+    Attributes:
+        name: Unique in its stage, and fit to be part of a file name.
+        inputs: Identities of what it reads, as ``{what: key or fingerprint}``; with the
+            stage's settings and version they make its key.
+        task: What ``work`` needs besides its settings: small and JSON-able.
+    """
+
+    name: str
+    inputs: Mapping[str, str]
+    task: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """A finished unit: its folder on disk and what it reported."""
+
+    name: str
+    key: str
+    path: Path
+    report: Report
+
+
+class Inputs(Protocol):
+    """What a stage may ask of the stages before it."""
+
+    @property
+    def sources(self) -> Sequence[Source]:
+        """Source files, by name."""
+
+    def units(self, stage: str) -> Sequence[Done]:
+        """Finished units of an input stage, by name."""
+
+    def folder(self, stage: str) -> Path:
+        """Finished folder of an input stage (what its ``finish`` wrote)."""
+
+    def key(self, stage: str) -> str:
+        """Key of an input stage."""
+
+
+class Progress(Protocol):
+    """Where long work inside one unit or ``finish`` says how far it is."""
+
+    def __call__(self, done: float, total: float, note: str = "") -> None:
+        """Report so much of so much done, e.g. 300 of 1000 steps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One stage of the pipeline.
+
+    Attributes:
+        name: As in ``stages.yaml`` and on the command line.
+        version: Raised by hand when the code would write different bytes.
+        settings: Settings dataclasses the stage reads, by section of ``stages.yaml``.
+            A stage with one section gets that dataclass as ``settings``; with several, a
+            dictionary of them by section.
+        plan: Cuts the work into units, from finished inputs. No disk writes.
+        work: Does one unit: writes everything below ``target``, which the engine publishes
+            whole; runs on any worker, several times if it must, and writes the same bytes
+            each time. Errors in the data are reported, not raised.
+        finish: Gathers the units into the stage's own folder ``target`` (index, tables).
+        modules: Modules whose code decides the bytes; their hash is recorded.
+        resumes: ``work`` finds what a killed try left below ``target`` and goes on from it.
+        in_driver: Units run in the driver's process, whatever the workers (training).
+    """
+
+    name: str
+    version: int
+    settings: Mapping[str, type]
+    plan: "Callable[[Inputs, Any], Sequence[Unit]]"
+    work: "Callable[[Unit, Path, Any, Progress], Report]"
+    finish: "Callable[[Inputs, Sequence[Done], Path, Any, Progress], Report]"
+    modules: Sequence[str] = field(default=())
+    resumes: bool = False
+    in_driver: bool = False
