@@ -178,6 +178,7 @@ class TrainSettings:
         kind_weight, offset_weight, map_weight: Weights of the loss terms.
         max_agents: Agents per scene that a batch holds (nearest to the ego first).
         max_roads: Road tokens per scene that a batch holds (nearest to the ego first).
+        max_tokens: Half seconds per scene that a batch holds; a part of longer logs.
         checkpoint_every: Steps between checkpoints.
         validate_every: Steps between validation losses; 0 for only at the end.
         validation_scenes: Scenes of the validation loss.
@@ -206,6 +207,7 @@ class TrainSettings:
     map_weight: float = 1.0
     max_agents: int = 128
     max_roads: int = 4096
+    max_tokens: int = 18
     checkpoint_every: int = 500
     validate_every: int = 0
     validation_scenes: int = 64
@@ -222,6 +224,7 @@ class RolloutSettings:
         count: Rollouts per scene.
         scenes: Scenes to play; 0 for all of the split.
         scenes_per_task: Scenes of one unit of work.
+        batch: Rollouts that are played at once.
         insert: Whether agents may enter.
         remove: Whether agents may leave.
         top_moves: Most likely moves that are sampled from.
@@ -236,6 +239,7 @@ class RolloutSettings:
     count: int = 32
     scenes: int = 0
     scenes_per_task: int = 8
+    batch: int = 32
     insert: bool = True
     remove: bool = True
     top_moves: int = 5
@@ -254,11 +258,20 @@ class ScoreSettings:
         stride_s: From one window to the next.
         count_radius_m: Agents within it of the ego are counted; ACE is given for it and for
             no limit.
+        enter_radius_m: For models that neither insert nor remove: who crosses this distance
+            to the ego enters or leaves, and who is beyond it is not there; 0 for never.
+        wosac: Version of the Waymo metric, for the first eight seconds.
+        resamples: Bootstrap resamples of the scenes behind the 95 % intervals.
+        seed: Of the bootstrap.
     """
 
     window_s: float = 8.0
     stride_s: float = 0.5
     count_radius_m: float = 75.0
+    enter_radius_m: float = 0.0
+    wosac: str = "wosac-2025"
+    resamples: int = 1000
+    seed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,16 +297,21 @@ def build(kind: type[T], values: Mapping[str, Any], where: str) -> T:
         ConfigError: naming the key, where it stands, and the nearest real one; or the value
             and the type expected.
     """
-    hints = get_type_hints(kind)
-    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
-    for key in values:
-        if key not in names:
-            near = get_close_matches(key, names, n=1)
-            hint = (
-                f"; did you mean {near[0]!r}?" if near else f"; there is {', '.join(names)}"
-            )
-            raise ConfigError(f"{where}: no setting {key!r}{hint}")
-    return kind(**{k: coerce(v, hints[k], f"{where}.{k}") for k, v in values.items()})
+    return kind(**{key: settle(kind, key, value, where) for key, value in values.items()})
+
+
+def settle(kind: type, key: str, value: Any, where: str) -> Any:
+    """Check one setting and give its value the type of its field.
+
+    Raises:
+        ConfigError: as ``build`` does.
+    """
+    names = [field.name for field in fields(kind)]
+    if key not in names:
+        near = get_close_matches(key, names, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"there is {', '.join(names)}"
+        raise ConfigError(f"{where}: no setting {key!r}; {hint}")
+    return coerce(value, get_type_hints(kind)[key], f"{where}.{key}")
 
 
 def coerce(value: Any, kind: Any, where: str) -> Any:

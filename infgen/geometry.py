@@ -49,5 +49,5 @@ def box_corners(
     """Corners [..., 4, 2] of boxes, counter-clockwise from front left."""
     signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]], dtype=pose.dtype) / 2
     local_m = size_lw_m[..., None, :] * signs  # [..., corner, 2]
-    turned_m = rotate(local_m, np.broadcast_to(pose[..., None, 2], local_m.shape[:-1]))
+    turned_m = rotate(local_m, pose[..., None, 2])
     return turned_m + pose[..., None, :2]

@@ -6,9 +6,10 @@ field laid end to end (``tracks.xyz_m``), and the sizes of every named dimension
 (``dim.agent``). Nothing else is needed to cut the records out again, also from memory maps.
 """
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from functools import cache
 from typing import Any, Generic, NamedTuple, TypeVar, get_type_hints
 
@@ -78,26 +79,66 @@ def pack(records: Sequence[Any], kind: type) -> dict[str, np.ndarray]:
     sizes: dict[str, np.ndarray] = {}
     for leaf in leaves(kind):
         values = [_value(record, leaf) for record in records]
-        dims = leaf.dims if leaf.dims is not None else (f"len({leaf.name})",)
-        if leaf.dims is not None or leaf.kind is str:
-            _note_sizes(sizes, leaf.name, dims, values)
+        _note_sizes(sizes, leaf.name, _dims(leaf), values)
         flat = [value.reshape(-1) for value in values]
         columns[leaf.name] = np.concatenate([np.empty(0, leaf.dtype), *flat])
     return {**{f"dim.{dim}": size for dim, size in sizes.items()}, **columns}
 
 
+class _Extent(NamedTuple):
+    """Where each record's part of some columns starts, for all columns of like shape.
+
+    Attributes:
+        starts: First element [record+1], before fixed dimensions are multiplied in.
+        sizes: Size of each named dimension per record.
+    """
+
+    starts: np.ndarray
+    sizes: tuple[np.ndarray, ...]
+
+
+class _Cut(NamedTuple):
+    """How one leaf is cut out: its column, its extent, and its fixed dimensions.
+
+    Attributes:
+        values: The column.
+        extent: Which of the extents it follows.
+        factor: Product of its fixed dimensions.
+        shape: Its dimensions: a fixed size, or ``-1 - i`` for the extent's i-th size.
+        kind: Python type of a scalar; None for an array.
+    """
+
+    values: np.ndarray
+    extent: int
+    factor: int
+    shape: tuple[int, ...]
+    kind: type | None
+
+
+class _Maker(NamedTuple):
+    """A record type with its fields in order: a leaf's number, or a nested maker."""
+
+    kind: Any
+    parts: "tuple[int | _Maker, ...]"
+
+
 class Unpacked(Generic[T], Sequence[T]):
     """Records cut out of columns on demand: ``records[3]`` touches only that record.
 
-    Arrays are views of the columns; with memory maps nothing is read until it is used.
+    Arrays are views of the columns; with memory maps nothing is read until it is used. All
+    that depends on the type is settled when opened: training reads one record at a time.
     """
 
     def __init__(self, columns: Columns, kind: type[T]) -> None:
+        record: Any = (
+            kind  # a type is hashable, whatever the type checker thinks of type[T]
+        )
         self._columns = columns
-        self._kind = kind
-        self._sizes = {k[4:]: v for k, v in columns.items() if k.startswith("dim.")}
-        self._length = len(next(iter(self._sizes.values()))) if self._sizes else 0
-        self._starts = {leaf.name: self._offsets(leaf) for leaf in leaves(self._kind)}
+        self._extents: list[_Extent] = []
+        found: dict[tuple[str, ...], int] = {}
+        self._cuts = [self._cut(leaf, found) for leaf in leaves(record)]
+        self._length = len(self._extents[0].starts) - 1 if self._extents else 0
+        self._maker = _maker(record, iter(range(len(self._cuts))))
 
     def __len__(self) -> int:
         return self._length
@@ -105,10 +146,14 @@ class Unpacked(Generic[T], Sequence[T]):
     def __getitem__(self, row: Any) -> Any:
         if isinstance(row, slice):
             return [self[i] for i in range(*row.indices(len(self)))]
-        if not -len(self) <= row < len(self):
-            raise IndexError(f"record {row} of {len(self)}")
-        row = row % len(self)
-        return self._build(self._kind, (), row)
+        if not -self._length <= row < self._length:
+            raise IndexError(f"record {row} of {self._length}")
+        row = row % self._length
+        extents = [
+            (int(starts[row]), int(starts[row + 1]), [int(size[row]) for size in sizes])
+            for starts, sizes in self._extents
+        ]
+        return _make(self._maker, [_value_at(cut, extents) for cut in self._cuts])
 
     def __iter__(self) -> Iterator[T]:
         return (self[row] for row in range(len(self)))
@@ -117,51 +162,83 @@ class Unpacked(Generic[T], Sequence[T]):
         """Return one whole column, all records end to end."""
         return self._columns[name]
 
-    def _offsets(self, leaf: Column) -> np.ndarray:
-        if leaf.dims is None and leaf.kind is not str:
-            return np.arange(self._length + 1)
-        dims = leaf.dims if leaf.dims is not None else (f"len({leaf.name})",)
-        sizes = np.ones(self._length, dtype=np.int64)
-        for dim in dims:
-            sizes = sizes * self._size(dim)
-        return np.concatenate([[0], np.cumsum(sizes)])
+    def sizes(self, dim: str) -> np.ndarray:
+        """Return the size of one named dimension in every record."""
+        return self._columns[f"dim.{dim}"]
+
+    def _cut(self, leaf: Column, found: dict[tuple[str, ...], int]) -> _Cut:
+        values = np.asarray(self._columns[leaf.name])
+        dims = _dims(leaf)
+        named = tuple(dim for dim in dims if not dim.isdigit())
+        factor = math.prod(int(dim) for dim in dims if dim.isdigit())
+        if named not in found:
+            found[named] = len(self._extents)
+            self._extents.append(self._extent(named, len(values) // factor))
+        order = iter(range(len(named)))
+        shape = tuple(int(dim) if dim.isdigit() else -1 - next(order) for dim in dims)
+        scalar = leaf.kind if leaf.dims is None else None
+        return _Cut(values, found[named], factor, shape, scalar)
+
+    def _extent(self, named: tuple[str, ...], length: int) -> _Extent:
+        if not named:
+            return _Extent(np.arange(length + 1), ())
+        sizes = tuple(self._size(dim) for dim in named)
+        per_record = np.prod(sizes, axis=0, dtype=np.int64)
+        return _Extent(np.concatenate([[0], np.cumsum(per_record)]), sizes)
 
     def _size(self, dim: str) -> np.ndarray:
-        if dim.isdigit():
-            return np.full(self._length, int(dim), dtype=np.int64)
         name, more = _split(dim)
-        return self._sizes[name] + more
-
-    def _build(self, kind: type, path: tuple[str, ...], row: int) -> Any:
-        values: dict[str, Any] = {}
-        inner: dict[str, type] = {
-            f.name: get_hints(kind)[f.name]
-            for f in fields(kind)
-            if is_dataclass(get_hints(kind)[f.name])
-        }
-        for name, hint in inner.items():
-            values[name] = self._build(hint, (*path, name), row)
-        for leaf in leaves(kind):
-            if len(leaf.path) == 1:
-                values[leaf.path[0]] = self._cut(
-                    leaf._replace(path=(*path, *leaf.path)), row
-                )
-        return kind(**values)
-
-    def _cut(self, leaf: Column, row: int) -> Any:
-        starts = self._starts[leaf.name]
-        part = self._columns[leaf.name][starts[row] : starts[row + 1]]
-        if leaf.kind is str:
-            return part.tobytes().decode()
-        if leaf.dims is None:
-            return leaf.kind(part[0])
-        return part.reshape([int(self._size(dim)[row]) for dim in leaf.dims])
+        return np.asarray(self._columns[f"dim.{name}"]) + more
 
 
-@cache
-def get_hints(kind: Any) -> dict[str, Any]:
-    """Annotations of a record type, resolved once."""
-    return get_type_hints(kind, include_extras=True)
+def names(kind: Any) -> frozenset[str]:
+    """Names of all columns that records of a type have, sizes included."""
+    named = {
+        f"dim.{_split(dim)[0]}"
+        for leaf in leaves(kind)
+        for dim in _dims(leaf)
+        if not dim.isdigit()
+    }
+    return frozenset(named | {leaf.name for leaf in leaves(kind)})
+
+
+def _maker(kind: Any, numbers: Iterator[int]) -> _Maker:
+    hints = get_type_hints(kind, include_extras=True)
+    return _Maker(
+        kind,
+        tuple(
+            _maker(hint, numbers) if is_dataclass(hint) else next(numbers)
+            for hint in hints.values()
+        ),
+    )
+
+
+def _make(maker: _Maker, values: list[Any]) -> Any:
+    return maker.kind(
+        *[
+            values[part] if isinstance(part, int) else _make(part, values)
+            for part in maker.parts
+        ]
+    )
+
+
+def _value_at(cut: _Cut, extents: list[tuple[int, int, list[int]]]) -> Any:
+    values, extent, factor, shape, kind = cut
+    start, stop, sizes = extents[extent]
+    part = values[start * factor : stop * factor]
+    if kind is str:
+        return part.tobytes().decode()
+    if kind is not None:
+        return kind(part[0])
+    if len(shape) == 1:
+        return part
+    return part.reshape([size if size >= 0 else sizes[-1 - size] for size in shape])
+
+
+def _dims(leaf: Column) -> tuple[str, ...]:
+    if leaf.dims is not None:
+        return leaf.dims
+    return (f"len({leaf.name})",) if leaf.kind is str else ()
 
 
 def _value(record: Any, leaf: Column) -> np.ndarray:

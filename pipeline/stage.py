@@ -1,7 +1,11 @@
 """What a stage is: how it cuts its work into units, does one, and gathers them.
 
 The engine knows stages only through this file. A stage module (``pipeline/ingest.py`` ...)
-ends in one ``STAGE = Stage(...)``; ``pipeline.stages.STAGES`` lists them.
+ends in one ``STAGE = Stage(...)``; ``pipeline.stages`` lists them.
+
+``infgen status`` and dry runs import every stage module, so a stage module imports torch,
+zarr, dask and polars inside its functions only, and ``plan`` uses none of them: it cuts by
+what the reports of its inputs say.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +14,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 Report = dict[str, Any]
-"""Few, JSON-able figures of one unit or of a whole stage."""
+"""Few, JSON-able figures of one unit or of a whole stage, the same each time it is made.
+
+Figures that vary from run to run (seconds, memory) go below the one key ``"run"``; they are
+kept apart from the artefact, which is byte-identical between runs.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +42,12 @@ class Unit:
 
     Attributes:
         name: Unique in its stage, and fit to be part of a file name.
-        inputs: Identities of what it reads, as ``{what: key or fingerprint}``; with the
-            stage's settings and version they make its key.
+        inputs: Identities of what it reads, as ``{what: key or fingerprint}``.
         task: What ``work`` needs besides its settings: small and JSON-able.
+
+    Name, inputs, task, and the stage's settings and version make the unit's key. Absolute
+    paths and URLs in the task are left out of it (the identities in ``inputs`` stand for
+    them), so that a root can be moved.
     """
 
     name: str
@@ -70,12 +81,23 @@ class Inputs(Protocol):
     def key(self, stage: str) -> str:
         """Key of an input stage."""
 
+    def content(self, stage: str, *names: str) -> str:
+        """Identity of what some files or folders in an input stage's folder hold.
+
+        Unlike its key it stays the same when the stage was made anew with equal results, so
+        units that name it in their ``inputs`` are not made again for nothing.
+        """
+
 
 class Progress(Protocol):
     """Where long work inside one unit or ``finish`` says how far it is."""
 
     def __call__(self, done: float, total: float, note: str = "") -> None:
-        """Report so much of so much done, e.g. 300 of 1000 steps."""
+        """Report so much of so much done, e.g. 300 of 1000 steps.
+
+        In a stage that ``resumes`` this is also where SIGTERM arrives, as
+        ``pipeline.stopping.Stopped``: save what is needed to go on, and raise it again.
+        """
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,31 +1,36 @@
-"""The door to the disk: columns in Zarr, memory maps of them, whole-or-nothing folders.
+"""The door to the disk: columns in Zarr, and memory maps of them.
 
 Every array is one chunk. Where ``compress`` is off its only codec is crc32c, so the chunk
 file is the array itself followed by four bytes, and ``map_group`` reads it without a copy.
-A missing chunk is an error here, never zeros.
+A missing chunk is an error here, never zeros. Zarr is imported where it is used: it takes a
+second, and neither ``infgen status`` nor mapped reading needs it.
 """
 
 import json
-import os
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import zarr
-from zarr.codecs import BloscCodec, Crc32cCodec
 
-from pipeline.columns import Unpacked, pack
+from pipeline.columns import Unpacked, names, pack
+from pipeline.folders import StoreError, publish, write_file, write_json
+
+__all__ = [
+    "StoreError",
+    "map_group",
+    "publish",
+    "read_group",
+    "read_records",
+    "write_file",
+    "write_group",
+    "write_json",
+    "write_records",
+]
 
 T = TypeVar("T")
 
 CHECKSUM_BYTES = 4
-
-
-class StoreError(ValueError):
-    """A group on disk that is damaged or not what was expected."""
 
 
 def write_group(
@@ -36,7 +41,10 @@ def write_group(
     compress: bool,
 ) -> None:
     """Write one-dimensional columns as a new Zarr v3 group."""
-    packed = BloscCodec(cname="zstd", clevel=5, shuffle="bitshuffle")
+    import zarr  # noqa: PLC0415
+    from zarr.codecs import BloscCodec, Crc32cCodec  # noqa: PLC0415
+
+    packed = BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle")
     codecs = [packed, Crc32cCodec()] if compress else [Crc32cCodec()]
     group = zarr.open_group(path, mode="w-", zarr_format=3, attributes=dict(attributes))
     for name, values in columns.items():
@@ -59,17 +67,23 @@ def read_group(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     Raises:
         StoreError: if a chunk is missing, cut short or damaged.
     """
+    import zarr  # noqa: PLC0415
+
+    _json(path / "zarr.json")
     columns = {}
-    group = zarr.open_group(path, mode="r")
-    for name, array in sorted(group.arrays()):
-        if array.size and not _chunk(path, name).is_file():
-            raise StoreError(
-                f"{_chunk(path, name)} is missing; `infgen verify` lists damage"
-            )
+    try:
+        group = zarr.open_group(path, mode="r")
+        arrays = sorted(group.arrays())
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreError(f"{path} is damaged: {error}") from error
+    for name, array in arrays:
+        chunk = _chunk(path, name)
+        if array.size and not chunk.is_file():
+            raise StoreError(f"{chunk} is missing; `infgen verify` lists damage")
         try:
             columns[name] = np.asarray(array[:])
         except (ValueError, RuntimeError) as error:
-            raise StoreError(f"{_chunk(path, name)} is damaged: {error}") from error
+            raise StoreError(f"{chunk} is damaged: {error}") from error
     return columns, dict(group.attrs)
 
 
@@ -110,6 +124,9 @@ def read_records(path: Path, kind: type[T], schema: str, *, mapped: bool) -> Unp
         raise StoreError(
             f"{path} holds {found!r}, expected {schema!r}; run its stage again"
         )
+    lost = sorted(names(kind) - columns.keys())
+    if lost:
+        raise StoreError(f"{path} lacks {', '.join(lost)}; `infgen verify` lists damage")
     return Unpacked(columns, kind)
 
 
@@ -120,7 +137,8 @@ def _map(chunk: Path, dtype: np.dtype, length: int) -> np.ndarray:
     found = chunk.stat().st_size if chunk.is_file() else None
     if found != expected:
         raise StoreError(f"{chunk} holds {found} bytes, expected {expected}")
-    return np.memmap(chunk, dtype=dtype, mode="r", shape=(length,))
+    # A plain view of the map: slicing a memmap object costs ten times as much.
+    return np.asarray(np.memmap(chunk, dtype=dtype, mode="r", shape=(length,)))
 
 
 def _chunk(path: Path, name: str) -> Path:
@@ -130,62 +148,8 @@ def _chunk(path: Path, name: str) -> Path:
 def _json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise StoreError(f"{path} is missing")
-    loaded: dict[str, Any] = json.loads(path.read_text())
-    return loaded
-
-
-@contextmanager
-def publish(target: Path, *, resume: bool = False) -> Iterator[Path]:
-    """Give a folder to write in, and make it ``target`` only once all is written.
-
-    A reader sees the whole folder or none of it; everything is on disk before the name is.
-
-    Args:
-        target: Where the folder shall stand; must not exist.
-        resume: Keep what an earlier, killed try left, instead of clearing it.
-    """
-    partial = target.with_name(f"{target.name}.partial")
-    if not resume:
-        shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True, exist_ok=resume)
-    yield partial
-    sync_tree(partial)
-    partial.rename(target)
-    sync_folder(target.parent)
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Write a small file whole or not at all, and sync it."""
-    partial = path.with_name(f"{path.name}.partial")
-    with partial.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
-    sync_folder(path.parent)
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON whole or not at all, keys sorted, so equal values are equal bytes."""
-    write_file(path, (json.dumps(value, indent=1, sort_keys=True) + "\n").encode())
-
-
-def sync_tree(root: Path) -> None:
-    """Put every file and folder below, and the folder itself, on disk."""
-    for folder, _, names in os.walk(root):
-        for name in names:
-            handle = os.open(os.path.join(folder, name), os.O_RDONLY)
-            try:
-                os.fsync(handle)
-            finally:
-                os.close(handle)
-        sync_folder(Path(folder))
-
-
-def sync_folder(folder: Path) -> None:
-    """Put a folder's own entries on disk."""
-    handle = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        loaded: dict[str, Any] = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise StoreError(f"{path} is damaged: {error}") from error
+    return loaded

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int8, Int16, Int32, UInt8
+from jaxtyping import Bool, Float32, Float64, Int8, Int16, Int32, UInt8, UInt16
 
 NO_MOVE = -1
 """Move of a token at which the agent is absent or not observed."""
@@ -66,12 +66,14 @@ class SceneTokens:
         kind: ``AgentKind``.
         size_lwh_m: One box per agent (mean over its observed steps).
         z_m: Height of the box centre at each token's end; meaningless where absent.
-        pose: Quantised x, y, heading at each token's end; zero where absent.
+        pose: Quantised x, y, heading at each token's end; zero where absent. An agent that
+            is present but not observed keeps the last pose it had.
         move: Row of the kind's codebook, ``FIRST_MOVE`` or ``NO_MOVE``.
         presence: ``Presence``.
         observed: Whether the log shows the agent at both ends of the token; False at
             ``ENTERING`` (SPEC 3.3).
-        cell: Cell of the ego's grid that holds the agent, or ``NO_CELL``.
+        cell: Cell of the ego's grid that holds the agent, or ``NO_CELL``; only where it is
+            observed or entering.
         near: Whether the agent is ever observed within the motion-loss radius of the ego.
         entry_token: Token at which each newcomer enters, ascending; within a token from
             near to far. Who enters outside the grid has ``entry_cell`` ``NO_CELL``.
@@ -92,8 +94,9 @@ class SceneTokens:
         word_value: ... its value (move, cell, heading bin or kind; else 0) ...
         word_agent: ... the agent's row (-1 for ``BEGIN_MOTION``) ...
         word_token: ... and the half second it belongs to.
-        anchor_agent: Rows whose chain of moves starts anew from the log: after a gap, and
-            the ego at its first token. ``anchor_token`` is when, ``anchor_pose`` where.
+        anchor_agent: Rows whose chain of moves starts anew from the log: after a gap (at
+            the last token not observed), and the ego at its first token. ``anchor_token``
+            is when, ``anchor_pose`` the pose at that token's end.
     """
 
     scenario_id: str
@@ -128,7 +131,7 @@ class SceneTokens:
     word: UInt8[np.ndarray, " word"]
     word_value: Int16[np.ndarray, " word"]
     word_agent: Int16[np.ndarray, " word"]
-    word_token: UInt8[np.ndarray, " word"]
+    word_token: UInt16[np.ndarray, " word"]
     anchor_agent: Int16[np.ndarray, " anchor"]
     anchor_token: Int16[np.ndarray, " anchor"]
     anchor_pose: Float32[np.ndarray, "anchor 3"]

@@ -1,0 +1,401 @@
+"""The command line: words in, tables and exit codes out. The work is done in ``pipeline``.
+
+Exit codes: 0 done or up to date; 1 a stage failed, or damage was found; 2 wrong words or
+settings; 3 something is stale (``status --check``), or too many records were quarantined;
+75 another run is at it; 130 and 143 stopped by SIGINT and SIGTERM.
+"""
+
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from infgen.config import ConfigError
+from pipeline import lookup, stopping
+from pipeline.doctor import examine
+from pipeline.events import Events
+from pipeline.folders import StoreError
+from pipeline.locks import LockedError
+from pipeline.manifest import verify as find_damage
+from pipeline.options import Asked, Running, gathers
+from pipeline.plan import PlanError
+from pipeline.request import Request
+from pipeline.root import KEY_DIGITS, Root, read_json
+from pipeline.runner import Result
+from pipeline.runner import run as make
+from pipeline.screen import Screen, gibibytes, show_table
+from pipeline.settings import DEFAULT_FILE
+from pipeline.status import Standing, standings
+from pipeline.sweep import find_garbage
+from pipeline.sweep import sweep as remove_garbage
+
+FAILED, WRONG, STALE, LOCKED = 1, 2, 3, 75
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+WATCH_S = 2.0
+
+app = typer.Typer(
+    name="infgen",
+    help="Long-term traffic simulation: driving logs in, scored futures out.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Key = Annotated[str, typer.Argument(help="Start of a key, or the name of a stage.")]
+RootFolder = Annotated[Path, typer.Option("--root", help="Folder of the experiment.")]
+WORK = Path("work")
+
+
+@app.command()
+@gathers(asked=Asked, running=Running)
+def run(
+    stages: Annotated[list[str] | None, typer.Argument(metavar="[STAGE]...")] = None,
+    json_: Json = False,
+    *,
+    asked: Asked,
+    running: Running,
+) -> None:
+    """Make stages, and what they need, where they are not made yet (default: report).
+
+    Example: infgen run report --root R --records '../data/*.tfrecord*' --profile small
+    """
+    _run(asked.request(), stages or [], running, as_json=json_)
+
+
+@app.command()
+@gathers(asked=Asked, running=Running)
+def ingest(
+    files: Annotated[list[str] | None, typer.Argument(metavar="[RECORDS]...")] = None,
+    json_: Json = False,
+    *,
+    asked: Asked,
+    running: Running,
+) -> None:
+    """Turn raw records into scenes.
+
+    Example: infgen ingest '../data/*.tfrecord*' --root R --dask local:2
+    """
+    _run(asked.request(files or ()), ["ingest"], running, as_json=json_)
+
+
+def _stage_verb(stage: str, what: str) -> None:
+    @gathers(asked=Asked, running=Running)
+    def verb(json_: Json = False, *, asked: Asked, running: Running) -> None:
+        _run(asked.request(), [stage], running, as_json=json_)
+
+    app.command(stage, help=f"{what}\n\nExample: infgen {stage} --root R")(verb)
+
+
+_stage_verb("build-vocab", "Cluster the vocabularies of moves and road pieces.")
+_stage_verb("tokenize", "Write scenes as tokens.")
+_stage_verb("train", "Train the network; goes on where a killed run stopped.")
+_stage_verb("rollout", "Play futures of the held-out scenes.")
+_stage_verb("score", "Score the futures against the logs.")
+_stage_verb("report", "Gather tables and figures in one page.")
+
+
+@app.command()
+@gathers(asked=Asked, running=Running)
+def plan(json_: Json = False, *, asked: Asked, running: Running) -> None:
+    """Say what a run would make, and why (run -n).
+
+    Example: infgen plan --root R -s tokenize.max_gap_s=2
+    """
+    _dry(asked.request(), [], running, as_json=json_)
+
+
+@app.command()
+@gathers(asked=Asked)
+def status(
+    check: Annotated[bool, typer.Option("--check", help="Exit 3 if any is stale.")] = False,
+    json_: Json = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Again every two seconds.")
+    ] = False,
+    strict_code: Annotated[bool, typer.Option(help="Other code makes stale.")] = False,
+    *,
+    asked: Asked,
+) -> None:
+    """Say how every stage stands to what is asked for, and why.
+
+    Example: infgen status --root R -s tokenize.max_gap_s=2
+    """
+    request = asked.request()
+    while True:
+        found = _standings(request, [], strict_code=strict_code)
+        _show_standings(found, as_json=json_)
+        if not watch:
+            break
+        time.sleep(WATCH_S)
+    if check and any(standing.state != "cached" for standing in found):
+        raise typer.Exit(STALE)
+
+
+@app.command()
+@gathers(asked=Asked)
+def dag(
+    mermaid: Annotated[bool, typer.Option("--mermaid", help="As a Mermaid chart.")] = False,
+    *,
+    asked: Asked,
+) -> None:
+    """Show which stage reads which.
+
+    Example: infgen dag --mermaid
+    """
+    stages = asked.request().stages(os.environ).stages
+    if mermaid:
+        typer.echo("flowchart LR")
+    for entry in stages.values():
+        if mermaid:
+            typer.echo("\n".join(f"  {dep} --> {entry.name}" for dep in entry.deps))
+        else:
+            typer.echo(f"{entry.name:<12} <- {', '.join(entry.deps)}")
+
+
+@app.command()
+def gc(
+    root: RootFolder = WORK,
+    yes: Annotated[bool, typer.Option("--yes", help="Remove it.")] = False,
+    json_: Json = False,
+) -> None:
+    """List what no profile's latest stages need; with --yes, remove it.
+
+    Example: infgen gc --root R --yes
+    """
+    garbage = (remove_garbage if yes else find_garbage)(Root(root.absolute()))
+    if json_:
+        _print_json({"removed": yes, "garbage": [asdict(each) for each in garbage]})
+        return
+    rows = [(each.path, gibibytes(each.bytes), each.why) for each in garbage]
+    total = gibibytes(sum(each.bytes for each in garbage))
+    done = "removed" if yes else "to remove with --yes"
+    show_table(f"{total} {done}", ("folder", "size", "what"), rows)
+
+
+@app.command()
+def verify(
+    root: RootFolder = WORK,
+    full: Annotated[
+        bool, typer.Option("--full", help="Checksums, not only sizes.")
+    ] = False,
+    json_: Json = False,
+) -> None:
+    """Check every made file against its manifest.
+
+    Example: infgen verify --root R --full
+    """
+    damage = list(find_damage(Root(root.absolute()), full=full))
+    if json_:
+        _print_json({"damage": damage})
+    else:
+        typer.echo("\n".join(damage) if damage else "all files are as their manifests say")
+    if damage:
+        raise typer.Exit(FAILED)
+
+
+@app.command()
+def show(key: Key, root: RootFolder = WORK) -> None:
+    """Print all that a made stage or unit says of itself.
+
+    Example: infgen show tokenize --root R
+    """
+    _print_json(lookup.describe(lookup.find(Root(root.absolute()), key)))
+
+
+@app.command()
+def diff(one: Key, other: Key, root: RootFolder = WORK, json_: Json = False) -> None:
+    """Say where two made stages or units differ.
+
+    Example: infgen diff 3f2a91 77c0de --root R
+    """
+    folders = [lookup.find(Root(root.absolute()), key) for key in (one, other)]
+    found = list(lookup.differences(*folders))
+    if json_:
+        _print_json({"differences": [list(each) for each in found]})
+    else:
+        show_table(f"{len(found)} differences", ("what", one, other), found)
+
+
+@app.command()
+def init(target: Annotated[Path, typer.Argument()] = Path("stages.yaml")) -> None:
+    """Write a stages.yaml to change.
+
+    Example: infgen init
+    """
+    if target.exists():
+        raise ConfigError(f"{target} exists; move it away, or name another file")
+    shutil.copyfile(DEFAULT_FILE, target)
+    typer.echo(f"wrote {target}; `infgen run` in this folder uses it")
+
+
+@app.command()
+def doctor(root: RootFolder = WORK, json_: Json = False) -> None:
+    """Check that this machine and disk can do what a run needs.
+
+    Example: infgen doctor --root R
+    """
+    checks = list(examine(Root(root.absolute())))
+    if json_:
+        _print_json({"checks": [asdict(check) for check in checks]})
+    else:
+        rows = [(check.what, check.state, check.note) for check in checks]
+        show_table("doctor", ("what", "state", "note"), rows)
+    if any(check.state == "bad" for check in checks):
+        raise typer.Exit(FAILED)
+
+
+@app.command()
+def demo(root: RootFolder = WORK / "demo", json_: Json = False) -> None:
+    """Run all stages on the built-in records, in minutes.
+
+    Example: infgen demo
+    """
+    _run(Asked(root=root, profile="demo").request(), [], Running(), as_json=json_)
+
+
+@app.command()
+def towns(
+    out: Annotated[Path, typer.Option(help="Folder to write to.")],
+    scenes: Annotated[int, typer.Option(help="How many scenes.")] = 8,
+    seed: Annotated[int, typer.Option(help="Other towns for another seed.")] = 0,
+) -> None:
+    """Write synthetic driving logs as WOMD records.
+
+    Example: infgen towns --out towns --scenes 20
+    """
+    from infgen.sources.towns import write_towns  # noqa: PLC0415
+
+    for path in write_towns(out, scenes=scenes, seed=seed):
+        typer.echo(path)
+
+
+def _run(
+    request: Request, targets: Sequence[str], running: Running, *, as_json: bool
+) -> None:
+    """Run, show what became of it, and leave with the exit code that says so."""
+    if running.dry_run:
+        _dry(request, targets, running, as_json=as_json)
+        return
+    plan = request.plan(targets, os.environ)
+    orders = running.orders(targets, plan)
+    request.remember(plan)
+    with stopping.listening(), Screen() as screen:
+        events = Events(request.root, (screen,))
+        results = make(plan, orders, events)
+    _show_results(request, results, as_json=as_json, log=events.log)
+    if any(result.errors for result in results):
+        raise typer.Exit(FAILED)
+    _check_quarantine(request, results, running.max_bad)
+
+
+def _dry(
+    request: Request, targets: Sequence[str], running: Running, *, as_json: bool
+) -> None:
+    found = _standings(request, targets, strict_code=running.strict_code)
+    _show_standings(found, as_json=as_json)
+
+
+def _standings(
+    request: Request, targets: Sequence[str], *, strict_code: bool
+) -> list[Standing]:
+    plan = request.plan(targets, os.environ)
+    return standings(plan, request.made(), strict_code=strict_code)
+
+
+def _show_standings(found: Sequence[Standing], *, as_json: bool) -> None:
+    if as_json:
+        _print_json({"stages": [asdict(standing) for standing in found]})
+        return
+    rows = [
+        (each.stage, each.state, each.progress, each.key[:KEY_DIGITS], each.why)
+        for each in found
+    ]
+    show_table("stages", ("stage", "state", "units", "key", "why"), rows)
+
+
+def _show_results(
+    request: Request, results: Sequence[Result], *, as_json: bool, log: Path
+) -> None:
+    if as_json:
+        _print_json({"stages": [asdict(each) for each in results], "log": str(log)})
+        return
+    rows = [
+        (each.stage, each.state, each.units, each.made, each.seconds, each.words)
+        for each in results
+    ]
+    columns = ("stage", "state", "units", "made now", "seconds", "figures")
+    show_table("run", columns, rows)
+    for result in results:
+        for unit, error in result.errors.items():
+            typer.echo(f"{result.stage}: {unit}: {error} (traceback in {log})", err=True)
+    _show_scores(request, results)
+
+
+def _show_scores(request: Request, results: Sequence[Result]) -> None:
+    made = [each for each in results if each.stage == "report" and not each.errors]
+    table = request.root.path / "report" / "table.json"
+    if made and made[0].state != "skipped" and table.is_file():
+        scores = read_json(table)
+        show_table("scores", scores["columns"], scores["rows"])
+        typer.echo(f"report: {request.root.path / 'report'}")
+
+
+def _check_quarantine(request: Request, results: Sequence[Result], max_bad: float) -> None:
+    for result in results:
+        bad, good = result.report.get("quarantined", 0), result.report.get("scenes", 0)
+        if result.stage != "ingest" or not bad:
+            continue
+        share = bad / (bad + good)
+        where = request.root.folder("ingest", result.key) / "quarantine.parquet"
+        typer.echo(
+            f"{bad} of {bad + good} records ({share:.2%}) are quarantined: {where}",
+            err=True,
+        )
+        if share > max_bad:
+            typer.echo(f"that is more than --max-bad {max_bad:g}", err=True)
+            raise typer.Exit(STALE)
+
+
+def _print_json(value: Any) -> None:
+    typer.echo(json.dumps(value, indent=1, default=str))
+
+
+def _exit_code(error: BaseException) -> int:
+    """Exit code of a known error; an unknown one goes on as a traceback."""
+    if isinstance(error, stopping.Stopped):
+        return 128 + error.signal
+    if isinstance(error, LockedError):
+        return LOCKED
+    if isinstance(error, ConfigError | PlanError):
+        return WRONG
+    if isinstance(error, StoreError | OSError):
+        return FAILED
+    ours = type(error).__module__.split(".")[0] in ("infgen", "pipeline")
+    if isinstance(error, ValueError) and ours:
+        return FAILED
+    raise error
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command; a known error is one line and an exit code."""
+    for name in THREADS:  # One thread each: results then do not depend on who does a unit.
+        os.environ.setdefault(name, "1")
+    try:
+        app(args=arguments)
+    except (ValueError, OSError, stopping.Stopped) as error:
+        code = _exit_code(error)
+        typer.echo(f"infgen: {error}", err=True)
+        sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

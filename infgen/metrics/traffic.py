@@ -1,0 +1,104 @@
+"""Traffic in one form, logged or played, so that both are measured by the same code."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool
+
+from infgen.config import TokenSettings
+from infgen.metrics.motion import Motion
+from infgen.metrics.placement import Events, logged_events, simulated_events
+from infgen.rollout.rollout import Rollout
+from infgen.scene import AgentKind, Scene
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """Vehicles, pedestrians and cyclists of one scene, all its steps.
+
+    Attributes:
+        scenario_id: Id of the log.
+        index: Which rollout of the scene; ``LOGGED`` for the log itself.
+        now: Last step of the history.
+        ego: Row of the recording car.
+        motion: Their boxes, as one rollout, in the scene's frame.
+        events: Entries and exits after now.
+    """
+
+    scenario_id: str
+    index: int
+    now: int
+    ego: int
+    motion: Motion
+    events: Events
+
+    @property
+    def future(self) -> slice:
+        """Steps after now."""
+        return slice(self.now + 1, self.motion.x_m.shape[2])
+
+    @property
+    def there_now(self) -> Bool[np.ndarray, " agent"]:
+        """Who is there at the last step of the history."""
+        return self.motion.valid[0, :, self.now]
+
+
+LOGGED = -1
+"""Index of the log among the rollouts of its scene."""
+
+
+def from_log(scene: Scene, settings: TokenSettings) -> Traffic:
+    """Read a log. Boxes are the mean of their observed steps.
+
+    Raises:
+        TokensError: if the log cannot be written as tokens.
+    """
+    events = logged_events(scene, settings)
+    tracks = scene.tracks
+    rows = np.flatnonzero((tracks.kind >= 0) & (tracks.kind < AgentKind.OTHER))
+    valid = tracks.valid[rows]
+    share = valid / np.maximum(1, valid.sum(axis=1, keepdims=True))
+    size_lwh_m = np.einsum("as,asc->ac", share, tracks.size_lwh_m[rows])
+    xyz_m = np.ascontiguousarray(np.moveaxis(tracks.xyz_m[rows], -1, 0))
+    return Traffic(
+        scenario_id=scene.scenario_id,
+        index=LOGGED,
+        now=scene.now,
+        ego=int(np.flatnonzero(rows == scene.ego)[0]),
+        motion=Motion(
+            x_m=xyz_m[None, 0],
+            y_m=xyz_m[None, 1],
+            z_m=xyz_m[None, 2],
+            heading_rad=tracks.heading_rad[None, rows],
+            size_lwh_m=size_lwh_m.astype(np.float32),
+            kind=tracks.kind[rows],
+            valid=valid[None],
+        ),
+        events=events,
+    )
+
+
+def from_rollout(rollout: Rollout) -> Traffic:
+    """Read a played future."""
+    xyz_m = np.ascontiguousarray(np.moveaxis(rollout.xyz_m, -1, 0))
+    return Traffic(
+        scenario_id=rollout.scenario_id,
+        index=rollout.index,
+        now=rollout.now,
+        ego=rollout.ego,
+        motion=Motion(
+            x_m=xyz_m[None, 0],
+            y_m=xyz_m[None, 1],
+            z_m=xyz_m[None, 2],
+            heading_rad=rollout.heading_rad[None],
+            size_lwh_m=rollout.size_lwh_m,
+            kind=rollout.kind,
+            valid=rollout.valid[None],
+        ),
+        events=simulated_events(rollout),
+    )
+
+
+def with_boxes(traffic: Traffic, size_lwh_m: np.ndarray) -> Traffic:
+    """Give the agents other boxes."""
+    return replace(traffic, motion=replace(traffic.motion, size_lwh_m=size_lwh_m))

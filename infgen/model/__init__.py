@@ -1,0 +1,1 @@
+"""The network: from scene tokens to probabilities of the next ones."""

@@ -1,0 +1,214 @@
+"""Agents as features, and what they do next.
+
+Shape letters as in ``layers``; rows are the visible agents of all tokens and scenes.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from infgen.config import ModelSettings
+from infgen.model.layers import (
+    Attention,
+    FourierEmbedding,
+    Seen,
+    embedding_mlp,
+    gather,
+    mlp,
+    normed,
+)
+from infgen.model.relations import direction, relation_embedding
+from infgen.model.sight import Around, Reach
+from infgen.scene import AgentKind
+from infgen.tokens.codebook import MotionCodebook
+from infgen.tokens.grid import Grid
+from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
+
+KINDS = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST)
+MAX_SPEED_MPS = 50.0
+"""Faster past displacements are not told apart."""
+
+ENTERING_M = -1.0
+"""Stands for the last displacement of an agent that is just entering ..."""
+UNKNOWN_M = -2.0
+"""... or whose last pose was not seen. No true displacement is negative."""
+
+
+@dataclass(frozen=True, slots=True)
+class AgentRows:
+    """Agents to embed, one per row.
+
+    Attributes:
+        kind: ``AgentKind`` [row].
+        size_lwh_m: Boxes [row, 3].
+        pose: Poses [row, 3].
+        before: Poses half a second earlier [row, 3] ...
+        known: ... and whether they were seen [row].
+        move: Codebook row, ``FIRST_MOVE`` or ``NO_MOVE`` [row].
+        presence: ``Presence`` [row].
+        cell: Cell of the ego's grid, or ``NO_CELL`` [row].
+    """
+
+    kind: Tensor
+    size_lwh_m: Tensor
+    pose: Tensor
+    before: Tensor
+    known: Tensor
+    move: Tensor
+    presence: Tensor
+    cell: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class AgentTables:
+    """Embeddings that depend on no scene.
+
+    Attributes:
+        moves: Of every kind's moves, then ``FIRST_MOVE``, then ``NO_MOVE``.
+        cells: Of every cell, then ``NO_CELL``.
+    """
+
+    moves: Tensor
+    cells: Tensor
+
+
+class AgentEmbedding(nn.Module):
+    """What an agent is and did last, by itself (SPEC 4.4)."""
+
+    corners_m: Tensor
+    centre_m: Tensor
+
+    def __init__(
+        self, settings: ModelSettings, codebook: MotionCodebook, grid: Grid
+    ) -> None:
+        super().__init__()
+        width = settings.width
+        self.num_moves = codebook.num_moves
+        self.num_cells = grid.num_cells
+        corners_m = torch.from_numpy(codebook.end_corners_m.copy())
+        self.register_buffer("corners_m", corners_m.flatten(2), persistent=False)
+        centre_m = torch.from_numpy(grid.centre_m.copy())
+        self.register_buffer("centre_m", centre_m, persistent=False)
+        self.moves = nn.ModuleList(embedding_mlp(8, width) for _ in KINDS)
+        self.special_moves = nn.Embedding(2, width)
+        self.cells = embedding_mlp(2, width)
+        self.no_cell = nn.Embedding(1, width)
+        self.motion = FourierEmbedding(2, settings.fourier_bands, width)
+        self.kind = nn.Embedding(len(KINDS), width)
+        self.size = embedding_mlp(3, width)
+        self.presence = nn.Embedding(len(Presence), width)
+        self.fuse = embedding_mlp(4 * width, width)
+
+    def tables(self) -> AgentTables:
+        """Embed all moves and cells."""
+        moves = [mlp(m) for mlp, m in zip(self.moves, self.corners_m, strict=True)]
+        cells = [self.cells(self.centre_m), self.no_cell.weight]
+        return AgentTables(torch.cat([*moves, self.special_moves.weight]), torch.cat(cells))
+
+    def forward(self, agents: AgentRows, tables: AgentTables) -> Tensor:
+        """Embed agents: [N, D]."""
+        move = agents.kind * self.num_moves + agents.move
+        special = len(KINDS) * self.num_moves
+        move = torch.where(agents.move == FIRST_MOVE, special, move)
+        move = torch.where(agents.move == NO_MOVE, special + 1, move)
+        cell = torch.where(agents.cell == NO_CELL, self.num_cells, agents.cell)
+        what = self.kind(agents.kind) + self.size(agents.size_lwh_m)
+        parts = [
+            gather(tables.moves, move),
+            self.motion(_last_motion(agents), what),
+            self.presence(agents.presence),
+            gather(tables.cells, cell),
+        ]
+        embedded: Tensor = self.fuse(torch.cat(parts, dim=-1))
+        return embedded
+
+
+def _last_motion(agents: AgentRows) -> Tensor:
+    """Length and direction, as the agent sees it, of its last displacement [N, 2].
+
+    What there is no displacement for gets a length that none can have, so nothing of the
+    world's axes gets into the features.
+    """
+    away_m = agents.pose[:, :2] - agents.before[:, :2]
+    length_m = away_m.square().sum(dim=-1).sqrt()
+    turned_rad = direction(away_m, agents.pose[:, 2])
+    entering = agents.presence == Presence.ENTERING
+    length_m = torch.where(agents.known, length_m, UNKNOWN_M)
+    length_m = torch.where(entering, ENTERING_M, length_m)
+    turned_rad = torch.where(agents.known & ~entering, turned_rad, 0.0)
+    return torch.stack([length_m, turned_rad], dim=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What agents see, for all blocks alike.
+
+    Attributes:
+        past_relation: Relations to their own past [N, K, D] ...
+        past_present: ... and which of it there is [N, K].
+        roads: Road tokens around them.
+        agents: Rows of the agents around them.
+    """
+
+    past_relation: Tensor
+    past_present: Tensor
+    roads: Seen
+    agents: Around
+
+
+class MotionBlock(nn.Module):
+    """One look at the own past, the roads, and the other agents."""
+
+    def __init__(self, settings: ModelSettings) -> None:
+        super().__init__()
+        width, heads, dropout = settings.width, settings.heads, settings.dropout
+        self.past = Attention(width, heads, dropout, bipartite=False)
+        self.roads = Attention(width, heads, dropout, bipartite=True)
+        self.agents = Attention(width, heads, dropout, bipartite=False)
+
+    def forward(self, x_ND: Tensor, past_NKD: Tensor, sight: Sight) -> Tensor:
+        """Update agents; ``past_NKD`` are their normed features of earlier tokens."""
+        x_ND = self.past(x_ND, Seen(past_NKD, sight.past_relation, sight.past_present))
+        x_ND = self.roads(x_ND, sight.roads)
+        updated: Tensor = self.agents(x_ND, sight.agents.seen(normed(x_ND)))
+        return updated
+
+
+class MotionStack(nn.Module):
+    """What every agent does next, all at once (SPEC 4.5)."""
+
+    def __init__(self, settings: ModelSettings, num_moves: int, token_s: float) -> None:
+        super().__init__()
+        width, bands = settings.width, settings.fourier_bands
+        window = settings.window_tokens
+        far_m = MAX_SPEED_MPS * token_s * window
+        self.settings = settings
+        self.past_relation = relation_embedding(far_m, bands, width, window)
+        self.roads_relation = relation_embedding(settings.map_agent_radius_m, bands, width)
+        self.agents_relation = relation_embedding(
+            settings.agent_agent_radius_m, bands, width
+        )
+        self.blocks = nn.ModuleList(
+            MotionBlock(settings) for _ in range(settings.motion_blocks)
+        )
+        self.move = mlp(width, width, num_moves)
+        self.leave = mlp(width, width, 1)
+
+    def roads_reach(self) -> Reach:
+        """How agents see roads."""
+        s = self.settings
+        return Reach.of(s.map_agent_radius_m, s.map_agent_neighbours, self.roads_relation)
+
+    def agents_reach(self) -> Reach:
+        """How agents see each other."""
+        s = self.settings
+        return Reach.of(
+            s.agent_agent_radius_m, s.agent_agent_neighbours, self.agents_relation
+        )
+
+    def forward(self, x_ND: Tensor, past_index: Tensor, sight: Sight) -> Tensor:
+        """Update the agents of all tokens; ``past_index`` are rows of their own past."""
+        for block in self.blocks:
+            x_ND = block(x_ND, gather(normed(x_ND), past_index), sight)
+        return x_ND

@@ -1,0 +1,340 @@
+"""Tokenized scenes as padded tensors: what the network is trained on.
+
+Dims: scene, agent, token, road, slot (turn of a newcomer within its half second), detail
+(an agent whose entry is described: a newcomer, or one that only plays the part). Agents are
+ordered from near to far by their least distance to the ego; agent 0 is the ego. Tokens come
+before agents, unlike in ``SceneTokens``: what is seen together lies together.
+
+A batch is a function of its records, their draws and the limits: nothing is random here.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor
+
+from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.model.window import SceneWindow, cut_window
+from infgen.tokens.grid import encode_heading, make_grid, to_grid
+from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE, Presence, SceneTokens
+
+T = TypeVar("T")
+
+NOBODY = -1
+"""Agent of an empty slot."""
+OUTSIDE = 1 << 15
+"""Turn of a newcomer that is in no cell: no query may see it yet."""
+PICKED_SHARE = 1 / 3
+"""Share of road tokens that are hidden to be predicted."""
+PSEUDO_PER_TOKEN = 2
+"""Agents per half second that play newcomers, to learn headings and offsets from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Agents:
+    """All agents of all scenes, as ``SceneTokens`` has them; padding is ABSENT.
+
+    Attributes:
+        kind: ``AgentKind``.
+        size_lwh_m: Boxes.
+        near: Whether the agent has a motion loss.
+        pose: x, y, heading at each token's end.
+        move: Row of the kind's codebook, ``FIRST_MOVE`` or ``NO_MOVE``.
+        presence: ``Presence``.
+        observed: Whether the log shows the agent throughout the token.
+        cell: Cell of the ego's grid, or ``NO_CELL``.
+        turn: Of an agent that enters at this token, its turn among those that do; -1 for
+            all others, ``OUTSIDE`` for who enters outside the grid.
+    """
+
+    kind: Int64[Tensor, "scene agent"]
+    size_lwh_m: Float32[Tensor, "scene agent 3"]
+    near: Bool[Tensor, "scene agent"]
+    pose: Float32[Tensor, "scene token agent 3"]
+    move: Int64[Tensor, "scene token agent"]
+    presence: Int64[Tensor, "scene token agent"]
+    observed: Bool[Tensor, "scene token agent"]
+    cell: Int64[Tensor, "scene token agent"]
+    turn: Int64[Tensor, "scene token agent"]
+
+    @property
+    def visible(self) -> Bool[Tensor, "scene token agent"]:
+        """Whether others can see the agent: it is observed, or just entering."""
+        return self.observed | (self.presence == Presence.ENTERING)
+
+
+@dataclass(frozen=True, slots=True)
+class Roads:
+    """The maps of all scenes.
+
+    Attributes:
+        real: False for padding.
+        pose: First point and heading.
+        token: Row of the map codebook.
+        point_kind: ``PointKind``.
+        line_kind: ``LineKind``.
+        signal: ``SignalClass`` at the end of the history.
+        follows: Whether the road token before it is its predecessor on the same line.
+        picked: Whether it is hidden where road tokens are predicted.
+    """
+
+    real: Bool[Tensor, "scene road"]
+    pose: Float32[Tensor, "scene road 3"]
+    token: Int64[Tensor, "scene road"]
+    point_kind: Int64[Tensor, "scene road"]
+    line_kind: Int64[Tensor, "scene road"]
+    signal: Int64[Tensor, "scene road"]
+    follows: Bool[Tensor, "scene road"]
+    picked: Bool[Tensor, "scene road"]
+
+
+@dataclass(frozen=True, slots=True)
+class Entries:
+    """Who enters when.
+
+    Attributes:
+        asked: Whether newcomers are asked for at this token (never at the first).
+        count: Newcomers within the grid at this token, also those beyond the last slot.
+        agent: The newcomer of each turn, or ``NOBODY``.
+        cell: Its cell; 0 where there is nobody.
+    """
+
+    asked: Bool[Tensor, "scene token"]
+    count: Int64[Tensor, "scene token"]
+    agent: Int64[Tensor, "scene token slot"]
+    cell: Int64[Tensor, "scene token slot"]
+
+
+@dataclass(frozen=True, slots=True)
+class Details:
+    """Agents described at the cell they enter at.
+
+    Attributes:
+        present: False for padding.
+        newcomer: Whether the agent does enter; else it is there already and plays the part.
+        agent: Row of the agent, hidden from its own query.
+        token: When.
+        turn: Newcomers of this turn and later are hidden as well.
+        cell: Where.
+        kind: ``AgentKind``.
+        size_lwh_m: Its box.
+        heading: Heading bin relative to the ego.
+        offset_m: Position less the cell's centre, in the ego's grid frame.
+    """
+
+    present: Bool[Tensor, "scene detail"]
+    newcomer: Bool[Tensor, "scene detail"]
+    agent: Int64[Tensor, "scene detail"]
+    token: Int64[Tensor, "scene detail"]
+    turn: Int64[Tensor, "scene detail"]
+    cell: Int64[Tensor, "scene detail"]
+    kind: Int64[Tensor, "scene detail"]
+    size_lwh_m: Float32[Tensor, "scene detail 3"]
+    heading: Int64[Tensor, "scene detail"]
+    offset_m: Float32[Tensor, "scene detail 2"]
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Several scenes side by side."""
+
+    scenario_ids: tuple[str, ...]
+    agents: Agents
+    roads: Roads
+    entries: Entries
+    details: Details
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """How much of a scene a batch holds.
+
+    Attributes:
+        agents: Agents, nearest to the ego first.
+        roads: Road tokens, nearest to the ego's path first.
+        entries: Newcomers per half second.
+        tokens: Half seconds; of a longer log a part is taken.
+        grid: Settings the scenes were tokenized with.
+    """
+
+    agents: int
+    roads: int
+    entries: int
+    tokens: int
+    grid: TokenSettings
+
+    @classmethod
+    def of(
+        cls, model: ModelSettings, train: TrainSettings, grid: TokenSettings
+    ) -> "Limits":
+        """Take the limits from the settings."""
+        return cls(
+            train.max_agents, train.max_roads, model.max_entries, train.max_tokens, grid
+        )
+
+
+def collate(records: Sequence[SceneTokens], limits: Limits, draw: int) -> Batch:
+    """Put scenes side by side.
+
+    Args:
+        records: The scenes.
+        limits: How much of each is taken.
+        draw: Which of the many views of a scene to take: it decides the part of a long log,
+            the hidden road tokens and who plays newcomer. Equal draws, equal batches.
+    """
+    scenes = [_scene(record, limits, draw) for record in records]
+    return Batch(
+        scenario_ids=tuple(record.scenario_id for record in records),
+        agents=_pad([scene[0] for scene in scenes], Agents),
+        roads=_pad([scene[1] for scene in scenes], Roads),
+        entries=_pad([scene[2] for scene in scenes], Entries),
+        details=_pad([scene[3] for scene in scenes], Details),
+    )
+
+
+def collate_roads(records: Sequence[SceneTokens], max_roads: int) -> Roads:
+    """Put only the maps of scenes side by side, with nothing hidden."""
+    maps = []
+    for record in records:
+        window = cut_window(record, 0, record.num_tokens, record.num_agents, max_roads)
+        maps.append(_roads(window, np.zeros(len(window.roads), dtype=bool)))
+    return _pad(maps, Roads)
+
+
+def to_device(batch: T, device: torch.device) -> T:
+    """Move every tensor of a batch, or of a part of one."""
+    if isinstance(batch, Tensor):
+        return batch.to(device)  # type: ignore[return-value]
+    if not is_dataclass(batch):
+        return batch
+    parts = {f.name: to_device(getattr(batch, f.name), device) for f in fields(batch)}
+    return replace(batch, **parts)  # type: ignore[type-var]
+
+
+_Arrays = dict[str, np.ndarray]
+
+
+def _scene(
+    record: SceneTokens, limits: Limits, draw: int
+) -> tuple[_Arrays, _Arrays, _Arrays, _Arrays]:
+    """Arrays of agents, roads, entries and details of one scene."""
+    digest = hashlib.sha256(f"{draw}/{record.scenario_id}".encode()).digest()
+    random = np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
+    spare = max(0, record.num_tokens - limits.tokens)
+    start = int(random.integers(spare + 1))
+    window = cut_window(record, start, limits.tokens, limits.agents, limits.roads)
+    turn = _turns(window)
+    entries = _entries(window, turn, limits.entries)
+    details = _details(window, entries, make_grid(limits.grid), random)
+    picked = random.random(len(window.roads)) < PICKED_SHARE
+    return _agents(window, turn), _roads(window, picked), entries, details
+
+
+def _agents(window: SceneWindow, turn: np.ndarray) -> _Arrays:
+    return {
+        "kind": window.kind,
+        "size_lwh_m": window.size_lwh_m,
+        "near": window.near,
+        "pose": window.pose.swapaxes(0, 1),
+        "move": window.move.T,
+        "presence": window.presence.T,
+        "observed": window.observed.T,
+        "cell": window.cell.T,
+        "turn": turn.T,
+    }
+
+
+def _roads(window: SceneWindow, picked: np.ndarray) -> _Arrays:
+    record, rows = window.record, window.roads
+    line = record.road_line[rows]
+    follows = np.zeros(len(rows), dtype=bool)
+    follows[1:] = (np.diff(rows) == 1) & (np.diff(line) == 0)
+    return {
+        "real": np.ones(len(rows), dtype=bool),
+        "pose": record.road_pose[rows],
+        "token": record.road_token[rows],
+        "point_kind": record.road_point_kind[rows],
+        "line_kind": record.road_line_kind[rows],
+        "signal": record.road_signal[rows],
+        "follows": follows,
+        "picked": picked,
+    }
+
+
+def _turns(window: SceneWindow) -> np.ndarray:
+    """Turn of every agent among the newcomers of its token [agent, token]."""
+    turn = np.full(window.presence.shape, -1, dtype=np.int64)
+    turn[window.presence == Presence.ENTERING] = OUTSIDE
+    turn[0] = -1  # The ego is always there to be seen.
+    inside = (window.entry_cell != NO_CELL) & (window.entry_row > 0)
+    row, token = window.entry_row[inside], window.entry_token[inside]
+    first = np.searchsorted(token, token)  # Tokens ascend: first newcomer of each.
+    turn[row, token] = np.arange(len(token)) - first
+    return turn
+
+
+def _entries(window: SceneWindow, turn: np.ndarray, limit: int) -> _Arrays:
+    tokens = turn.shape[1]
+    inside = (turn >= 0) & (turn < OUTSIDE)
+    asked = np.arange(tokens) > 0
+    count = inside.sum(axis=0)
+    slots = 1 + min(limit, int(count[1:].max(initial=0)))
+    agent = np.full((tokens, slots), NOBODY, dtype=np.int64)
+    row, token = np.nonzero(inside & (turn < slots) & asked)
+    agent[token, turn[row, token]] = row
+    cell = np.where(agent >= 0, window.cell[agent, np.arange(tokens)[:, None]], 0)
+    return {"asked": asked, "count": count, "agent": agent, "cell": cell}
+
+
+def _details(
+    window: SceneWindow, entries: _Arrays, grid: Any, random: np.random.Generator
+) -> _Arrays:
+    """Newcomers in order, then agents that are there already and play the part."""
+    token, turn = np.nonzero(entries["agent"] >= 0)
+    row = entries["agent"][token, turn]
+    there = (window.presence == Presence.PRESENT) & window.observed
+    there &= window.cell != NO_CELL
+    there[0], there[:, 0] = False, False
+    players = np.argwhere(there)  # [player, (agent, token)]
+    few = min(len(players), PSEUDO_PER_TOKEN * (there.shape[1] - 1))
+    players = players[np.sort(random.permutation(len(players))[:few])]
+
+    rows = np.concatenate([row, players[:, 0]])
+    tokens = np.concatenate([token, players[:, 1]])
+    pose, ego_pose = window.pose[rows, tokens], window.pose[0, tokens]
+    cell = window.cell[rows, tokens]
+    return {
+        "present": np.ones(len(rows), dtype=bool),
+        "newcomer": np.arange(len(rows)) < len(row),
+        "agent": rows,
+        "token": tokens,
+        "turn": np.concatenate([turn, np.zeros(few, dtype=np.int64)]),
+        "cell": cell,
+        "kind": window.kind[rows],
+        "size_lwh_m": window.size_lwh_m[rows],
+        "heading": encode_heading(pose[:, 2] - ego_pose[:, 2], grid),
+        "offset_m": to_grid(pose[:, :2], ego_pose) - grid.centre_m[cell],
+    }
+
+
+_PADDING = {"move": NO_MOVE, "cell": NO_CELL, "turn": -1, "agent": NOBODY}
+
+
+def _pad(scenes: Sequence[_Arrays], kind: type[T]) -> T:
+    """Stack arrays of different sizes, filled up at their ends."""
+    tensors = {}
+    for name in scenes[0]:
+        parts = [scene[name] for scene in scenes]
+        shape = np.max([part.shape for part in parts], axis=0)
+        dtype = parts[0].dtype if parts[0].dtype.kind in "fb" else np.dtype(np.int64)
+        fill = _PADDING.get(name, 0)
+        padded = np.full((len(parts), *shape), fill, dtype=dtype)
+        for row, part in enumerate(parts):
+            padded[row][tuple(slice(size) for size in part.shape)] = part
+        tensors[name] = torch.from_numpy(padded)
+    return kind(**tensors)

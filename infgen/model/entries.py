@@ -1,0 +1,143 @@
+"""Newcomers: whether one enters, in which cell, and who it is.
+
+Shape letters as in ``layers``; S are the turns of newcomers within one half second.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from infgen.config import ModelSettings
+from infgen.model.agents import KINDS
+from infgen.model.layers import Attention, Seen, embedding_mlp, mlp
+from infgen.model.relations import relation_embedding
+from infgen.model.sight import Reach
+from infgen.tokens.grid import Grid
+
+OFFSET_REACH_STEPS = 2 / 3
+"""Offsets lie within so many grid steps of a cell's centre (2 m for 3 m cells)."""
+
+
+class QueryBlock(nn.Module):
+    """One look at the roads and at the agents around a query."""
+
+    def __init__(self, settings: ModelSettings) -> None:
+        super().__init__()
+        width, heads, dropout = settings.width, settings.heads, settings.dropout
+        self.roads = Attention(width, heads, dropout, bipartite=True)
+        self.agents = Attention(width, heads, dropout, bipartite=True)
+
+    def forward(self, x: Tensor, roads: Seen, agents: Seen) -> Tensor:
+        """Update queries [N, D], or [N, S, D]."""
+        updated: Tensor = self.agents(self.roads(x, roads), agents)
+        return updated
+
+
+class CellStack(nn.Module):
+    """Ask, from the ego's pose, whether one more agent enters and where (SPEC 4.6).
+
+    Slots differ only by which newcomers they see: as neighbours, and in the occupancy,
+    which is one pooled embedding of all occupied cells (not one token per cell).
+    """
+
+    def __init__(self, settings: ModelSettings, grid: Grid) -> None:
+        super().__init__()
+        width, bands = settings.width, settings.fourier_bands
+        self.settings = settings
+        self.num_cells = grid.num_cells
+        self.query = nn.Embedding(1, width)
+        self.occupancy = mlp(grid.num_cells, width, width)
+        self.roads_relation = relation_embedding(settings.query_radius_m, bands, width)
+        self.agents_relation = relation_embedding(settings.query_radius_m, bands, width)
+        self.blocks = nn.ModuleList(
+            QueryBlock(settings) for _ in range(settings.scene_blocks)
+        )
+        self.add = mlp(width, width, 1)
+        self.cell = mlp(width, width, grid.num_cells)
+
+    def roads_reach(self) -> Reach:
+        """How the query sees roads."""
+        s = self.settings
+        return Reach.of(s.query_radius_m, s.query_map_neighbours, self.roads_relation)
+
+    def agents_reach(self, agents: int) -> Reach:
+        """How the query sees agents: all of them within its radius."""
+        return Reach.of(self.settings.query_radius_m, agents, self.agents_relation)
+
+    def forward(self, occupied: Tensor, roads: Seen, agents: Seen) -> Tensor:
+        """Answer queries: features [N, S, D].
+
+        Args:
+            occupied: 1 where a slot sees an agent in a cell, else 0 [N, S, cell].
+            roads: Road tokens around the ego, the same for all slots.
+            agents: Agents around the ego; ``present`` differs by slot.
+        """
+        x = self.query.weight[0] + self.occupancy(occupied)
+        for block in self.blocks:
+            x = block(x, roads, agents)
+        return x
+
+    def occupied(self, cell: Tensor, seen: Tensor) -> Tensor:
+        """Mark the cells [..., cell] that hold an agent that is seen.
+
+        Args:
+            cell: Cell of each agent [..., agent]; negative for none.
+            seen: Whether it is seen [..., agent].
+        """
+        held = torch.where(seen & (cell >= 0), cell, self.num_cells)
+        marks = torch.zeros((*held.shape[:-1], self.num_cells + 1), device=cell.device)
+        return marks.scatter(-1, held, 1.0)[..., :-1]
+
+
+class DetailStack(nn.Module):
+    """Ask, from the centre of a cell, who enters there and how it stands (SPEC 4.7)."""
+
+    centre_m: Tensor
+
+    def __init__(self, settings: ModelSettings, grid: Grid) -> None:
+        super().__init__()
+        width, bands = settings.width, settings.fourier_bands
+        self.settings = settings
+        self.reach_m = OFFSET_REACH_STEPS * grid.step_m
+        centre_m = torch.from_numpy(grid.centre_m.copy())
+        self.register_buffer("centre_m", centre_m, persistent=False)
+        self.query = nn.Embedding(1, width)
+        self.cells = embedding_mlp(2, width)
+        self.roads_relation = relation_embedding(settings.heading_radius_m, bands, width)
+        self.agents_relation = relation_embedding(settings.heading_radius_m, bands, width)
+        self.blocks = nn.ModuleList(
+            QueryBlock(settings) for _ in range(settings.scene_blocks)
+        )
+        self.kind = mlp(width, width, len(KINDS))
+        self.given_kind = nn.Embedding(len(KINDS), width)
+        self.size = mlp(width, width, 3)
+        self.heading = mlp(width, width, grid.num_headings)
+        self.offset = mlp(width, width, 2)
+
+    def roads_reach(self) -> Reach:
+        """How the query sees roads."""
+        s = self.settings
+        return Reach.of(s.heading_radius_m, s.heading_map_neighbours, self.roads_relation)
+
+    def agents_reach(self) -> Reach:
+        """How the query sees agents."""
+        s = self.settings
+        return Reach.of(
+            s.heading_radius_m, s.heading_agent_neighbours, self.agents_relation
+        )
+
+    def forward(self, cell: Tensor, roads: Seen, agents: Seen) -> Tensor:
+        """Describe the cells [N]: features [N, D]."""
+        x: Tensor = self.query.weight[0] + self.cells(self.centre_m[cell])
+        for block in self.blocks:
+            x = block(x, roads, agents)
+        return x
+
+    def given(self, x: Tensor, kind: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Size (log of metres), heading logits and offset (metres), once the kind is known.
+
+        Args:
+            x: Features [..., D].
+            kind: ``AgentKind`` [...].
+        """
+        x = x + self.given_kind(kind)
+        return self.size(x), self.heading(x), self.reach_m * torch.tanh(self.offset(x))

@@ -1,0 +1,244 @@
+"""Small parts the network is built from.
+
+Shape letters: N targets, S slots of one target, K neighbours of a target, D width, H heads,
+C width of one head, F scalars, P nodes of a table.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+FEED_FORWARD = 4
+"""The feed-forward part is so many times as wide as the features."""
+HIDDEN_SCORE = -1e9
+"""Score of what a target does not see: its weight is exactly zero beside any other."""
+
+
+def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    """Two linear layers with a norm between: heads, and embeddings of one scalar."""
+    return nn.Sequential(
+        nn.Linear(inputs, width),
+        nn.LayerNorm(width),
+        nn.ReLU(),
+        nn.Linear(width, outputs),
+    )
+
+
+def embedding_mlp(inputs: int, width: int) -> nn.Sequential:
+    """Three linear layers with norms between: embeddings of several numbers."""
+    return nn.Sequential(
+        nn.Linear(inputs, width), nn.LayerNorm(width), nn.ReLU(), *mlp(width, width, width)
+    )
+
+
+def normed(x: Tensor) -> Tensor:
+    """Bring features [..., D] to mean 0 and variance 1, without a learned gain."""
+    return functional.layer_norm(x, x.shape[-1:])
+
+
+def gather(features_ND: Tensor, index: Tensor) -> Tensor:
+    """Take rows of features by an index of any shape: [*index, D].
+
+    An embedding look-up: its gradient is summed in order, on every device.
+    """
+    return functional.embedding(index, features_ND)
+
+
+def initialise(module: nn.Module) -> None:
+    """Xavier weights, zero biases, small embeddings (SPEC 4.1). For ``Module.apply``."""
+    if isinstance(module, nn.Linear):
+        nn.init.xavier_uniform_(module.weight)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
+    elif isinstance(module, nn.Embedding):
+        nn.init.normal_(module.weight, std=0.02)
+
+
+class FourierEmbedding(nn.Module):
+    """A few scalars as one feature: each through learned waves and an MLP, then summed."""
+
+    def __init__(self, scalars: int, bands: int, width: int) -> None:
+        super().__init__()
+        self.frequency = nn.Embedding(scalars, bands)
+        self.scalars = nn.ModuleList(
+            mlp(2 * bands + 1, width, width) for _ in range(scalars)
+        )
+        self.out = nn.Sequential(nn.LayerNorm(width), nn.ReLU(), nn.Linear(width, width))
+
+    def scalar(self, number: int, value: Tensor) -> Tensor:
+        """Embed one of the scalars: [...] to [..., D]."""
+        phase = 2 * math.pi * value[..., None] * self.frequency.weight[number]
+        waves = torch.cat([phase.cos(), phase.sin(), value[..., None]], dim=-1)
+        embedded: Tensor = self.scalars[number](waves)
+        return embedded
+
+    def forward(self, values: Tensor, more: Tensor | None = None) -> Tensor:
+        """Embed scalars [..., F], and add features [..., D] before the last layer."""
+        parts = [self.scalar(i, values[..., i]) for i in range(len(self.scalars))]
+        parts += [] if more is None else [more]
+        embedded: Tensor = self.out(torch.stack(parts).sum(dim=0))
+        return embedded
+
+
+class RelationEmbedding(FourierEmbedding):
+    """A Fourier embedding of relations, read from tables instead of computed per pair.
+
+    Every scalar's function is evaluated at evenly spaced nodes and is linear between them:
+    a few thousand evaluations instead of one per pair of neighbours. Training and
+    simulation use the same tables, so there is no difference between the two.
+    """
+
+    def __init__(
+        self, ranges: Sequence[tuple[float, float, int]], bands: int, width: int
+    ) -> None:
+        """Make tables of (first node, last node, number of nodes) per scalar."""
+        super().__init__(len(ranges), bands, width)
+        self.ranges = tuple(ranges)
+
+    def table(self) -> Tensor:
+        """Evaluate all scalars at their nodes: [P, D], one scalar after the other."""
+        device = self.frequency.weight.device
+        return torch.cat(
+            [
+                self.scalar(i, torch.linspace(first, last, nodes, device=device))
+                for i, (first, last, nodes) in enumerate(self.ranges)
+            ]
+        )
+
+    def look_up(self, values: Tensor, table_PD: Tensor) -> Tensor:
+        """Embed relations [N, K, F] by a table: normed features [N, K, D]."""
+        first = values.new_tensor([low for low, _, _ in self.ranges])
+        gaps = values.new_tensor([nodes - 1 for _, _, nodes in self.ranges])
+        span = values.new_tensor([high - low for low, high, _ in self.ranges])
+        position = ((values - first) * (gaps / span)).clamp(min=0).minimum(gaps)
+        lower = position.floor().minimum(gaps - 1)
+        share = position - lower
+
+        starts = torch.tensor([0, *(nodes for _, _, nodes in self.ranges[:-1])])
+        node = lower.long() + starts.cumsum(0).to(values.device)
+        bags = torch.cat([node, node + 1], dim=-1).flatten(0, -2)  # [pair, 2 F]
+        shares = torch.cat([1 - share, share], dim=-1).flatten(0, -2)
+        summed = functional.embedding_bag(
+            bags, table_PD, mode="sum", per_sample_weights=shares
+        )
+        return normed(self.out(summed)).view(*values.shape[:-1], table_PD.shape[1])
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What every target sees.
+
+    Attributes:
+        features: Normed features of its neighbours [N, K, D].
+        relation: Normed features of how they stand to it [N, K, D].
+        present: Which neighbours there are: [N, K], or [N, S, K] if slots differ.
+    """
+
+    features: Tensor
+    relation: Tensor
+    present: Tensor
+
+
+class Attention(nn.Module):
+    """Let targets look at their neighbours; gated update and feed-forward (SPEC 4.1).
+
+    Keys and values are ``W x + V r`` for a neighbour's features x and relation r. They are
+    never formed: the score ``q.(W x + V r)`` is ``(W'q).x + (V'q).r``, and the sum of
+    values is ``W sum(a x) + V sum(a r)``. So the work per pair is two short products per
+    head, and x and r, which many layers share, are all that is kept per pair. Gains and
+    biases of the norms of x and r are folded into the weights. A target without neighbours
+    still passes the gate and the feed-forward.
+    """
+
+    def __init__(self, width: int, heads: int, dropout: float, *, bipartite: bool) -> None:
+        super().__init__()
+        if width % heads:
+            raise ValueError(f"width {width} does not divide into {heads} heads")
+        self.heads = heads
+        self.dropout = dropout
+        self.norm_target = nn.LayerNorm(width)
+        self.norm_source = nn.LayerNorm(width) if bipartite else None
+        self.norm_relation = nn.LayerNorm(width)
+        self.query = nn.Linear(width, width)
+        self.key = nn.Linear(width, width, bias=False)
+        self.value = nn.Linear(width, width)
+        self.relation_key = nn.Linear(width, width, bias=False)
+        self.relation_value = nn.Linear(width, width, bias=False)
+        self.gate = nn.Linear(2 * width, width)
+        self.itself = nn.Linear(width, width)
+        self.out = nn.Linear(width, width)
+        self.norm_out = nn.LayerNorm(width)
+        self.feed_forward = nn.Sequential(
+            nn.LayerNorm(width),
+            nn.Linear(width, FEED_FORWARD * width),
+            nn.ReLU(),
+            nn.Dropout(dropout),
+            nn.Linear(FEED_FORWARD * width, width),
+            nn.LayerNorm(width),
+        )
+
+    def forward(self, target: Tensor, seen: Seen) -> Tensor:
+        """Update targets [N, D], or [N, S, D] whose slots share their neighbours."""
+        slots = target if target.dim() == 3 else target[:, None]
+        present = seen.present if seen.present.dim() == 3 else seen.present[:, None]
+        normal = self.norm_target(slots)
+        looked = self.look(normal, Seen(seen.features, seen.relation, present))
+        gate = torch.sigmoid(self.gate(torch.cat([looked, normal], dim=-1)))
+        update = looked + gate * (self.itself(normal) - looked)
+        slots = slots + self.norm_out(self.out(update))
+        slots = slots + self.feed_forward(slots)
+        return slots.view_as(target)
+
+    def look(self, normal_NSD: Tensor, seen: Seen) -> Tensor:
+        """Sum what each slot sees: [N, S, D]; ``seen.present`` is [N, S, K]."""
+        targets, slots, width = normal_NSD.shape
+        heads = (targets, slots, self.heads)
+        query = self.query(normal_NSD).view(*heads, width // self.heads)
+        source, relation = self._folded()
+        keys = [seen.features.transpose(1, 2), seen.relation.transpose(1, 2)]  # [N, D, K]
+        score = torch.bmm(_per_head(query, source[0]), keys[0])
+        score = torch.baddbmm(score, _per_head(query, relation[0]), keys[1])
+        score = score.view(*heads, seen.features.shape[1]) * query.shape[-1] ** -0.5
+
+        hidden = ~seen.present[:, :, None]  # [N, S, 1, K]
+        weight = score.masked_fill(hidden, HIDDEN_SCORE).softmax(dim=-1)
+        weight = functional.dropout(
+            weight.masked_fill(hidden, 0.0), self.dropout, self.training
+        )
+        flat = weight.flatten(1, 2)  # [N, S H, K]
+        from_source = torch.bmm(flat, seen.features).view(*heads, width)
+        from_relation = torch.bmm(flat, seen.relation).view(*heads, width)
+        value = torch.einsum("nshd,hcd->nshc", from_source, source[1])
+        value = value + torch.einsum("nshd,hcd->nshc", from_relation, relation[1])
+        bias = self._value_bias().view(self.heads, -1)  # [H, C]
+        return (value + weight.sum(dim=-1)[..., None] * bias).flatten(2)
+
+    def source_norm(self) -> nn.LayerNorm:
+        """Norm of the neighbours' features: the targets' own unless they differ."""
+        return self.norm_target if self.norm_source is None else self.norm_source
+
+    def _folded(self) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+        """Key and value weights [H, C, D] of source and relation, gains folded in."""
+
+        def fold(linear: nn.Linear, norm: nn.LayerNorm) -> Tensor:
+            return (linear.weight * norm.weight).view(self.heads, -1, len(norm.weight))
+
+        source, relation = self.source_norm(), self.norm_relation
+        return (
+            (fold(self.key, source), fold(self.value, source)),
+            (fold(self.relation_key, relation), fold(self.relation_value, relation)),
+        )
+
+    def _value_bias(self) -> Tensor:
+        """What biases add to every value [D]; what they add to keys cancels out."""
+        bias: Tensor = self.value(self.source_norm().bias)
+        return bias + self.relation_value(self.norm_relation.bias)
+
+
+def _per_head(query_NSHC: Tensor, weight_HCD: Tensor) -> Tensor:
+    """Bring queries to the space of normed features: [N, S H, D]."""
+    return torch.einsum("nshc,hcd->nshd", query_NSHC, weight_HCD).flatten(1, 2)

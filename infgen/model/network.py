@@ -1,0 +1,228 @@
+"""The whole network, and one pass over all tokens of a batch at once (training)."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from infgen.clock import CLOCK
+from infgen.config import ModelSettings, TokenSettings
+from infgen.model.agents import AgentEmbedding, AgentRows, MotionStack, Sight
+from infgen.model.batch import Agents, Batch, Details, Entries
+from infgen.model.entries import CellStack, DetailStack
+from infgen.model.layers import Seen, initialise, normed
+from infgen.model.outputs import (
+    DetailOutputs,
+    EntryOutputs,
+    MotionOutputs,
+    Outputs,
+    RoadOutputs,
+)
+from infgen.model.relations import Rows, relations
+from infgen.model.roads import RoadEncoder, RoadFeatures
+from infgen.model.sight import cell_pose, look_around, see_roads
+from infgen.tokens.codebook import MotionCodebook, RoadCodebook
+from infgen.tokens.grid import Grid, make_grid
+
+EGO = 0
+"""Row of the ego, in batches as in simulation."""
+
+
+class Network(nn.Module):
+    """Roads, agents and newcomers in one network (SPEC 4).
+
+    It carries its codebooks, so weights on disk need nothing beside them.
+    """
+
+    def __init__(
+        self,
+        settings: ModelSettings,
+        motion: MotionCodebook,
+        roads: RoadCodebook,
+        grid: TokenSettings,
+    ) -> None:
+        super().__init__()
+        self.settings = settings
+        self.grid_settings = grid
+        cells = make_grid(grid)
+        for name, array in (
+            ("motion_size_lw_m", motion.size_lw_m),
+            ("motion_path", motion.path),
+            ("motion_real", motion.real),
+            ("road_curve_m", roads.curve_m),
+            ("road_real", roads.real),
+        ):
+            self.register_buffer(name, torch.from_numpy(array.copy()))
+        self.roads = RoadEncoder(settings, roads)
+        self.embed = AgentEmbedding(settings, motion, cells)
+        self.motion = MotionStack(settings, motion.num_moves, CLOCK.token_s)
+        self.cells = CellStack(settings, cells)
+        self.details = DetailStack(settings, cells)
+        self.apply(initialise)
+
+    @property
+    def grid(self) -> Grid:
+        """Cells and heading bins that entries are told in."""
+        return make_grid(self.grid_settings)
+
+    def motion_codebook(self) -> MotionCodebook:
+        """Return the moves that motion logits choose from."""
+        names = ("motion_size_lw_m", "motion_path", "motion_real")
+        return MotionCodebook(*(self.get_buffer(n).numpy(force=True) for n in names))
+
+    def road_codebook(self) -> RoadCodebook:
+        """Return the shapes of road tokens."""
+        names = ("road_curve_m", "road_real")
+        return RoadCodebook(*(self.get_buffer(n).numpy(force=True) for n in names))
+
+    def forward(self, batch: Batch, *, hidden_roads: bool = False) -> Outputs:
+        """Compute all logits, every token given the true ones before it.
+
+        Args:
+            batch: The scenes.
+            hidden_roads: Also predict hidden road tokens (a second pass over the maps).
+        """
+        roads = self.roads(batch.roads)
+        agents = batch.agents
+        rows = Rows.where(agents.visible)
+        x = self.embed(_agent_rows(agents, rows), self.embed.tables())
+        raw = normed(x)
+        hidden = self.roads.predict_hidden(batch.roads) if hidden_roads else None
+        return Outputs(
+            motion=self._motion(agents, rows, x, roads),
+            entries=self._entries(agents, batch.entries, rows, raw, roads),
+            details=self._details(agents, batch.details, rows, raw, roads),
+            roads=None if hidden is None else RoadOutputs(*hidden),
+        )
+
+    def _motion(
+        self, agents: Agents, rows: Rows, x: Tensor, roads: RoadFeatures
+    ) -> MotionOutputs:
+        """Run the motion stack over the visible agents of all tokens."""
+        visible, scene = agents.visible, _count(agents.kind)
+        by_scene = Rows(rows.at, rows.number.flatten(1))
+        by_token = Rows(rows.at, rows.number.flatten(0, 1))
+        pose = agents.pose.flatten(0, 1)  # [scene token, agent, 3]
+        visible = visible.flatten(0, 1)
+        others = ~torch.eye(visible.shape[1], dtype=torch.bool, device=visible.device)
+        past_index, past_present, past_relation = self._past(agents, rows)
+        reach = self.motion.roads_reach()
+        sight = Sight(
+            past_relation,
+            past_present,
+            see_roads(reach, by_scene, agents.pose.flatten(1, 2), roads, scene),
+            look_around(
+                self.motion.agents_reach(),
+                by_token,
+                pose,
+                pose,
+                by_token.number,
+                visible[:, None] & visible[:, :, None] & others,
+            ),
+        )
+        x = self.motion(x, past_index, sight)
+        return MotionOutputs(rows, self.motion.move(x), self.motion.leave(x)[:, 0])
+
+    def _past(self, agents: Agents, rows: Rows) -> tuple[Tensor, Tensor, Tensor]:
+        """Rows, presence and relations of every row's own past, oldest first [N, K]."""
+        window = self.settings.window_tokens
+
+        def past(values: Tensor) -> Tensor:
+            padded = functional.pad(values, (0, 0, window, 0))  # [scene, token, agent]
+            return rows.pack(padded.unfold(1, window, 1)[:, :-1])
+
+        index, present = past(rows.number), past(agents.visible)
+        pose = rows.pack(agents.pose)
+        ago = torch.arange(-window, 0, device=pose.device, dtype=pose.dtype)
+        ago = ago.expand(len(index), window)[..., None]
+        described = torch.cat([relations(pose, pose[index]), ago], dim=-1)
+        relation = self.motion.past_relation
+        return index, present, relation.look_up(described, relation.table())
+
+    def _entries(
+        self,
+        agents: Agents,
+        entries: Entries,
+        rows: Rows,
+        raw: Tensor,
+        roads: RoadFeatures,
+    ) -> EntryOutputs:
+        """Ask for the newcomers of every token, each slot seeing those before it."""
+        asked = Rows.where(entries.asked)
+        alone = Rows(asked.at, asked.number.flatten()[:, None])
+        ego_pose = agents.pose[:, :, EGO]
+        around = look_around(
+            self.cells.agents_reach(agents.kind.shape[1]),
+            alone,
+            ego_pose.flatten(0, 1)[:, None],
+            agents.pose.flatten(0, 1),
+            rows.number.flatten(0, 1),
+            agents.visible.flatten(0, 1)[:, None],
+        )
+        slot = torch.arange(entries.agent.shape[2], device=raw.device)[:, None]
+        turn = asked.pack(agents.turn).gather(1, around.place)[:, None]  # [N, 1, K]
+        cell = asked.pack(agents.cell).gather(1, around.place)[:, None]
+        seen = around.seen(raw)
+        seen = Seen(seen.features, seen.relation, seen.present[:, None] & (turn < slot))
+        occupied = self.cells.occupied(cell.expand_as(seen.present), seen.present)
+        reach = self.cells.roads_reach()
+        roads_seen = see_roads(reach, asked, ego_pose, roads, _count(agents.kind))
+        x = self.cells(occupied, roads_seen, seen)
+        return EntryOutputs(asked, self.cells.add(x)[..., 0], self.cells.cell(x))
+
+    def _details(
+        self,
+        agents: Agents,
+        details: Details,
+        rows: Rows,
+        raw: Tensor,
+        roads: RoadFeatures,
+    ) -> DetailOutputs:
+        """Describe agents at the cells they enter at, without seeing them."""
+        wanted = Rows.where(details.present)
+        scene = wanted.at // details.present.shape[1]
+        token, cell = wanted.pack(details.token), wanted.pack(details.cell)
+        ego_pose = agents.pose[scene, token, EGO]
+        pose = cell_pose(ego_pose, self.details.centre_m[cell])
+        each = Rows(_count(pose), _count(pose)[:, None])
+
+        place = torch.arange(agents.kind.shape[1], device=raw.device)
+        turn = wanted.pack(details.turn)[:, None]
+        allowed = agents.visible[scene, token] & (agents.turn[scene, token] < turn)
+        allowed &= place != wanted.pack(details.agent)[:, None]
+        around = look_around(
+            self.details.agents_reach(),
+            each,
+            pose[:, None],
+            agents.pose[scene, token],
+            rows.number[scene, token],
+            allowed[:, None],
+        )
+        reach = self.details.roads_reach()
+        roads_seen = see_roads(reach, each, pose[:, None], roads, scene)
+        x = self.details(cell, roads_seen, around.seen(raw))
+        given = self.details.given(x, wanted.pack(details.kind))
+        return DetailOutputs(wanted, self.details.kind(x), *given)
+
+
+def _count(like: Tensor) -> Tensor:
+    return torch.arange(len(like), device=like.device)
+
+
+def _agent_rows(agents: Agents, rows: Rows) -> AgentRows:
+    """All visible agents, with where they were half a second earlier."""
+    visible = agents.visible
+    seen_before = torch.zeros_like(visible)
+    seen_before[:, 1:] = visible[:, :-1]
+    pose = agents.pose
+    before = torch.cat([pose[:, :1], pose[:, :-1]], dim=1)
+    tokens = pose.shape[1]
+    return AgentRows(
+        kind=rows.pack(agents.kind[:, None].expand(-1, tokens, -1)),
+        size_lwh_m=rows.pack(agents.size_lwh_m[:, None].expand(-1, tokens, -1, -1)),
+        pose=rows.pack(pose),
+        before=rows.pack(before),
+        known=rows.pack(seen_before),
+        move=rows.pack(agents.move),
+        presence=rows.pack(agents.presence),
+        cell=rows.pack(agents.cell),
+    )

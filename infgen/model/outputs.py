@@ -1,0 +1,74 @@
+"""Logits of one pass over a batch, as rows: nothing is computed for padding."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from infgen.model.relations import Rows
+
+
+@dataclass(frozen=True, slots=True)
+class MotionOutputs:
+    """What every visible agent does next.
+
+    Attributes:
+        rows: The visible agents among [scene, token, agent].
+        move_logits: [row, move], by the codebook of the agent's kind.
+        leave_logit: Log-odds that the next token is the agent's last [row].
+    """
+
+    rows: Rows
+    move_logits: Tensor
+    leave_logit: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class EntryOutputs:
+    """Whether one more agent enters, and where.
+
+    Attributes:
+        rows: The tokens that were asked among [scene, token].
+        add_logit: Log-odds of ADD against BEGIN MOTION [row, slot].
+        cell_logits: [row, slot, cell].
+    """
+
+    rows: Rows
+    add_logit: Tensor
+    cell_logits: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class DetailOutputs:
+    """Who enters at a cell, and how it stands.
+
+    Attributes:
+        rows: The agents described among [scene, detail].
+        kind_logits: [row, kind].
+        size_log_m: Logarithm of length, width, height, given the kind [row, 3].
+        heading_logits: Given the kind [row, heading].
+        offset_m: In the ego's grid frame, given the kind [row, 2].
+    """
+
+    rows: Rows
+    kind_logits: Tensor
+    size_log_m: Tensor
+    heading_logits: Tensor
+    offset_m: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class RoadOutputs:
+    """Hidden road tokens: their logits [prediction, token] and what they are."""
+
+    logits: Tensor
+    token: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """All logits of a batch; ``roads`` only if asked for."""
+
+    motion: MotionOutputs
+    entries: EntryOutputs
+    details: DetailOutputs
+    roads: RoadOutputs | None

@@ -1,0 +1,181 @@
+"""Who sees whom, and how they stand to each other.
+
+Neighbour lists are padded rows of the nearest sources within a radius: no edge lists, no
+order that depends on the device. Nothing here is learned and nothing is differentiated.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor
+
+from infgen.model.layers import RelationEmbedding
+
+BLOCK_PAIRS = 1 << 22
+"""Distances held at once while neighbours are searched."""
+SQUARE_PER_M2 = 1024
+"""Squared distances are compared in units of 1/1024 m2, so that rounding makes no order."""
+INDEX_BITS = 20
+NO_DIRECTION_M = 0.01
+"""Nearer points have no direction: rounding would decide it."""
+
+ANGLE_NODES = 1025
+DISTANCE_STEP_M = 0.05
+"""Between two nodes of the tables of distances."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """The places of a padded array that hold something, as consecutive rows.
+
+    Attributes:
+        at: Flat index of each row in the padded array.
+        number: Row of each place of the padded array; 0 where there is none.
+    """
+
+    at: Int64[Tensor, " row"]
+    number: Int64[Tensor, "..."]
+
+    @classmethod
+    def where(cls, real: Bool[Tensor, "..."]) -> "Rows":
+        """Number the true places of a mask in order."""
+        at = real.flatten().nonzero()[:, 0]
+        number = torch.zeros(real.numel(), dtype=torch.int64, device=real.device)
+        number[at] = torch.arange(len(at), device=real.device)
+        return cls(at, number.view(real.shape))
+
+    def pack(self, padded: Tensor) -> Tensor:
+        """Take the rows out of an array whose first dimensions are the mask's."""
+        return padded.flatten(0, self.number.dim() - 1)[self.at]
+
+    def spread(self, rows: Tensor) -> Tensor:
+        """Put rows back to their places, zeros elsewhere. Inverse of ``pack``."""
+        padded = rows.new_zeros((self.number.numel(), *rows.shape[1:]))
+        padded = padded.index_copy(0, self.at, rows)
+        return padded.view(*self.number.shape, *rows.shape[1:])
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbours:
+    """The nearest sources of every target.
+
+    Attributes:
+        index: Position among the group's sources; 0 where there is none.
+        present: Which of them there are, nearest first.
+    """
+
+    index: Int64[Tensor, "group target neighbour"]
+    present: Bool[Tensor, "group target neighbour"]
+
+
+@torch.no_grad()
+def nearest(
+    target_xy_m: Float32[Tensor, "group target 2"],
+    source_xy_m: Float32[Tensor, "group source 2"],
+    allowed: Bool[Tensor, " group #target source"],
+    radius_m: float,
+    count: int,
+) -> Neighbours:
+    """Find the ``count`` nearest allowed sources within a radius; ties by position."""
+    groups, targets = target_xy_m.shape[:2]
+    sources = source_xy_m.shape[1]
+    count = min(count, sources)
+    if not count or not targets or not groups:
+        empty = torch.zeros((groups, targets, 0), dtype=torch.int64)
+        empty = empty.to(target_xy_m.device)
+        return Neighbours(empty, empty.bool())
+    allowed = allowed.expand(groups, targets, sources)
+    block = max(1, BLOCK_PAIRS // (groups * sources))
+    parts = [
+        _nearest_keys(
+            target_xy_m[:, at : at + block],
+            source_xy_m,
+            allowed[:, at : at + block],
+            radius_m,
+            count,
+        )
+        for at in range(0, targets, block)
+    ]
+    key = torch.cat(parts, dim=1)
+    present = key < _NOBODY
+    most = int(present.sum(dim=-1).max())  # The rest would be padding for everyone.
+    key, present = key[..., :most], present[..., :most]
+    index = torch.where(present, key & ((1 << INDEX_BITS) - 1), 0)
+    return Neighbours(index, present)
+
+
+_NOBODY = 1 << 62
+
+
+def within_radius(
+    pose: Float32[Tensor, "*pair 3"], other: Float32[Tensor, "*pair 3"], radius_m: float
+) -> Bool[Tensor, "*pair"]:
+    """Tell which poses are within a radius, exactly as ``nearest`` does."""
+    return _square(pose[..., :2] - other[..., :2]) <= _square_limit(radius_m)
+
+
+def _square(away_m: Tensor) -> Tensor:
+    """Squared distances in whole units."""
+    return (away_m.square().sum(dim=-1) * SQUARE_PER_M2).round().long()
+
+
+def _square_limit(radius_m: float) -> int:
+    return round(radius_m**2 * SQUARE_PER_M2)
+
+
+def _nearest_keys(
+    target_xy_m: Tensor, source_xy_m: Tensor, allowed: Tensor, radius_m: float, count: int
+) -> Tensor:
+    """Smallest keys [group, target, count]: squared distance, then position."""
+    square = _square(target_xy_m[:, :, None] - source_xy_m[:, None])
+    position = torch.arange(source_xy_m.shape[1], device=square.device)
+    key = (square << INDEX_BITS) | position
+    seen = allowed & (square <= _square_limit(radius_m))
+    return key.masked_fill(~seen, _NOBODY).topk(count, dim=-1, largest=False).values
+
+
+def wrap_angle(angle_rad: Tensor) -> Tensor:
+    """Bring angles to [-pi, pi]."""
+    return angle_rad - 2 * math.pi * torch.round(angle_rad / (2 * math.pi))
+
+
+def direction(away_m: Float32[Tensor, "*pair 2"], heading_rad: Tensor) -> Tensor:
+    """Direction [*pair] of displacements, seen from a heading; 0 where there is none."""
+    angle_rad = torch.atan2(away_m[..., 1], away_m[..., 0])
+    some = away_m.square().sum(dim=-1) > NO_DIRECTION_M**2
+    return torch.where(some, wrap_angle(angle_rad - heading_rad), 0.0)
+
+
+@torch.no_grad()
+def relations(
+    target_pose: Float32[Tensor, "target 3"],
+    source_pose: Float32[Tensor, "target neighbour 3"],
+) -> Float32[Tensor, "target neighbour 3"]:
+    """Describe neighbours to their target: distance, direction, relative heading."""
+    away_m = source_pose[..., :2] - target_pose[:, None, :2]
+    distance_m = away_m.square().sum(dim=-1).sqrt()
+    heading_rad = target_pose[:, None, 2]
+    turned_rad = wrap_angle(source_pose[..., 2] - heading_rad)
+    return torch.stack([distance_m, direction(away_m, heading_rad), turned_rad], dim=-1)
+
+
+def relation_embedding(
+    radius_m: float, bands: int, width: int, past_tokens: int = 0
+) -> RelationEmbedding:
+    """Make the embedding of one family of relations.
+
+    Args:
+        radius_m: Largest distance that its table tells apart.
+        bands: Frequencies per scalar.
+        width: Of the features.
+        past_tokens: If not 0, relations end in a time difference of -1 to so many tokens.
+    """
+    turn = (-math.pi, math.pi, ANGLE_NODES)
+    nodes = math.ceil(radius_m / DISTANCE_STEP_M) + 1
+    ranges = [(0.0, radius_m, nodes), turn, turn]
+    if past_tokens:
+        # One node more than there are tokens, so that a window of one is a range too.
+        ranges.append((-float(past_tokens), 0.0, past_tokens + 1))
+    return RelationEmbedding(ranges, bands, width)

@@ -1,0 +1,121 @@
+"""What agents and queries see of roads and of each other, as ``layers.Seen``.
+
+Shared by training (all tokens at once) and simulation (one token of many rollouts), so that
+both see the same. Dims: group (a scene, a rollout, or one token of it), target, source.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor
+
+from infgen.model.layers import RelationEmbedding, Seen, gather
+from infgen.model.relations import Rows, nearest, relations
+from infgen.model.roads import RoadFeatures
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """How far targets see, how many, and how what they see is embedded.
+
+    Attributes:
+        radius_m: Radius.
+        count: Nearest sources that are seen.
+        relation: Embedding of how sources stand to targets.
+        table: Its table.
+    """
+
+    radius_m: float
+    count: int
+    relation: RelationEmbedding
+    table: Tensor
+
+    @classmethod
+    def of(cls, radius_m: float, count: int, relation: RelationEmbedding) -> "Reach":
+        """Evaluate the relation's table for one pass."""
+        return cls(radius_m, count, relation, relation.table())
+
+
+@dataclass(frozen=True, slots=True)
+class Around:
+    """Neighbours of each row, not yet with features.
+
+    Attributes:
+        index: Rows of the neighbours [N, K].
+        relation: Normed features of how they stand to it [N, K, D].
+        present: Which of them there are [N, K].
+        place: Position of each neighbour among its group's sources [N, K].
+    """
+
+    index: Tensor
+    relation: Tensor
+    present: Tensor
+    place: Tensor
+
+    def seen(self, features: Tensor) -> Seen:
+        """Join with the features of all rows [row, D]."""
+        return Seen(gather(features, self.index), self.relation, self.present)
+
+
+def look_around(
+    reach: Reach,
+    targets: Rows,
+    target_pose: Float32[Tensor, "group target 3"],
+    source_pose: Float32[Tensor, "group source 3"],
+    source_row: Int64[Tensor, "group source"],
+    allowed: Bool[Tensor, " group #target source"],
+) -> Around:
+    """Find what every target row sees of its group's sources.
+
+    Args:
+        reach: How far and how many.
+        targets: Which places of [group, target] are rows.
+        target_pose: Poses of targets.
+        source_pose: Poses of sources.
+        source_row: Row of each source in the features it will be joined with.
+        allowed: Which sources each target may see.
+    """
+    found = nearest(
+        target_pose[..., :2], source_pose[..., :2], allowed, reach.radius_m, reach.count
+    )
+    place, present = targets.pack(found.index), targets.pack(found.present)
+    group = (targets.at // found.index.shape[1])[:, None]
+    described = relations(targets.pack(target_pose), source_pose[group, place])
+    return Around(
+        index=source_row[group, place],
+        relation=reach.relation.look_up(described, reach.table),
+        present=present,
+        place=place,
+    )
+
+
+def see_roads(
+    reach: Reach,
+    targets: Rows,
+    target_pose: Float32[Tensor, "group target 3"],
+    roads: RoadFeatures,
+    scene: Int64[Tensor, " group"],
+) -> Seen:
+    """Show every target row the road tokens around it; ``scene`` is each group's map."""
+    around = look_around(
+        reach,
+        targets,
+        target_pose,
+        roads.pose[scene],
+        roads.rows.number[scene],
+        roads.real[scene][:, None],
+    )
+    return around.seen(roads.features)
+
+
+def cell_pose(
+    ego_pose: Float32[Tensor, "*row 3"], centre_m: Float32[Tensor, "*row 2"]
+) -> Float32[Tensor, "*row 3"]:
+    """Poses at the centres of cells (ego's grid frame), facing as the ego does."""
+    turn_rad = ego_pose[..., 2] - math.pi / 2
+    cos, sin = turn_rad.cos(), turn_rad.sin()
+    x_m = cos * centre_m[..., 0] - sin * centre_m[..., 1] + ego_pose[..., 0]
+    y_m = sin * centre_m[..., 0] + cos * centre_m[..., 1] + ego_pose[..., 1]
+    return torch.stack([x_m, y_m, ego_pose[..., 2]], dim=-1)

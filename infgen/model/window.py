@@ -1,0 +1,119 @@
+"""A part of one tokenized scene: some half seconds, the nearest agents and roads."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int8, Int16, Int64
+
+from infgen.tokens.scene_tokens import FIRST_MOVE, Presence, SceneTokens
+
+
+@dataclass(frozen=True, slots=True)
+class SceneWindow:
+    """Part of a scene, as if the log began with it.
+
+    Agents are ordered from near to far, the ego first. Who is there at the first token
+    enters at it, as in a log that begins there.
+
+    Attributes:
+        record: The whole scene.
+        roads: Rows of the record's road tokens that are kept, ascending.
+        kind, size_lwh_m, near, pose, move, presence, observed, cell: As in the record.
+        entry_row: Row of each newcomer whose agent is kept ...
+        entry_token: ... its token, ascending from 0 ...
+        entry_cell: ... and its cell.
+    """
+
+    record: SceneTokens
+    roads: Int64[np.ndarray, " road"]
+    kind: Int8[np.ndarray, " agent"]
+    size_lwh_m: Float32[np.ndarray, "agent 3"]
+    near: Bool[np.ndarray, " agent"]
+    pose: Float32[np.ndarray, "agent token 3"]
+    move: Int16[np.ndarray, "agent token"]
+    presence: Int8[np.ndarray, "agent token"]
+    observed: Bool[np.ndarray, "agent token"]
+    cell: Int16[np.ndarray, "agent token"]
+    entry_row: Int64[np.ndarray, " entry"]
+    entry_token: Int64[np.ndarray, " entry"]
+    entry_cell: Int16[np.ndarray, " entry"]
+
+
+def cut_window(
+    record: SceneTokens, start: int, tokens: int, max_agents: int, max_roads: int
+) -> SceneWindow:
+    """Take ``tokens`` half seconds from ``start`` on, and what is nearest to the ego."""
+    stop = min(start + tokens, record.num_tokens)
+    presence, observed, move = _begin_at(record, start, stop)
+    visible = observed | (presence == Presence.ENTERING)
+    pose = record.pose[:, start:stop]
+    rows = _nearest_agents(pose, visible, record.ego)[:max_agents]
+    roads = _nearest_roads(record.road_pose, pose[record.ego], max_roads)
+
+    row_of = np.full(record.num_agents, -1, dtype=np.int64)
+    row_of[rows] = np.arange(len(rows))
+    entry_token = record.entry_token.astype(np.int64) - start
+    kept = (row_of[record.entry_agent] >= 0) & (entry_token >= 0)
+    kept &= entry_token < stop - start
+    return SceneWindow(
+        record=record,
+        roads=roads,
+        kind=record.kind[rows],
+        size_lwh_m=record.size_lwh_m[rows],
+        near=record.near[rows],
+        pose=pose[rows],
+        move=move[rows],
+        presence=presence[rows],
+        observed=observed[rows],
+        cell=record.cell[rows, start:stop],
+        entry_row=row_of[record.entry_agent[kept]],
+        entry_token=entry_token[kept],
+        entry_cell=record.entry_cell[kept],
+    )
+
+
+def _begin_at(
+    record: SceneTokens, start: int, stop: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Presence, observed and move of the window, everyone entering at its first token.
+
+    Who is not observed then enters when it is next observed. Who leaves at the first token
+    has no second one and is dropped.
+    """
+    presence = record.presence[:, start:stop].copy()
+    observed = record.observed[:, start:stop].copy()
+    move = record.move[:, start:stop].copy()
+    if start == 0:
+        return presence, observed, move
+    columns = np.arange(presence.shape[1])
+    before = record.presence[:, start - 1]
+    running = np.isin(before, (Presence.PRESENT, Presence.ENTERING))
+    first = np.where(observed.any(axis=1), observed.argmax(axis=1), len(columns))
+    leaves = presence[np.arange(len(first)), first.clip(max=len(columns) - 1)]
+    gone = running & ((first == len(columns)) | (leaves == Presence.LEAVING))
+
+    unseen = running[:, None] & (columns < first[:, None]) | gone[:, None]
+    presence[unseen], observed[unseen] = Presence.ABSENT, False
+    enters = running[:, None] & ~gone[:, None] & (columns == first[:, None])
+    presence[enters], observed[enters], move[enters] = Presence.ENTERING, False, FIRST_MOVE
+    return presence, observed, move
+
+
+def _nearest_agents(pose: np.ndarray, visible: np.ndarray, ego: int) -> np.ndarray:
+    """Rows of the agents that are there, by least distance to the ego, the ego first."""
+    away_m = pose[..., :2] - pose[ego, :, :2]
+    together = visible & visible[ego]
+    distance_m = np.where(together, np.hypot(away_m[..., 0], away_m[..., 1]), np.inf)
+    distance_m = distance_m.min(axis=1, initial=np.inf)
+    distance_m[ego] = -1.0
+    order = np.argsort(distance_m, kind="stable")
+    return order[visible[order].any(axis=1) | (order == ego)]
+
+
+def _nearest_roads(road_pose: np.ndarray, path: np.ndarray, limit: int) -> np.ndarray:
+    """Rows, ascending, of the road tokens nearest to the ego's path."""
+    if len(road_pose) <= limit:
+        return np.arange(len(road_pose))
+    away_m = road_pose[:, None, :2] - path[:, :2]  # [road, token, 2]
+    distance_m2 = (away_m**2).sum(axis=-1).min(axis=1)
+    return np.sort(np.argsort(distance_m2, kind="stable")[:limit])

@@ -1,0 +1,221 @@
+"""Everyone in a batch of rollouts: they enter, move and leave.
+
+Rows are places. An agent keeps its row for its life; after it has left, the row is free for
+the next newcomer. Row 0 is always the ego. Plain arrays; the network sees them as a
+``Column``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int8, Int16, Int32, Int64
+
+from infgen.geometry import to_world, wrap_angle
+from infgen.rollout.trace import NOBODY, Start
+from infgen.tokens.codebook import MotionCodebook
+from infgen.tokens.grid import (
+    Grid,
+    decode_cell,
+    decode_heading,
+    encode_cell,
+    from_grid,
+    to_grid,
+)
+from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
+
+EGO_ROW = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Population:
+    """All agents of all rollouts of a batch at the end of one half second.
+
+    Attributes:
+        life: Number of the agent in its rollout, or ``NOBODY`` in a free row.
+        born: Lives so far in each rollout.
+        kind: ``AgentKind``.
+        size_lwh_m: Boxes.
+        pose: x, y, heading in the scene's frame.
+        move: Move that led here, ``FIRST_MOVE`` where entering, else ``NO_MOVE``.
+        presence: ``Presence``; ``ABSENT`` in a free row.
+        observed: False where absent, entering, or (in the history) not seen by the log.
+    """
+
+    life: Int32[np.ndarray, "rollout row"]
+    born: Int32[np.ndarray, " rollout"]
+    kind: Int8[np.ndarray, "rollout row"]
+    size_lwh_m: Float32[np.ndarray, "rollout row 3"]
+    pose: Float32[np.ndarray, "rollout row 3"]
+    move: Int16[np.ndarray, "rollout row"]
+    presence: Int8[np.ndarray, "rollout row"]
+    observed: Bool[np.ndarray, "rollout row"]
+
+    def cells(self, grid: Grid) -> Int16[np.ndarray, "rollout row"]:
+        """Cell [rollout, row] of the ego's grid that holds each agent, or ``NO_CELL``."""
+        ego_pose = self.pose[:, EGO_ROW, None]
+        cell = encode_cell(to_grid(self.pose[..., :2], ego_pose), grid)
+        return np.where(self.presence == Presence.ABSENT, np.int16(NO_CELL), cell)
+
+
+@dataclass(frozen=True, slots=True)
+class Newcomers:
+    """At most one newcomer per rollout.
+
+    Attributes:
+        who: Rollouts that have one; the other entries mean nothing.
+        cell: Cell of the ego's grid.
+        offset_m: Position less the cell's centre, in the grid frame.
+        heading: Bin of the heading relative to the ego.
+        kind: ``AgentKind``.
+        size_lwh_m: Box.
+    """
+
+    who: Bool[np.ndarray, " rollout"]
+    cell: Int16[np.ndarray, " rollout"]
+    offset_m: Float32[np.ndarray, "rollout 2"]
+    heading: Int16[np.ndarray, " rollout"]
+    kind: Int8[np.ndarray, " rollout"]
+    size_lwh_m: Float32[np.ndarray, "rollout 3"]
+
+
+def settle(starts: Sequence[Start], min_rows: int) -> list[Population]:
+    """Give every agent of the histories a row, the ego first, then near to far.
+
+    Returns:
+        The population at every token of the history. At the last one poses are the log's
+        own, so that a rollout continues the log without a jump.
+
+    Raises:
+        ValueError: if the histories end at different tokens.
+    """
+    now = starts[0].history.now
+    if any(start.history.now != now for start in starts):
+        raise ValueError("a batch of rollouts must start from histories of one length")
+    rows = max(min_rows, *(start.history.num_agents for start in starts))
+    return [_settle_at(starts, rows, token) for token in range(now + 1)]
+
+
+def _settle_at(starts: Sequence[Start], rows: int, token: int) -> Population:
+    empty = _empty(len(starts), rows)
+    for at, start in enumerate(starts):
+        history = start.history
+        order = _near_to_far(start)
+        place = slice(0, len(order))
+        empty.life[at, place] = order
+        empty.born[at] = len(order)
+        empty.kind[at, place] = history.kind[order]
+        empty.size_lwh_m[at, place] = history.size_lwh_m[order]
+        empty.pose[at, place] = history.pose[order, token]
+        empty.move[at, place] = history.move[order, token]
+        empty.presence[at, place] = history.presence[order, token]
+        empty.observed[at, place] = history.observed[order, token]
+        if token == history.now:
+            logged = start.scene.tracks.pose(start.scene.now)[start.logged_row[order]]
+            empty.pose[at, place] = logged
+    return empty
+
+
+def _near_to_far(start: Start) -> Int64[np.ndarray, " agent"]:
+    history = start.history
+    xy_m = history.pose[:, history.now, :2]
+    distance_m = np.linalg.norm(xy_m - xy_m[history.ego], axis=1)
+    distance_m[history.ego] = -1.0
+    return np.argsort(distance_m, kind="stable")
+
+
+def _empty(rollouts: int, rows: int) -> Population:
+    shape = (rollouts, rows)
+    return Population(
+        life=np.full(shape, NOBODY, dtype=np.int32),
+        born=np.zeros(rollouts, dtype=np.int32),
+        kind=np.zeros(shape, dtype=np.int8),
+        size_lwh_m=np.zeros((*shape, 3), dtype=np.float32),
+        pose=np.zeros((*shape, 3), dtype=np.float32),
+        move=np.full(shape, NO_MOVE, dtype=np.int16),
+        presence=np.zeros(shape, dtype=np.int8),
+        observed=np.zeros(shape, dtype=bool),
+    )
+
+
+def move_on(
+    population: Population,
+    move: Int64[np.ndarray, "rollout row"],
+    leave: Bool[np.ndarray, "rollout row"],
+    codebook: MotionCodebook,
+) -> tuple[Population, Float32[np.ndarray, "rollout row 5 3"]]:
+    """Move everyone by half a second; whoever was leaving is gone, its row free.
+
+    Args:
+        population: At the end of a half second.
+        move: Next move of each row.
+        leave: Rows whose agent will be there for the last time. The ego never is.
+        codebook: The moves.
+
+    Returns:
+        The population at the end of the next half second, and the poses
+        [rollout, row, 5, 3] on the way there.
+    """
+    gone = population.presence == Presence.LEAVING
+    there = (population.presence != Presence.ABSENT) & ~gone
+    leave = leave & there
+    leave[:, EGO_ROW] = False
+    steps = codebook.path[population.kind, move][:, :, 1:]
+    path = to_world(steps, population.pose[:, :, None]) * there[..., None, None]
+    presence = np.where(leave, Presence.LEAVING, Presence.PRESENT) * there
+    moved = replace(
+        population,
+        life=np.where(there, population.life, NOBODY).astype(np.int32),
+        pose=path[:, :, -1],
+        move=np.where(there, move, NO_MOVE).astype(np.int16),
+        presence=presence.astype(np.int8),
+        observed=there,
+    )
+    return moved, path
+
+
+def enter(
+    population: Population, newcomers: Newcomers, grid: Grid
+) -> tuple[Population, Int64[np.ndarray, " rollout"]]:
+    """Give each newcomer the first free row of its rollout.
+
+    Returns:
+        The population with them, and the row that each rollout's newcomer got (-1 where
+        there is none). A newcomer of a full rollout is turned away.
+    """
+    free = population.life == NOBODY
+    fits = newcomers.who & free.any(axis=1)
+    rollout = np.flatnonzero(fits)
+    row = free.argmax(axis=1)[rollout]
+
+    new = Population(
+        life=population.life.copy(),
+        born=population.born + fits.astype(np.int32),
+        kind=population.kind.copy(),
+        size_lwh_m=population.size_lwh_m.copy(),
+        pose=population.pose.copy(),
+        move=population.move.copy(),
+        presence=population.presence.copy(),
+        observed=population.observed.copy(),
+    )
+    new.life[rollout, row] = population.born[rollout]
+    new.kind[rollout, row] = newcomers.kind[rollout]
+    new.size_lwh_m[rollout, row] = newcomers.size_lwh_m[rollout]
+    new.pose[rollout, row] = entry_pose(population.pose[:, EGO_ROW], newcomers, grid)[
+        rollout
+    ]
+    new.move[rollout, row] = FIRST_MOVE
+    new.presence[rollout, row] = Presence.ENTERING
+    new.observed[rollout, row] = False
+    rows = np.full(len(fits), -1, dtype=np.int64)
+    rows[rollout] = row
+    return new, rows
+
+
+def entry_pose(
+    ego_pose: Float32[np.ndarray, "rollout 3"], newcomers: Newcomers, grid: Grid
+) -> Float32[np.ndarray, "rollout 3"]:
+    """Poses [rollout, 3] of newcomers in the scene's frame."""
+    local_m = decode_cell(newcomers.cell, grid) + newcomers.offset_m
+    heading_rad = wrap_angle(decode_heading(newcomers.heading, grid) + ego_pose[:, 2])
+    return np.column_stack([from_grid(local_m, ego_pose), heading_rad])

@@ -1,0 +1,199 @@
+"""Frames as they are played, and the rollouts they add up to.
+
+A batch plays several rollouts at once. Rows of a batch are used again after their agent has
+left, so each agent has a *life*: its number within its rollout, logged agents first.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int8, Int16, Int32
+
+from infgen.clock import CLOCK
+from infgen.rollout.heights import ground_z_m
+from infgen.rollout.rollout import NEVER, Rollout
+from infgen.scene import Scene
+from infgen.tokens.scene_tokens import SceneTokens
+
+NOBODY = -1
+"""Life of a free row."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """Half a second of a batch of rollouts.
+
+    Attributes:
+        token: The half second: steps ``5 token + 1`` to ``5 token + 5``.
+        life: Who is in each row during it, or ``NOBODY``.
+        path: x, y, heading of every row at its five steps.
+        leaving: Rows whose agent is there for the last time.
+        born: Life of an agent placed at the end of this half second, else ``NOBODY``; its
+            row is free in ``life``.
+        kind: ``AgentKind`` of every row after this half second.
+        size_lwh_m: Box of every row after this half second.
+    """
+
+    token: int
+    life: Int32[np.ndarray, "rollout row"]
+    path: Float32[np.ndarray, "rollout row 5 3"]
+    leaving: Bool[np.ndarray, "rollout row"]
+    born: Int32[np.ndarray, "rollout row"]
+    kind: Int8[np.ndarray, "rollout row"]
+    size_lwh_m: Float32[np.ndarray, "rollout row 3"]
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What a rollout continues: a log and its tokenized history.
+
+    Attributes:
+        scene: The log.
+        history: Its tokens up to now, nothing later in them.
+        index: Which of the scene's rollouts this is.
+        seed: Seed of its random streams.
+    """
+
+    scene: Scene
+    history: SceneTokens
+    index: int
+    seed: int
+
+    @property
+    def logged_row(self) -> Int32[np.ndarray, " agent"]:
+        """Row in the log of each agent of the history."""
+        order = np.argsort(self.scene.tracks.id, kind="stable")
+        found = np.searchsorted(self.scene.tracks.id[order], self.history.track_id)
+        return order[found].astype(np.int32)
+
+
+def collect(
+    starts: Sequence[Start], frames: Sequence[Frame], weights: str
+) -> list[Rollout]:
+    """Put the frames of a batch together to one rollout per start.
+
+    Args:
+        starts: What each rollout of the batch continues.
+        frames: All frames, in order.
+        weights: Fingerprint of the weights that played them.
+    """
+    return [
+        _rollout(start, _lives(start, frames, at), weights)
+        for at, start in enumerate(starts)
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class _Lives:
+    """One row per life of a rollout, filled frame by frame."""
+
+    pose: Float32[np.ndarray, "life step 3"]
+    valid: Bool[np.ndarray, "life step"]
+    kind: Int8[np.ndarray, " life"]
+    size_lwh_m: Float32[np.ndarray, "life 3"]
+    entry_step: Int16[np.ndarray, " life"]
+    exit_step: Int16[np.ndarray, " life"]
+
+
+def _lives(start: Start, frames: Sequence[Frame], at: int) -> _Lives:
+    logged = start.history.num_agents
+    count = 1 + max([logged - 1, *(int(frame.born[at].max()) for frame in frames)])
+    steps = CLOCK.end_step(frames[-1].token) + 1
+    lives = _Lives(
+        pose=np.zeros((count, steps, 3), dtype=np.float32),
+        valid=np.zeros((count, steps), dtype=bool),
+        kind=np.zeros(count, dtype=np.int8),
+        size_lwh_m=np.zeros((count, 3), dtype=np.float32),
+        entry_step=np.zeros(count, dtype=np.int16),
+        exit_step=np.full(count, NEVER, dtype=np.int16),
+    )
+    _write_history(lives, start)
+    for frame in frames:
+        _write_frame(lives, frame, at)
+    return lives
+
+
+def _write_history(lives: _Lives, start: Start) -> None:
+    tracks, rows, now = start.scene.tracks, start.logged_row, start.scene.now
+    logged, span = len(rows), slice(0, now + 1)
+    seen = tracks.valid[rows, span]
+    lives.valid[:logged, span] = seen
+    lives.pose[:logged, span, :2] = tracks.xyz_m[rows, span, :2] * seen[..., None]
+    lives.pose[:logged, span, 2] = tracks.heading_rad[rows, span] * seen
+    lives.kind[:logged] = start.history.kind
+    lives.size_lwh_m[:logged] = start.history.size_lwh_m
+    lives.entry_step[:logged] = seen.argmax(axis=1)
+
+
+def _write_frame(lives: _Lives, frame: Frame, at: int) -> None:
+    end = CLOCK.end_step(frame.token)
+    span = slice(CLOCK.start_step(frame.token) + 1, end + 1)
+    life, born = frame.life[at], frame.born[at]
+    there, new = life != NOBODY, born != NOBODY
+    lives.pose[life[there], span] = frame.path[at][there]
+    lives.valid[life[there], span] = True
+    lives.exit_step[life[frame.leaving[at]]] = end
+    lives.kind[born[new]] = frame.kind[at][new]
+    lives.size_lwh_m[born[new]] = frame.size_lwh_m[at][new]
+    lives.entry_step[born[new]] = end
+
+
+def _rollout(start: Start, lives: _Lives, weights: str) -> Rollout:
+    count, logged = len(lives.kind), start.history.num_agents
+    first_id = int(start.scene.tracks.id.max()) + 1
+    inserted_id = np.arange(first_id, first_id + count - logged, dtype=np.int32)
+    z_m = _heights(start, lives)
+    return Rollout(
+        scenario_id=start.scene.scenario_id,
+        index=start.index,
+        seed=start.seed,
+        weights=weights,
+        origin_xyz_m=start.scene.origin_xyz_m,
+        now=start.scene.now,
+        ego=start.history.ego,
+        id=np.concatenate([start.history.track_id, inserted_id]),
+        kind=lives.kind,
+        size_lwh_m=lives.size_lwh_m,
+        xyz_m=np.concatenate([lives.pose[..., :2], z_m[..., None]], axis=-1),
+        heading_rad=lives.pose[..., 2],
+        valid=lives.valid,
+        logged=np.arange(count) < logged,
+        entry_step=lives.entry_step,
+        exit_step=lives.exit_step,
+    )
+
+
+def _heights(start: Start, lives: _Lives) -> Float32[np.ndarray, "life step"]:
+    """Heights of box centres: the log's in the history, then road plus clearance.
+
+    The clearance of a logged agent is what it had over the road at now, that of an inserted
+    one half its height. Roads are looked up once per half second and interpolated.
+    """
+    tracks, rows, now = start.scene.tracks, start.logged_row, start.scene.now
+    logged, stride = len(rows), CLOCK.steps_per_token
+    ground_m = _ground_at_knots(start, lives)
+    clearance_m = lives.size_lwh_m[:, 2] / 2
+    clearance_m[:logged] = tracks.xyz_m[rows, now, 2] - ground_m[:logged, 0]
+
+    later = np.arange(lives.valid.shape[1] - now)
+    left = later // stride
+    right = np.minimum(left + 1, ground_m.shape[1] - 1)
+    share = (later % stride / stride).astype(np.float32)
+    z_m = np.zeros(lives.valid.shape, dtype=np.float32)
+    z_m[:, now:] = ground_m[:, left] * (1 - share) + ground_m[:, right] * share
+    z_m[:, now:] += clearance_m[:, None]
+    z_m[:logged, : now + 1] = tracks.xyz_m[rows, : now + 1, 2]
+    return z_m * lives.valid
+
+
+def _ground_at_knots(start: Start, lives: _Lives) -> Float32[np.ndarray, "life knot"]:
+    """Road height at the end of every half second from now on, held where nobody is."""
+    knots = np.arange(start.scene.now, lives.valid.shape[1], CLOCK.steps_per_token)
+    history, there = start.history, lives.valid[:, knots]
+    xy_m = lives.pose[:, knots, :2].reshape(-1, 2)
+    ground_m = ground_z_m(xy_m, history.road_pose[:, :2], history.road_z_m)
+    # Hold the last known height after an exit, the first known one before an entry.
+    last = np.maximum.accumulate(np.where(there, np.arange(len(knots)), -1), axis=1)
+    held = np.where(last < 0, there.argmax(axis=1)[:, None], last)
+    return np.take_along_axis(ground_m.reshape(there.shape), held, axis=1)

@@ -1,0 +1,131 @@
+"""Curves in the plane: points [point, 2] in metres, from start to end."""
+
+import numpy as np
+from jaxtyping import Float64
+
+Points = Float64[np.ndarray, "point 2"]
+
+
+def arc_lengths(xy_m: Points) -> Float64[np.ndarray, " point"]:
+    """Distance of every point from the first, along the curve."""
+    steps_m = np.linalg.norm(np.diff(xy_m, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps_m)])
+
+
+def length(xy_m: Points) -> float:
+    """Length of a curve."""
+    return float(arc_lengths(xy_m)[-1])
+
+
+def points_at(
+    xy_m: Points, along_m: Float64[np.ndarray, " at"]
+) -> Float64[np.ndarray, "at 2"]:
+    """Points at distances along a curve; its ends beyond them."""
+    known_m = arc_lengths(xy_m)
+    return np.column_stack([np.interp(along_m, known_m, xy_m[:, axis]) for axis in (0, 1)])
+
+
+def resample(xy_m: Points, spacing_m: float) -> Points:
+    """Space the points of a curve evenly, as near to the spacing as its length allows."""
+    total_m = length(xy_m)
+    count = max(1, round(total_m / spacing_m))
+    return points_at(xy_m, np.linspace(0.0, total_m, count + 1))
+
+
+def cut(xy_m: Points, from_m: float, to_m: float, spacing_m: float) -> Points:
+    """Cut out what lies between two distances along a curve."""
+    count = max(1, round((to_m - from_m) / spacing_m))
+    return points_at(xy_m, np.linspace(from_m, to_m, count + 1))
+
+
+def headings(xy_m: Points) -> Float64[np.ndarray, " point"]:
+    """Direction at every point, in radians, without jumps of a whole turn."""
+    tangent = np.gradient(xy_m, axis=0)
+    return np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+
+
+def offset(xy_m: Points, left_m: float) -> Points:
+    """Shift a curve to its left."""
+    heading_rad = headings(xy_m)
+    normal = np.column_stack([-np.sin(heading_rad), np.cos(heading_rad)])
+    return xy_m + left_m * normal
+
+
+def start_pose(xy_m: Points) -> Float64[np.ndarray, "3"]:
+    """Pose at the start of a curve, heading along it."""
+    return np.array([*xy_m[0], headings(xy_m[:2])[0]])
+
+
+def end_pose(xy_m: Points) -> Float64[np.ndarray, "3"]:
+    """Pose at the end of a curve, heading along it."""
+    return np.array([*xy_m[-1], headings(xy_m[-2:])[0]])
+
+
+def bend(
+    pose: Float64[np.ndarray, "3"], length_m: float, curvature_1pm: float, spacing_m: float
+) -> Points:
+    """Draw a curve from a pose that turns ever more, up to a curvature halfway."""
+    along_m = np.arange(0.0, length_m + spacing_m / 2, spacing_m)
+    ramp = np.clip(2 * along_m / length_m, 0.0, 1.0)
+    heading_rad = pose[2] + np.cumsum(ramp * curvature_1pm) * spacing_m
+    steps_m = spacing_m * np.column_stack([np.cos(heading_rad), np.sin(heading_rad)])
+    return pose[:2] + np.concatenate([[[0.0, 0.0]], np.cumsum(steps_m[:-1], axis=0)])
+
+
+def join(
+    start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"], spacing_m: float
+) -> Points:
+    """Join two poses smoothly: nearly an arc where an arc would do (a cubic Bézier)."""
+    chord_m = float(np.linalg.norm(end[:2] - start[:2]))
+    turn_rad = abs((end[2] - start[2] + np.pi) % (2 * np.pi) - np.pi)
+    # The handles with which a Bézier follows an arc of this chord and turn.
+    arc = (
+        4 / 3 * np.tan(turn_rad / 4) / (2 * np.sin(turn_rad / 2))
+        if turn_rad > 0.01
+        else 1 / 3
+    )
+    out_m, in_m = (
+        chord_m * arc * np.array([np.cos(pose[2]), np.sin(pose[2])])
+        for pose in (start, end)
+    )
+    corners_m = [start[:2], start[:2] + out_m, end[:2] - in_m, end[:2]]
+    part = np.linspace(0.0, 1.0, 65)[:, None]
+    weights = [
+        (1 - part) ** 3,
+        3 * part * (1 - part) ** 2,
+        3 * part**2 * (1 - part),
+        part**3,
+    ]
+    fine_m = sum(weight * corner for weight, corner in zip(weights, corners_m, strict=True))
+    return resample(np.asarray(fine_m), spacing_m)
+
+
+def chain(*parts: Points) -> Points:
+    """Lay curves end to end; a point where one ends and the next starts stands once."""
+    kept = [parts[0]]
+    for part in parts[1:]:
+        touches = np.linalg.norm(part[0] - kept[-1][-1]) < 1e-6
+        kept.append(part[1:] if touches else part)
+    return np.concatenate(kept)
+
+
+def smooth(xy_m: Points, reach_m: float, spacing_m: float) -> Points:
+    """Round the corners of an evenly spaced curve; its ends stay."""
+    half = max(1, round(reach_m / spacing_m))
+    total = np.cumsum(np.pad(xy_m, ((half + 1, half), (0, 0)), mode="edge"), axis=0)
+    mean = (total[2 * half + 1 :] - total[: -2 * half - 1]) / (2 * half + 1)
+    # Near an end average over what fits on both sides, or the end would creep inwards.
+    fits = np.minimum(np.arange(len(xy_m)), np.arange(len(xy_m))[::-1])
+    share = np.clip(fits / half, 0.0, 1.0)[:, None]
+    return share * mean + (1 - share) * xy_m
+
+
+def curvatures(
+    xy_m: Points, spacing_m: float, reach_m: float = 2.0
+) -> Float64[np.ndarray, " point"]:
+    """Absolute curvature in 1/m of an evenly spaced curve, over a reach of it."""
+    half = max(1, round(reach_m / spacing_m / 2))
+    heading_rad = np.pad(headings(xy_m), half, mode="edge")
+    return np.abs(heading_rad[2 * half :] - heading_rad[: -2 * half]) / (
+        2 * half * spacing_m
+    )

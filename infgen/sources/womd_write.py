@@ -1,0 +1,268 @@
+"""Scenes as WOMD ``Scenario`` records, and records as TFRecord files. Inverse of ``womd``.
+
+Fields stand in ascending order of their numbers, as the official writer puts them. States
+and map points are many and their messages have one fixed size, so each is one row of a
+structured array, tags included.
+"""
+
+import gzip
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from infgen.scene import FeatureKind, LinkKind, RoadMap, Scene, Side, Signals, Tracks
+from infgen.sources.tfrecord import frame
+
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+_WIRE_DTYPES = {_VARINT: "u1", _FIXED64: "<f8", _FIXED32: "<f4"}
+
+
+_Fields = dict[str, tuple[int, int]]
+"""Names of a message's fields to their number and wire type."""
+
+_POINT: _Fields = {"x": (1, _FIXED64), "y": (2, _FIXED64), "z": (3, _FIXED64)}
+_STATE: _Fields = {
+    "x": (2, _FIXED64),
+    "y": (3, _FIXED64),
+    "z": (4, _FIXED64),
+    "length": (5, _FIXED32),
+    "width": (6, _FIXED32),
+    "height": (7, _FIXED32),
+    "heading": (8, _FIXED32),
+    "velocity_x": (9, _FIXED32),
+    "velocity_y": (10, _FIXED32),
+    "valid": (11, _VARINT),
+}
+_UNSEEN = b"\x58\x00"
+"""The message of a state that says ``valid: false`` and nothing else."""
+
+
+def encode_scenario(scene: Scene) -> bytes:
+    """Write one scene as the bytes of a WOMD ``Scenario``.
+
+    Positions go back to the world frame: the origin is added in float64.
+    """
+    origin = scene.origin_xyz_m
+    roles = zip(scene.predict_row.tolist(), scene.predict_difficulty.tolist(), strict=True)
+    return b"".join(
+        [
+            b"".join(_double(1, time_s) for time_s in scene.timestamps_s.tolist()),
+            _tracks(scene.tracks, origin),
+            b"".join(_int(4, track) for track in scene.interest_id.tolist()),
+            _message(5, scene.scenario_id.encode()),
+            _int(6, scene.ego),
+            _dynamic_states(scene.signals, origin, scene.tracks.num_steps),
+            _map_features(scene.road_map, origin),
+            _int(10, scene.now),
+            *(_message(11, _int(1, row) + _int(2, level)) for row, level in roles),
+        ]
+    )
+
+
+def write_tfrecord(path: Path, records: Iterable[bytes]) -> None:
+    """Write records as a TFRecord, GZIP if its name ends in ``.gz``.
+
+    Nothing in the file depends on when or under which name it was written.
+    """
+    data = b"".join(frame(record) for record in records)
+    path.write_bytes(gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
+
+
+def _tracks(tracks: Tracks, origin_xyz_m: Float64[np.ndarray, "3"]) -> bytes:
+    kinds = tracks.kind.astype(int) + 1
+    states = _states(tracks, origin_xyz_m)
+    blank = _bytes_of(_rows(_STATE, **dict.fromkeys(_STATE, np.zeros(1))))
+    unseen = (_bytes_of(states) == blank).all(axis=-1)  # [agent, step]
+    parts = []
+    for row, (track, kind) in enumerate(
+        zip(tracks.id.tolist(), kinds.tolist(), strict=True)
+    ):
+        written = [
+            _message(3, _UNSEEN if skip else state.tobytes())
+            for state, skip in zip(states[row], unseen[row].tolist(), strict=True)
+        ]
+        parts.append(_message(2, _int(1, track) + _int(2, kind) + b"".join(written)))
+    return b"".join(parts)
+
+
+def _states(tracks: Tracks, origin_xyz_m: Float64[np.ndarray, "3"]) -> np.ndarray:
+    """Messages [agent, step] of all states."""
+    xyz_m = tracks.xyz_m.astype(np.float64) + origin_xyz_m
+    return _rows(
+        _STATE,
+        x=xyz_m[..., 0],
+        y=xyz_m[..., 1],
+        z=xyz_m[..., 2],
+        length=tracks.size_lwh_m[..., 0],
+        width=tracks.size_lwh_m[..., 1],
+        height=tracks.size_lwh_m[..., 2],
+        heading=tracks.heading_rad,
+        velocity_x=tracks.velocity_mps[..., 0],
+        velocity_y=tracks.velocity_mps[..., 1],
+        valid=tracks.valid,
+    )
+
+
+def _rows(layout: _Fields, **values: np.ndarray) -> np.ndarray:
+    """Lay out one message of fixed size per value: every field's tag, then the value."""
+    columns: list[tuple[str, str]] = []
+    for name, (_, wire) in layout.items():
+        columns += [(f"tag_{name}", "u1"), (name, _WIRE_DTYPES[wire])]
+    rows = np.empty(next(iter(values.values())).shape, np.dtype(columns))
+    for name, (number, wire) in layout.items():
+        rows[f"tag_{name}"] = number << 3 | wire
+        rows[name] = values[name]
+    return rows
+
+
+def _bytes_of(rows: np.ndarray) -> np.ndarray:
+    """Bytes [..., byte] of every row of a structured array."""
+    return rows[..., None].view("u1")
+
+
+def _points(number: int, xyz_m: Float64[np.ndarray, "point 3"]) -> bytes:
+    """Write points, each as field ``number`` holding a ``MapPoint``."""
+    rows = _rows(_POINT, x=xyz_m[:, 0], y=xyz_m[:, 1], z=xyz_m[:, 2])
+    head = _key(number, _BYTES) + _varint(rows.itemsize)
+    heads = np.tile(np.frombuffer(head, "u1"), (len(rows), 1))
+    return np.hstack([heads, _bytes_of(rows)]).tobytes()
+
+
+def _dynamic_states(signals: Signals, origin_xyz_m: np.ndarray, num_steps: int) -> bytes:
+    """Write one message per step, also of steps without signals."""
+    stops_m = signals.stop_xyz_m.astype(np.float64) + origin_xyz_m
+    lanes, states = signals.lane_id.tolist(), signals.state.tolist()
+    rows = [
+        _message(1, _int(1, lanes[row]) + _int(2, states[row]) + _points(3, stops_m[[row]]))
+        for row in range(len(lanes))
+    ]
+    ends = np.searchsorted(signals.step, np.arange(num_steps + 1))
+    return b"".join(
+        _message(7, b"".join(rows[ends[step] : ends[step + 1]]))
+        for step in range(num_steps)
+    )
+
+
+def _map_features(road_map: RoadMap, origin_xyz_m: np.ndarray) -> bytes:
+    xyz_m = road_map.xyz_m.astype(np.float64) + origin_xyz_m
+    tables = _Tables(road_map)
+    parts = []
+    for row, (feature, kind) in enumerate(
+        zip(road_map.feature_id.tolist(), road_map.feature_kind.tolist(), strict=True)
+    ):
+        points_m = xyz_m[road_map.point_offsets[row] : road_map.point_offsets[row + 1]]
+        body = _feature(road_map, tables, row, points_m)
+        parts.append(_message(8, _int(1, feature) + _message(kind, body)))
+    return b"".join(parts)
+
+
+def _feature(road_map: RoadMap, tables: "_Tables", row: int, points_m: np.ndarray) -> bytes:
+    kind = FeatureKind(road_map.feature_kind[row])
+    if kind == FeatureKind.LANE:
+        return _lane(road_map, tables, row, points_m)
+    if kind in (FeatureKind.ROAD_LINE, FeatureKind.ROAD_EDGE):
+        return _int(1, int(road_map.feature_type[row])) + _points(2, points_m)
+    if kind == FeatureKind.STOP_SIGN:
+        lanes = road_map.sign_lane_id[tables.signs.get(int(road_map.feature_id[row]), [])]
+        return b"".join(_int(1, lane) for lane in lanes.tolist()) + _points(2, points_m)
+    return _points(1, points_m)
+
+
+class _Tables:
+    """Rows of the map's tables by what they belong to."""
+
+    def __init__(self, road_map: RoadMap) -> None:
+        own = np.where(road_map.boundary_neighbour < 0, road_map.boundary_lane_id, -1)
+        links = zip(
+            road_map.link_lane_id.tolist(), road_map.link_kind.tolist(), strict=True
+        )
+        sides = zip(
+            road_map.neighbour_lane_id.tolist(),
+            road_map.neighbour_side.tolist(),
+            strict=True,
+        )
+        self.links = _rows_by(links)
+        self.neighbours = _rows_by(sides)
+        self.boundaries = _rows_by(
+            zip(own.tolist(), road_map.boundary_side.tolist(), strict=True)
+        )
+        self.shared = _rows_by(road_map.boundary_neighbour.tolist())
+        self.signs = _rows_by(road_map.sign_id.tolist())
+
+
+def _rows_by(keys: Iterable[Any]) -> dict[Any, list[int]]:
+    """Row numbers of each key, ascending."""
+    found: dict[Any, list[int]] = {}
+    for row, key in enumerate(keys):
+        found.setdefault(key, []).append(row)
+    return found
+
+
+def _lane(road_map: RoadMap, tables: _Tables, row: int, points_m: np.ndarray) -> bytes:
+    lane = int(road_map.feature_id[row])
+    parts = [
+        _double(1, float(road_map.speed_limit_mph[row])),
+        _int(2, int(road_map.feature_type[row])),
+        _int(3, int(road_map.interpolating[row])),
+        _points(8, points_m),
+    ]
+    for number, link in ((9, LinkKind.ENTRY), (10, LinkKind.EXIT)):
+        others = road_map.link_other_id[tables.links.get((lane, link), [])]
+        parts += [_int(number, other) for other in others.tolist()]
+    for number, side in ((11, Side.LEFT), (12, Side.RIGHT)):
+        beside = tables.neighbours.get((lane, side), [])
+        parts += [_message(number, _neighbour(road_map, tables, at)) for at in beside]
+    for number, side in ((13, Side.LEFT), (14, Side.RIGHT)):
+        along = tables.boundaries.get((lane, side), [])
+        parts += [_message(number, _boundary(road_map, at)) for at in along]
+    return b"".join(parts)
+
+
+def _neighbour(road_map: RoadMap, tables: _Tables, at: int) -> bytes:
+    spans = zip((2, 3, 4, 5), road_map.neighbour_span[at].tolist(), strict=True)
+    shared = tables.shared.get(at, [])
+    return b"".join(
+        [
+            _int(1, int(road_map.neighbour_other_id[at])),
+            *(_int(number, index) for number, index in spans),
+            *(_message(6, _boundary(road_map, row)) for row in shared),
+        ]
+    )
+
+
+def _boundary(road_map: RoadMap, at: int) -> bytes:
+    first, last = road_map.boundary_span[at].tolist()
+    feature = int(road_map.boundary_feature_id[at])
+    kind = int(road_map.boundary_type[at])
+    return _int(1, first) + _int(2, last) + _int(3, feature) + _int(4, kind)
+
+
+def _key(number: int, wire: int) -> bytes:
+    return _varint(number << 3 | wire)
+
+
+def _varint(value: int) -> bytes:
+    """Seven bits a byte, lowest first; negative numbers as 64-bit two's complement."""
+    value &= (1 << 64) - 1
+    parts = bytearray()
+    while value > 0x7F:
+        parts.append(value & 0x7F | 0x80)
+        value >>= 7
+    parts.append(value)
+    return bytes(parts)
+
+
+def _int(number: int, value: int) -> bytes:
+    return _key(number, _VARINT) + _varint(value)
+
+
+def _double(number: int, value: float) -> bytes:
+    return _key(number, _FIXED64) + struct.pack("<d", value)
+
+
+def _message(number: int, body: bytes) -> bytes:
+    return _key(number, _BYTES) + _varint(len(body)) + body

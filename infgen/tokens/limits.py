@@ -1,0 +1,144 @@
+"""What a road user can do in half a second, and what is only noise of the log.
+
+The codebook holds no move beyond these limits. Speed, acceleration and turn are bounded at
+every 0.1 s step; acceleration as a vector. All three bounds are convex, so a mean of moves
+within them is within them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from infgen.clock import CLOCK
+from infgen.config import VocabSettings
+from infgen.geometry import rotate, wrap_angle
+from infgen.scene import AgentKind
+
+PEDESTRIAN_MAX_YAW_RATE_RAD_S = 2 * np.pi
+"""A pedestrian turns round on the spot within one move; others obey the setting."""
+
+MAX_REVERSE_MPS = (6.0, np.inf, 3.0)
+"""Vehicles and cyclists that go backwards faster are logged with a wrong heading."""
+
+JUMP = 4.0
+"""A step that changes velocity by so many times the limit is a jump of the log, not noise
+that may be smoothed."""
+
+SLIP_M, LONGEST_PIVOT_M = 0.3, 3.0
+"""A vehicle turns about its rear axle, at most ``LONGEST_PIVOT_M`` behind its centre, which
+swings out; beyond that its centre goes sideways by no more than ``SLIP_M``."""
+
+_INSIDE, _EASED = 1 - 1e-3, 1 - 2e-3
+"""Moves keep this far inside the limits, so that no rounding brings them outside."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionLimits:
+    """Bounds by kind (row: ``AgentKind``).
+
+    Attributes:
+        speed_mps: No step is faster.
+        accel_mps2: No two steps in a row change velocity faster.
+        yaw_rate_rad_s: No step turns faster.
+    """
+
+    speed_mps: Float32[np.ndarray, "3"]
+    accel_mps2: Float32[np.ndarray, "3"]
+    yaw_rate_rad_s: Float32[np.ndarray, "3"]
+
+
+def limits_of(settings: VocabSettings) -> MotionLimits:
+    """Take the limits from the settings."""
+    speed_mps = [
+        settings.vehicle_max_speed_mps,
+        settings.pedestrian_max_speed_mps,
+        settings.cyclist_max_speed_mps,
+    ]
+    yaw = settings.max_yaw_rate_rad_s
+    return MotionLimits(
+        speed_mps=np.array(speed_mps, dtype=np.float32),
+        accel_mps2=np.full(3, settings.max_accel_mps2, dtype=np.float32),
+        yaw_rate_rad_s=np.array([yaw, PEDESTRIAN_MAX_YAW_RATE_RAD_S, yaw], np.float32),
+    )
+
+
+def within(
+    path: Float32[np.ndarray, "move 6 3"], kind: int, limits: MotionLimits
+) -> Bool[np.ndarray, " move"]:
+    """Tell which moves keep to the limits of a kind at every step."""
+    speed_mps, accel_mps2, yaw_rad_s = _rates(path)
+    return (
+        (speed_mps <= limits.speed_mps[kind] * _INSIDE)
+        & (accel_mps2 <= limits.accel_mps2[kind] * _INSIDE)
+        & (yaw_rad_s <= limits.yaw_rate_rad_s[kind] * _INSIDE)
+        & _goes_straight(path, kind)
+    )
+
+
+def plausible(
+    path: Float32[np.ndarray, "move 6 3"], kind: int, limits: MotionLimits
+) -> Bool[np.ndarray, " move"]:
+    """Tell which logged moves are possible but for jitter, which ``ease`` takes away."""
+    speed_mps, accel_mps2, _ = _rates(path)
+    step_m = np.diff(path[..., :2], axis=1)
+    change_mps = np.linalg.norm(step_m[:, -1] - step_m[:, 0], axis=-1) / CLOCK.step_s
+    mean_accel_mps2 = change_mps / (CLOCK.token_s - CLOCK.step_s)
+    mean_yaw_rad_s = np.abs(path[:, -1, 2]) / CLOCK.token_s
+    return (
+        (speed_mps <= limits.speed_mps[kind] * _EASED)
+        & (accel_mps2 <= limits.accel_mps2[kind] * JUMP)
+        & (mean_accel_mps2 <= limits.accel_mps2[kind] * _EASED)
+        & (mean_yaw_rad_s <= limits.yaw_rate_rad_s[kind] * _EASED)
+        & _goes_straight(path, kind)
+    )
+
+
+def ease(
+    path: Float32[np.ndarray, "move 6 3"], kind: int, limits: MotionLimits
+) -> Float32[np.ndarray, "move 6 3"]:
+    """Draw plausible moves towards even motion, as far as the limits ask; ends stay.
+
+    Positions of a log jitter by centimetres, which at 0.1 s are many m/s2. Even motion has
+    no acceleration and everywhere the mean turn, so the share of it needed is known.
+    """
+    share = np.linspace(0, 1, path.shape[1], dtype=np.float32)[:, None]
+    even = path[:, -1:] * share  # [move, 6, 3]
+    apart = path - even
+    apart[..., 2] = wrap_angle(apart[..., 2])
+
+    _, accel_mps2, yaw_rad_s = _rates(path)
+    mean_yaw_rad_s = np.abs(path[:, -1, 2]) / CLOCK.token_s
+    most_mps2 = limits.accel_mps2[kind] * _EASED
+    spare_rad_s = limits.yaw_rate_rad_s[kind] * _EASED - mean_yaw_rad_s
+    kept_xy = most_mps2 / np.maximum(accel_mps2, most_mps2)
+    kept_turn = spare_rad_s / np.maximum(yaw_rad_s - mean_yaw_rad_s, spare_rad_s)
+    kept = np.stack([kept_xy, kept_xy, kept_turn], axis=-1)[:, None]
+    eased = even + kept.astype(np.float32) * apart
+    eased[..., 2] = wrap_angle(eased[..., 2])
+    return np.where(kept < 1, eased, path)
+
+
+def _rates(path: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the highest speed, acceleration and yaw rate of each move."""
+    step_m = np.diff(path[..., :2].astype(np.float64), axis=1)
+    change_m = np.diff(step_m, axis=1)
+    turn_rad = wrap_angle(np.diff(path[..., 2].astype(np.float64), axis=1))
+    return (
+        np.linalg.norm(step_m, axis=-1).max(axis=1) / CLOCK.step_s,
+        np.linalg.norm(change_m, axis=-1).max(axis=1) / CLOCK.step_s**2,
+        np.abs(turn_rad).max(axis=1) / CLOCK.step_s,
+    )
+
+
+def _goes_straight(path: np.ndarray, kind: int) -> np.ndarray:
+    """Tell which moves go where the agent points, as far as its kind must."""
+    turn_rad = path[:, -1, 2]
+    end_m = rotate(path[:, -1, :2], -turn_rad / 2)  # seen along the mean heading
+    forward_m, left_m = end_m[:, 0], end_m[:, 1]
+    straight = forward_m >= -MAX_REVERSE_MPS[kind] * CLOCK.token_s
+    if kind == AgentKind.VEHICLE:
+        swing_m = 2 * LONGEST_PIVOT_M * np.sin(turn_rad / 2)
+        straight &= left_m <= np.maximum(swing_m, 0) + SLIP_M
+        straight &= left_m >= np.minimum(swing_m, 0) - SLIP_M
+    return straight

@@ -1,0 +1,104 @@
+"""From a scene to its tokens: the one function that puts this room together."""
+
+import numpy as np
+
+from infgen.clock import CLOCK, Clock
+from infgen.config import TokenSettings
+from infgen.scene import Scene
+from infgen.tokens.agents import match_agents
+from infgen.tokens.codebook import MotionCodebook, RoadCodebook
+from infgen.tokens.grid import make_grid
+from infgen.tokens.moves import make_move_table
+from infgen.tokens.presence import makes_a_move, seen_tokens
+from infgen.tokens.roads import match_roads, road_pieces
+from infgen.tokens.scene_tokens import SceneTokens
+from infgen.tokens.sequence import write_words
+from infgen.tokens.signals import signal_lines, signals_at
+from infgen.tokens.tracks import Paths, read_paths
+
+
+def tokenize_scene(
+    scene: Scene,
+    motion: MotionCodebook,
+    roads: RoadCodebook,
+    settings: TokenSettings,
+    until: int | None = None,
+    clock: Clock = CLOCK,
+) -> SceneTokens:
+    """Write a scene as tokens.
+
+    Args:
+        scene: The log.
+        motion: Moves that agents are written with.
+        roads: Shapes that map lines are written with.
+        settings: How.
+        until: Last step to look at. With ``until=scene.now`` the tokens are the history
+            alone, as a simulation starts from: nothing later is read, and every agent
+            observed at that step is kept, no other. (For agents however far from the ego
+            set ``max_distance_m`` to infinity.)
+        clock: Steps and tokens.
+
+    Raises:
+        TokensError: if the scene cannot be written as tokens, saying why.
+    """
+    last = scene.tracks.num_steps - 1 if until is None else until
+    grid = make_grid(settings)
+    paths = read_paths(scene, settings, until, clock)
+    paths = paths.take(_kept(paths, whole_log=until is None))
+    agents, entries, anchors = match_agents(
+        paths, make_move_table(motion), grid, settings.entry_order
+    )
+    words = write_words(agents, entries, paths.ego)
+
+    pieces = road_pieces(scene.road_map)
+    line, lane_id = signal_lines(scene.signals, pieces.line, pieces.feature_id, last)
+    ends = clock.steps_per_token * np.arange(1, agents.move.shape[1] + 1)
+    now = np.array([scene.now])
+    lanes, lane_of = np.unique(pieces.feature_id, return_inverse=True)
+    return SceneTokens(
+        scenario_id=scene.scenario_id,
+        origin_xyz_m=scene.origin_xyz_m,
+        now=clock.token_ending_at(scene.now),
+        ego=paths.ego,
+        track_id=paths.track_id,
+        kind=agents.kind,
+        size_lwh_m=paths.size_lwh_m,
+        z_m=paths.z_m[:, 1:],
+        pose=agents.pose,
+        move=agents.move,
+        presence=agents.presence,
+        observed=agents.observed,
+        cell=agents.cell,
+        near=paths.near,
+        entry_token=entries.token,
+        entry_agent=entries.agent,
+        entry_cell=entries.cell,
+        entry_offset_m=entries.offset_m,
+        entry_heading=entries.heading,
+        entry_residual_rad=entries.residual_rad,
+        road_pose=pieces.pose,
+        road_z_m=pieces.z_m,
+        road_token=match_roads(pieces, roads),
+        road_point_kind=pieces.point_kind,
+        road_line_kind=pieces.line_kind,
+        road_line=pieces.line,
+        road_signal=signals_at(scene.signals, lanes, now)[lane_of, 0],
+        signal_line=line,
+        signal_state=signals_at(scene.signals, lane_id, ends),
+        word=words.word,
+        word_value=words.value,
+        word_agent=words.agent,
+        word_token=words.token,
+        anchor_agent=anchors.agent,
+        anchor_token=anchors.token,
+        anchor_pose=anchors.pose,
+    )
+
+
+def _kept(paths: Paths, *, whole_log: bool) -> np.ndarray:
+    """Return rows of the agents to write: the ego, those at ``now``, those with a move."""
+    kept = paths.at_now.copy()
+    kept[paths.ego] = True
+    if whole_log:
+        kept |= makes_a_move(seen_tokens(paths.valid))
+    return np.flatnonzero(kept)

@@ -1,0 +1,59 @@
+"""What happens in a run, told to a log file and to whoever listens."""
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol
+
+from pipeline.root import Root
+
+Event = Mapping[str, Any]
+"""``event`` says which; the rest are its figures.
+
+``run-started``, ``stage-cached``, ``stage-started`` (units, made), ``unit-done``,
+``unit-failed`` (error, trace), ``progress`` (done, total, note; not logged), ``stage-done``
+(report), ``stage-failed``, ``stage-skipped``, ``run-ended``.
+"""
+
+
+class Listener(Protocol):
+    """Whoever wants to know, e.g. the screen."""
+
+    def __call__(self, event: Event) -> None:
+        """Take note of one event."""
+
+
+Emit = Callable[..., None]
+"""``emit(event, **figures)``."""
+
+
+class Events:
+    """Tells every event to the listeners, and to a JSON-lines file below ``logs/``."""
+
+    def __init__(self, root: Root, listeners: tuple[Listener, ...] = ()) -> None:
+        self.log = root.logs / f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{os.getpid()}.jsonl"
+        self._listeners = listeners
+
+    def emit(self, event: str, **figures: Any) -> None:
+        """Tell one event. A line of the log is written whole and at once."""
+        about = {"event": event, **figures}
+        if event != "progress":
+            self._write(about)
+        for listener in self._listeners:
+            listener(about)
+
+    def _write(self, about: dict[str, Any]) -> None:
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        now = datetime.now(UTC).isoformat(timespec="milliseconds")
+        line = json.dumps({"time": now, **about}, default=str) + "\n"
+        _append(self.log, line.encode())
+
+
+def _append(path: Path, data: bytes) -> None:
+    handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+    try:
+        os.write(handle, data)
+    finally:
+        os.close(handle)

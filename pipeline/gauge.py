@@ -1,0 +1,119 @@
+"""How far a stage is, how fast it goes, and how long it will take."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from pipeline.events import Event
+
+
+@dataclass
+class Gauge:
+    """Reads the events of one stage.
+
+    Units count one each; what a unit says of itself counts as a part of one. A stage that
+    is all one unit (training) is told in that unit's own steps.
+
+    Attributes:
+        stage: Its name.
+        units: Units of its work.
+        before: Units that were made before this run.
+    """
+
+    stage: str
+    units: int
+    before: int
+    clock: Callable[[], float] = time.monotonic
+    note: str = ""
+    _done: int = 0
+    _part: tuple[float, float] = (0.0, 1.0)
+    _first_part: float | None = None
+    _begun: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Start the clock."""
+        self._begun = self.clock()
+
+    def take(self, event: Event) -> None:
+        """Note a unit's end, or how far it is."""
+        if event["event"] in ("unit-done", "unit-failed"):
+            self._done += 1
+            self._part, self.note = (0.0, 1.0), ""
+        elif event["event"] == "progress" and event["total"]:
+            self._part = (float(event["done"]), float(event["total"]))
+            self.note = str(event["note"])
+            if self._first_part is None:
+                self._first_part = self._part[0]
+
+    @property
+    def in_steps(self) -> bool:
+        """Whether the stage is told in the steps of its only unit, or of its finish."""
+        return self.units - self.before <= 1 and self._first_part is not None
+
+    @property
+    def done(self) -> float:
+        """Units, or steps, that are done."""
+        if self.in_steps:
+            return self._part[0]
+        return self.before + self._done + self._fraction
+
+    @property
+    def total(self) -> float:
+        """Units, or steps, in all."""
+        return self._part[1] if self.in_steps else float(self.units)
+
+    @property
+    def _fraction(self) -> float:
+        return min(1.0, self._part[0] / self._part[1])
+
+    @property
+    def _made(self) -> float:
+        """What of ``done`` this run did itself."""
+        return self.done - (self._first_part or 0.0 if self.in_steps else self.before)
+
+    @property
+    def per_s(self) -> float | None:
+        """Units, or steps, per second; None as long as nothing is done."""
+        taken = self.clock() - self._begun
+        return self._made / taken if self._made > 0 and taken > 0 else None
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds to go at this rate."""
+        rate = self.per_s
+        return max(0.0, self.total - self.done) / rate if rate else None
+
+    def words(self) -> str:
+        """Say it in one line: ``12 of 27 units, 0.8/s, 0:19 left, note``."""
+        what = "steps" if self.in_steps else "units"
+        parts = [f"{self.done:.4g} of {self.total:g} {what}"]
+        if self.per_s is not None and self.left_s is not None:
+            parts += [_rate(self.per_s), f"{clock_time(self.left_s)} left"]
+        return ", ".join([*parts, *([self.note] if self.note else [])])
+
+
+def _rate(per_s: float) -> str:
+    return f"{per_s:.3g}/s" if per_s >= 0.1 else f"{1 / per_s:.3g} s each"
+
+
+def clock_time(seconds: float) -> str:
+    """Write a duration as ``0:07``, ``12:30`` or ``1:02:03``."""
+    minutes, second = divmod(round(seconds), 60)
+    hour, minute = divmod(minutes, 60)
+    return f"{hour}:{minute:02}:{second:02}" if hour else f"{minute}:{second:02}"
+
+
+def figures(report: dict[str, Any], most: int = 6) -> str:
+    """Write the plain figures of a report in one line."""
+    plain = {
+        name: value
+        for name, value in report.items()
+        if isinstance(value, int | float | str) and not isinstance(value, bool)
+    }
+    shown = list(plain.items())[:most]
+    return ", ".join(f"{name} {_short(value)}" for name, value in shown)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

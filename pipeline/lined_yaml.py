@@ -1,0 +1,74 @@
+"""YAML mappings that know the line of every key, and refuse a key given twice."""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from infgen.config import ConfigError
+
+
+class Lined(dict[str, Any]):
+    """A mapping as YAML gave it.
+
+    Attributes:
+        file: Name of its file.
+        lines: Line of each key, from 1.
+    """
+
+    def __init__(self, file: str) -> None:
+        super().__init__()
+        self.file = file
+        self.lines: dict[str, int] = {}
+
+    def where(self, key: str) -> str:
+        """Place of a key, as ``stages.yaml:12``."""
+        return f"{self.file}:{self.lines[key]}"
+
+
+def load(path: Path) -> Lined:
+    """Read a YAML file whose outermost value is a mapping.
+
+    Raises:
+        ConfigError: naming file and line, if it is not YAML, or a key stands twice.
+    """
+    try:
+        node = yaml.compose(path.read_text(), Loader=yaml.SafeLoader)
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path} is missing; `infgen init` writes one") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: {' '.join(str(error).split())}") from error
+    loaded = _plain(node, path.name) if node is not None else Lined(path.name)
+    if not isinstance(loaded, Lined):
+        raise ConfigError(f"{path}: expected a mapping, got {type(loaded).__name__}")
+    return loaded
+
+
+def _plain(node: yaml.Node, file: str) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return _mapping(node, file)
+    if isinstance(node, yaml.SequenceNode):
+        return [_plain(part, file) for part in node.value]
+    try:
+        return yaml.constructor.SafeConstructor().construct_object(node)
+    except (yaml.YAMLError, ValueError) as error:
+        said = " ".join(str(error).split())
+        raise ConfigError(f"{file}:{_line(node)}: {said}") from error
+
+
+def _mapping(node: yaml.MappingNode, file: str) -> Lined:
+    found = Lined(file)
+    for key_node, value_node in node.value:
+        key = str(key_node.value)
+        if key in found:
+            raise ConfigError(
+                f"{file}:{_line(key_node)}: {key!r} stands twice, first in line "
+                f"{found.lines[key]}; keep one"
+            )
+        found.lines[key] = _line(key_node)
+        found[key] = _plain(value_node, file)
+    return found
+
+
+def _line(node: yaml.Node) -> int:
+    return int(node.start_mark.line) + 1

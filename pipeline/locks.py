@@ -1,0 +1,92 @@
+"""One run at a time per stage. A lock dies with its process: nothing to unlock by hand."""
+
+import errno
+import fcntl
+import json
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+POLL_S = 0.1
+PATIENCE_S = 0.5
+"""How long a lock is tried before it counts as held: ``is_locked`` takes it briefly."""
+
+
+class LockedError(ValueError):
+    """Another run holds the lock."""
+
+
+@contextmanager
+def locked(path: Path, *, wait: bool = False) -> Iterator[None]:
+    """Hold a lock file for the length of the block.
+
+    Args:
+        path: The file; it is never removed.
+        wait: Queue until it is free.
+
+    Raises:
+        LockedError: if another run holds it and ``wait`` is off: its host, its process and
+            since when.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        begun = time.monotonic()
+        while not _try(handle, fcntl.LOCK_EX):
+            if not wait and time.monotonic() - begun > PATIENCE_S:
+                raise LockedError(_who(path))
+            time.sleep(POLL_S)
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, json.dumps(_me()).encode(), 0)
+        yield
+        os.ftruncate(handle, 0)
+    finally:
+        os.close(handle)
+
+
+def is_locked(path: Path) -> bool:
+    """Whether some process holds a lock."""
+    if not path.is_file():
+        return False
+    handle = os.open(path, os.O_RDWR)
+    try:
+        return not _try(handle, fcntl.LOCK_SH)
+    finally:
+        os.close(handle)
+
+
+def holder(path: Path) -> dict[str, Any]:
+    """Host, process and start of the run that holds a lock; empty if it cannot be told."""
+    try:
+        about = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return about if isinstance(about, dict) else {}
+
+
+def _try(handle: int, kind: int) -> bool:
+    try:
+        fcntl.flock(handle, kind | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.EAGAIN, errno.EACCES):
+            return False
+        raise
+    return True
+
+
+def _me() -> dict[str, Any]:
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"host": socket.gethostname(), "pid": os.getpid(), "since": now}
+
+
+def _who(path: Path) -> str:
+    about = holder(path)
+    who = "another process"
+    if about:
+        who = f"process {about['pid']} on {about['host']} since {about['since']}"
+    return f"{path.parent.name} is being made by {who}; --wait queues behind it ({path})"

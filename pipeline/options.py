@@ -1,0 +1,131 @@
+"""Options that several verbs share, gathered in records, and verbs that take them."""
+
+import inspect
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
+from pipeline.plan import Plan, PlanError
+from pipeline.request import Request, complete
+from pipeline.root import Root
+from pipeline.runner import Orders
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What names a request; what is not named is as in the root's last run."""
+
+    root: Annotated[Path, typer.Option(help="Folder of the experiment.")] = Path("work")
+    records: Annotated[
+        list[str] | None,
+        typer.Option(help="TFRecords: paths, patterns, folders or URLs; may be repeated."),
+    ] = None
+    profile: Annotated[
+        str | None,
+        typer.Option("--profile", "--preset", help="Settings laid over, from stages.yaml."),
+    ] = None
+    set: Annotated[
+        list[str] | None,
+        typer.Option("-s", "--set", help="stage.key=value, e.g. train.steps=100."),
+    ] = None
+    file: Annotated[
+        Path | None, typer.Option(help="Another stages.yaml than ./stages.yaml.")
+    ] = None
+
+    def request(self, records: Sequence[str] = ()) -> Request:
+        """Fill in from the root's memory what was not named."""
+        return complete(
+            Root(self.root.absolute()),
+            file=self.file,
+            profile=self.profile,
+            records=[
+                part for word in (*(self.records or ()), *records) for part in _split(word)
+            ],
+            overrides=self.set or (),
+            environ=os.environ,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """How to run; none of it decides what comes out."""
+
+    dry_run: Annotated[bool, typer.Option("-n", "--dry-run", help="Only say what.")] = False
+    force: Annotated[
+        bool, typer.Option("-f", "--force", help="Make the named stages again.")
+    ] = False
+    begin: Annotated[
+        str | None, typer.Option("--from", help="Make again from this stage on.")
+    ] = None
+    keep_going: Annotated[
+        bool, typer.Option("-k", "--keep-going", help="Go on after a failed unit.")
+    ] = False
+    wait: Annotated[bool, typer.Option("--wait", help="Queue behind another run.")] = False
+    dask: Annotated[
+        str,
+        typer.Option(
+            help="none, local[:N], gpu[:0,1], tcp://HOST:PORT, file:scheduler.json."
+        ),
+    ] = "none"
+    max_bad: Annotated[
+        float, typer.Option(help="Largest share of records that may be quarantined.")
+    ] = 0.001
+    strict_code: Annotated[
+        bool, typer.Option("--strict-code", help="Make again what other code made.")
+    ] = False
+
+    def orders(self, targets: Sequence[str], plan: Plan) -> Orders:
+        """Say which stages are made again, and how the units are done."""
+        again = set(targets or plan.stages) if self.force else set()
+        if self.begin is not None:
+            if self.begin not in plan.stages:
+                there = ", ".join(plan.stages)
+                raise PlanError(f"--from {self.begin}: not on the way; there is {there}")
+            again.add(self.begin)
+        return Orders(
+            force=frozenset(again),
+            keep_going=self.keep_going,
+            wait=self.wait,
+            strict_code=self.strict_code,
+            workers=self.dask,
+        )
+
+
+def _split(word: str) -> list[str]:
+    return [word] if Path(word).exists() else [part for part in word.split(",") if part]
+
+
+def gathers(**records: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Let a verb take the fields of some records as options, gathered in those records."""
+
+    def decorate(verb: Callable[..., None]) -> Callable[..., None]:
+        @wraps(verb)
+        def gathered(**values: Any) -> None:
+            for name, kind in records.items():
+                given = {field.name: values.pop(field.name) for field in fields(kind)}
+                values[name] = kind(**given)
+            verb(**values)
+
+        own = [
+            p for p in inspect.signature(verb).parameters.values() if p.name not in records
+        ]
+        options = [option for kind in records.values() for option in _options(kind)]
+        gathered.__signature__ = inspect.Signature([*own, *options])  # type: ignore[attr-defined]
+        gathered.__annotations__ = {p.name: p.annotation for p in (*own, *options)}
+        return gathered
+
+    return decorate
+
+
+def _options(kind: type) -> list[inspect.Parameter]:
+    hints = get_type_hints(kind, include_extras=True)
+    only_by_name = inspect.Parameter.KEYWORD_ONLY
+    return [
+        inspect.Parameter(f.name, only_by_name, default=f.default, annotation=hints[f.name])
+        for f in fields(kind)
+    ]

@@ -1,0 +1,142 @@
+"""What the user asks of a root, and what a root remembers of having been asked.
+
+A command names records, a profile and settings, or leaves them to be as last time:
+``infgen status --root R`` alone speaks of the last run. Whoever names a profile or records
+starts a new request: settings of the last one then count no more.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.folders import StoreError, write_json
+from pipeline.plan import Plan, make_plan
+from pipeline.root import Root, link, read_json
+from pipeline.settings import DEFAULT_FILE, StagesFile, load_stages
+from pipeline.sources import absolute
+
+NO_PROFILE = "default"
+LAST = "last"
+OWN_FILE = "stages.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """All that decides what a run makes.
+
+    Attributes:
+        root: Where.
+        file: Its ``stages.yaml``.
+        profile: Laid over it; None for none.
+        records: Paths, patterns or URLs; empty to use those of the file.
+        overrides: ``section.key=value`` words.
+    """
+
+    root: Root
+    file: Path
+    profile: str | None
+    records: tuple[str, ...]
+    overrides: tuple[str, ...]
+
+    @property
+    def words(self) -> str:
+        """The request as it would be written on the command line."""
+        records = [f"--records {pattern}" for pattern in self.records]
+        profile = [f"--profile {self.profile}"] if self.profile else []
+        return " ".join([*profile, *records, *[f"-s {word}" for word in self.overrides]])
+
+    def stages(self, environ: Mapping[str, str]) -> StagesFile:
+        """Read the request's ``stages.yaml``."""
+        return load_stages(self.file, environ)
+
+    def plan(self, targets: Sequence[str], environ: Mapping[str, str]) -> Plan:
+        """Plan the targets (all stages if there are none) and what they need."""
+        file = self.stages(environ)
+        chosen = file.choose(self.profile, self.overrides)
+        if self.records:
+            chosen = chosen.with_sources(self.records)
+        return make_plan(self.root, file.stages, chosen, targets or list(file.stages))
+
+    def made(self) -> Mapping[str, str]:
+        """Keys of the stages that the last run under this profile was to make."""
+        return _read(self.root, self.profile or NO_PROFILE).get("keys", {})
+
+    def remember(self, plan: Plan) -> None:
+        """Make this the root's last request."""
+        before = dict(self.made())
+        about = {
+            "profile": self.profile,
+            "records": self.records,
+            "overrides": self.overrides,
+            "file": None if self.file == DEFAULT_FILE else str(self.file),
+            "keys": {**before, **{name: plan[name].key for name in plan.stages}},
+        }
+        path = _ref(self.root, self.profile or NO_PROFILE)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, about)
+        link(self.root.refs / LAST, path)
+
+
+def complete(
+    root: Root,
+    *,
+    file: Path | None,
+    profile: str | None,
+    records: Sequence[str],
+    overrides: Sequence[str],
+    environ: Mapping[str, str],
+) -> Request:
+    """Fill in from the root's memory what a command does not name."""
+    last = _read(root, LAST)
+    fresh = profile is not None or bool(records)
+    profile = profile or last.get("profile")
+    before = _read(root, profile or NO_PROFILE)
+    request = Request(
+        root=root,
+        file=_file(file, before or last),
+        profile=profile,
+        records=tuple(absolute(pattern) for pattern in records),
+        overrides=(*(() if fresh else before.get("overrides", ())), *overrides),
+    )
+    if not records:
+        request = _with_known_records(request, before, last, environ)
+    return request
+
+
+def _with_known_records(
+    request: Request,
+    before: Mapping[str, Any],
+    last: Mapping[str, Any],
+    environ: Mapping[str, str],
+) -> Request:
+    """Take the records this profile had; or those of the file; or the root's last."""
+    known = before.get("records", ())
+    if not known and not request.stages(environ).names_sources(request.profile):
+        known = last.get("records", ())
+    return Request(
+        request.root, request.file, request.profile, tuple(known), request.overrides
+    )
+
+
+def _file(named: Path | None, before: Mapping[str, Any]) -> Path:
+    own = Path(OWN_FILE)
+    if named is not None:
+        return named.absolute()
+    if own.is_file():
+        return own.absolute()
+    remembered = before.get("file")
+    return Path(remembered) if remembered else DEFAULT_FILE
+
+
+def _ref(root: Root, name: str) -> Path:
+    return root.refs / f"{name}.json"
+
+
+def _read(root: Root, name: str) -> dict[str, Any]:
+    path = root.refs / LAST if name == LAST else _ref(root, name)
+    try:
+        about = read_json(path)
+    except StoreError:
+        return {}
+    return about if isinstance(about, dict) else {}

@@ -1,0 +1,203 @@
+"""Stage ``rollout``: weights and the first second of every scene to played futures.
+
+One unit is some scenes of one shard with all their rollouts, so a task is long beside its
+overhead. What a rollout does depends on its scene, its index and the seed alone.
+"""
+
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from itertools import groupby, islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from infgen.clock import CLOCK
+from infgen.config import RolloutSettings
+from pipeline.splits import in_split
+from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
+
+if TYPE_CHECKING:
+    from infgen.rollout.rollout import Rollout
+    from infgen.rollout.simulate import Player
+    from infgen.rollout.trace import Start
+
+SCHEMA = "infgen.rollouts/1"
+
+
+def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
+    """Cut the split into units of ``scenes_per_task`` scenes."""
+    weights = inputs.folder("train")
+    identity = inputs.content("train", "model.safetensors", "model.json")
+    shards = [
+        done for done in inputs.units("ingest") if in_split(done.name, settings.split)
+    ]
+    left = settings.scenes or sum(int(done.report["scenes"]) for done in shards)
+    units = []
+    for done in shards:
+        scenes = min(left, int(done.report["scenes"]))
+        left -= scenes
+        for first in range(0, scenes, settings.scenes_per_task):
+            count = min(settings.scenes_per_task, scenes - first)
+            units.append(
+                Unit(
+                    name=f"{done.name}-{first:05d}",
+                    inputs={"scenes": done.key, "weights": identity},
+                    task={
+                        "scenes": str(done.path),
+                        "weights": str(weights),
+                        "first": first,
+                        "count": count,
+                    },
+                )
+            )
+    return units
+
+
+def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress) -> Report:
+    """Play all rollouts of some scenes, a batch at a time, and write them as groups."""
+    from infgen.rollout.rollout import Rollout  # noqa: PLC0415
+    from infgen.rollout.simulate import simulate  # noqa: PLC0415
+    from infgen.rollout.trace import Frame, collect  # noqa: PLC0415
+    from pipeline.store import write_records  # noqa: PLC0415
+
+    player, weights = _player(Path(unit.task["weights"]), settings)
+    starts, refused = _starts(unit, player, settings)
+    rows: list[dict[str, Any]] = []
+    for group, batch in enumerate(_batches(starts, settings.batch)):
+        frames: list[Frame] = []
+        for frame in simulate(player, batch):
+            frames.append(frame)
+            share = len(frames) * CLOCK.token_s / settings.seconds
+            progress(len(rows) + len(batch) * share, len(starts), "rollouts")
+        rollouts = collect(batch, frames, weights)
+        path = target / f"rollouts-{group:03d}.zarr"
+        write_records(path, rollouts, Rollout, SCHEMA, compress=True)
+        rows += [_row(unit.name, group, at, played) for at, played in enumerate(rollouts)]
+    _write_index(target, rows)
+    return _report(rows, refused)
+
+
+def read_rollouts(folder: Path) -> "Iterator[Rollout]":
+    """Read the rollouts of one unit, a group in memory at a time."""
+    from infgen.rollout.rollout import Rollout  # noqa: PLC0415
+    from pipeline.store import read_records  # noqa: PLC0415
+
+    for path in sorted(folder.glob("rollouts-*.zarr")):
+        yield from read_records(path, Rollout, SCHEMA, mapped=False)
+
+
+def finish(
+    inputs: Inputs,
+    units: Sequence[Done],
+    target: Path,
+    settings: RolloutSettings,
+    progress: Progress,
+) -> Report:
+    """Write one index of all rollouts, and what they add up to."""
+    import polars as pl  # noqa: PLC0415
+
+    parts = [pl.scan_parquet(done.path / "index.parquet") for done in units]
+    if parts:
+        pl.concat(parts).sink_parquet(target / "index.parquet")
+    count = sum(done.report["rollouts"] for done in units)
+    totals = {
+        name: sum(done.report[name] for done in units)
+        for name in ("rollouts", "inserted", "left", "agents")
+    }
+    means = {
+        f"{name}_per_rollout": totals[name] / count if count else 0.0
+        for name in ("inserted", "left", "agents")
+    }
+    refused = [line for done in units for line in done.report["refused"]]
+    return {"rollouts": count, **means, "refused": refused}
+
+
+@lru_cache(maxsize=2)
+def _player(weights: Path, settings: RolloutSettings) -> "tuple[Player, str]":
+    """Load the weights once per process."""
+    import torch  # noqa: PLC0415
+
+    from infgen.model.steps import Stepper  # noqa: PLC0415
+    from infgen.rollout.simulate import Player  # noqa: PLC0415
+    from pipeline.train import load_network, weights_fingerprint  # noqa: PLC0415
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    network = load_network(weights).to(device).eval()
+    player = Player(
+        stepper=Stepper(network),
+        codebook=network.motion_codebook(),
+        roads=network.road_codebook(),
+        tokens=network.grid_settings,
+        settings=settings,
+        device=device,
+    )
+    return player, weights_fingerprint(weights)
+
+
+def _starts(
+    unit: Unit, player: "Player", settings: RolloutSettings
+) -> "tuple[list[Start], list[str]]":
+    """Tokenize the histories; scenes that cannot be played are named with the reason."""
+    from infgen.rollout.trace import Start  # noqa: PLC0415
+    from infgen.tokens.tokenizer import tokenize_scene  # noqa: PLC0415
+    from pipeline.ingest import read_scenes  # noqa: PLC0415
+
+    first, count = unit.task["first"], unit.task["count"]
+    starts, refused = [], []
+    for scene in islice(read_scenes(Path(unit.task["scenes"])), first, first + count):
+        try:
+            history = tokenize_scene(
+                scene, player.codebook, player.roads, player.tokens, until=scene.now
+            )
+        except ValueError as error:
+            refused.append(f"{scene.scenario_id}: {error}")
+            continue
+        starts += [Start(scene, history, at, settings.seed) for at in range(settings.count)]
+    return starts, refused
+
+
+def _batches(starts: "Sequence[Start]", size: int) -> "Iterator[list[Start]]":
+    """Cut into batches whose histories are of one length."""
+    for _, group in groupby(starts, key=lambda start: start.history.now):
+        alike = list(group)
+        yield from (alike[at : at + size] for at in range(0, len(alike), size))
+
+
+def _row(unit: str, group: int, at: int, rollout: "Rollout") -> dict[str, Any]:
+    return {
+        "scenario_id": rollout.scenario_id,
+        "rollout": rollout.index,
+        "unit": unit,
+        "group": group,
+        "row": at,
+        "agents": len(rollout.id),
+        "inserted": int((~rollout.logged).sum()),
+        "left": int((rollout.exit_step >= 0).sum()),
+        "steps": rollout.num_steps,
+    }
+
+
+def _write_index(target: Path, rows: list[dict[str, Any]]) -> None:
+    import polars as pl  # noqa: PLC0415
+
+    columns = {name: pl.Int32 for name in ("rollout", "group", "row", "agents", "inserted")}
+    schema = {"scenario_id": pl.String, "unit": pl.String, **columns}
+    schema |= {"left": pl.Int32, "steps": pl.Int32}
+    pl.DataFrame(rows, schema=schema).write_parquet(target / "index.parquet")
+
+
+def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
+    totals = {
+        name: sum(row[name] for row in rows) for name in ("agents", "inserted", "left")
+    }
+    return {"rollouts": len(rows), **totals, "refused": refused}
+
+
+STAGE = Stage(
+    name="rollout",
+    version=1,
+    settings={"rollout": RolloutSettings},
+    plan=plan,
+    work=play,
+    finish=finish,
+    modules=("infgen.rollout", "infgen.model", "infgen.tokens", "pipeline.rollout"),
+)

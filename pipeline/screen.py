@@ -1,0 +1,126 @@
+"""The door to the terminal: progress while a run goes on, and tables.
+
+With a terminal there is a bar per stage; without one, a plain line per event, and while a
+stage goes on one line every ten seconds.
+"""
+
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.table import Table
+
+from pipeline.events import Event
+from pipeline.gauge import Gauge, figures
+
+QUIET_S = 10.0
+PLAIN_WIDTH = 160
+
+
+def console() -> Console:
+    """Standard output; as wide as a log may be where it is no terminal."""
+    plain = Console()
+    return plain if plain.is_terminal else Console(width=PLAIN_WIDTH)
+
+
+def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print a table to standard output."""
+    table = Table(*columns, title=title, title_justify="left")
+    for row in rows:
+        table.add_row(*[_cell(value) for value in row])
+    console().print(table)
+
+
+def gibibytes(count: int) -> str:
+    """Write a number of bytes for people."""
+    return f"{count / (1 << 30):.2f} GiB" if count >= 1 << 30 else f"{count / 1e6:.1f} MB"
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    text = f"{value:.4g}" if isinstance(value, float) else str(value)
+    return text.replace("[", r"\[")
+
+
+class Screen:
+    """Listens to a run and shows it on standard error."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        self._gauge: Gauge | None = None
+        self._bars: Progress | None = None
+        self._bar: TaskID | None = None
+        self._said_at = time.monotonic()
+
+    def __enter__(self) -> "Screen":
+        if self._console.is_terminal:
+            self._bars = Progress(
+                TextColumn("{task.description:<12}"),
+                BarColumn(),
+                TextColumn("{task.fields[words]}"),
+                console=self._console,
+            )
+            self._bars.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+
+    def __call__(self, event: Event) -> None:
+        """Show one event."""
+        kind = event["event"]
+        if kind == "stage-started":
+            self._start(event)
+        elif kind in ("unit-done", "unit-failed", "progress") and self._gauge is not None:
+            self._gauge.take(event)
+            self._go_on(event)
+        if kind in _LINES:
+            self._say(_LINES[kind].format_map(_Words(event)))
+
+    def _start(self, event: Event) -> None:
+        self._gauge = Gauge(event["stage"], event["units"], event["made"])
+        self._said_at = time.monotonic()
+        if self._bars is not None:
+            self._bar = self._bars.add_task(event["stage"], total=None, words="")
+
+    def _go_on(self, event: Event) -> None:
+        gauge = self._gauge
+        if gauge is None:
+            return
+        if self._bars is not None and self._bar is not None:
+            self._bars.update(
+                self._bar, completed=gauge.done, total=gauge.total, words=gauge.words()
+            )
+        elif time.monotonic() - self._said_at >= QUIET_S:
+            self._said_at = time.monotonic()
+            self._say(f"{gauge.stage}: {gauge.words()}")
+
+    def _say(self, line: str) -> None:
+        if self._bars is None:
+            sys.stderr.write(f"{time.strftime('%H:%M:%S')} {line}\n")
+            sys.stderr.flush()
+        else:
+            self._console.print(line, markup=False, highlight=False)
+
+
+_LINES = {
+    "stage-cached": "{stage}: cached ({units} units)",
+    "stage-started": "{stage}: {units} units, {made} of them made before",
+    "unit-failed": "{stage}: unit {unit} failed: {error}",
+    "stage-done": "{stage}: made; {figures}",
+    "stage-failed": "{stage}: failed; the log tells more, and the next run tries again",
+    "stage-skipped": "{stage}: skipped, as what it needs is not made",
+}
+
+
+class _Words(dict[str, Any]):
+    """The figures of an event, with its report in words."""
+
+    def __init__(self, event: Event) -> None:
+        super().__init__(event)
+        self["figures"] = figures(event.get("report") or {}) or "no figures"

@@ -1,0 +1,91 @@
+"""Stopping on SIGTERM and SIGINT without leaving anything half done.
+
+The first signal raises ``Stopped`` at once, except inside ``whole()`` (a write that must
+be finished; it is raised at its end) and inside ``patient()`` (work that saves its state;
+it is raised by the next ``check()``). A second signal raises at once inside ``patient()``
+too.
+"""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+
+SIGNALS = (signal.SIGTERM, signal.SIGINT)
+
+
+class Stopped(BaseException):
+    """The process was asked to stop. Not an ``Exception``: nothing shall swallow it.
+
+    Attributes:
+        signal: Number of the signal; the exit code is 128 more.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name}")
+        self.signal = number
+
+
+@dataclass
+class _State:
+    """Signals belong to the process, and so does this."""
+
+    pending: int = 0
+    whole: int = 0
+    patient: int = 0
+
+
+_STATE = _State()
+
+
+@contextmanager
+def listening() -> Iterator[None]:
+    """Turn SIGTERM and SIGINT into ``Stopped`` for the length of the block."""
+    before = {number: signal.signal(number, _note) for number in SIGNALS}
+    _STATE.pending = 0
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def whole() -> Iterator[None]:
+    """Put a signal off until the block is done."""
+    _STATE.whole += 1
+    try:
+        yield
+    finally:
+        _STATE.whole -= 1
+    if _STATE.pending and not _STATE.whole and not _STATE.patient:
+        raise Stopped(_STATE.pending)
+
+
+@contextmanager
+def patient() -> Iterator[None]:
+    """Leave it to the block to call ``check`` where it can stop well."""
+    _STATE.patient += 1
+    try:
+        yield
+    finally:
+        _STATE.patient -= 1
+    check()
+
+
+def check() -> None:
+    """Stop here if a signal has come.
+
+    Raises:
+        Stopped: if so.
+    """
+    if _STATE.pending and not _STATE.whole:
+        raise Stopped(_STATE.pending)
+
+
+def _note(number: int, frame: FrameType | None) -> None:
+    again = bool(_STATE.pending)
+    _STATE.pending = number
+    if not _STATE.whole and (again or not _STATE.patient):
+        raise Stopped(number)

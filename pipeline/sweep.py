@@ -1,0 +1,109 @@
+"""Finding and removing what no remembered request needs any more."""
+
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.folders import PARTIAL, StoreError
+from pipeline.locks import locked
+from pipeline.manifest import read_manifest
+from pipeline.root import KEY_DIGITS, MANIFEST, Root, read_json
+
+PARTIAL_AGE_S = 24 * 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Garbage:
+    """A folder that nothing needs.
+
+    Attributes:
+        path: Where it is.
+        bytes: What it takes.
+        why: What it is.
+    """
+
+    path: Path
+    bytes: int
+    why: str
+
+
+def find_garbage(root: Root) -> list[Garbage]:
+    """List what the latest stages of every profile, and their units, do not need.
+
+    Units of an unfinished stage are kept: the next run goes on from them.
+    """
+    found = []
+    for stage in root.stages():
+        kept = _kept(root, stage)
+        for folder in _folders(root, stage):
+            if folder.name.endswith(PARTIAL):
+                if _age_s(folder) > PARTIAL_AGE_S:
+                    found.append(Garbage(folder, _bytes(folder), "left by a killed run"))
+            elif folder.name not in kept:
+                what = "unit" if folder.parent.name == "units" else "stage"
+                found.append(Garbage(folder, _bytes(folder), f"{what} of {stage}"))
+    return found
+
+
+def sweep(root: Root) -> list[Garbage]:
+    """Remove the garbage while holding the locks of all stages.
+
+    Raises:
+        LockedError: if a run is making one of them.
+    """
+    with ExitStack() as stack:
+        for stage in root.stages():
+            stack.enter_context(locked(root.lock(stage)))
+        found = find_garbage(root)
+        for garbage in found:
+            (garbage.path / MANIFEST).unlink(missing_ok=True)
+            shutil.rmtree(garbage.path)
+    return found
+
+
+def _kept(root: Root, stage: str) -> set[str]:
+    """Names of folders that are needed, of the stage itself and of its units."""
+    folders = {key[:KEY_DIGITS] for key in _remembered(root, stage)}
+    pointed = root.pointed(stage)
+    if pointed is not None:
+        folders.add(pointed.name)
+    units = set()
+    for folder in folders:
+        if (root.stage(stage) / folder / MANIFEST).is_file():
+            manifest = read_manifest(root.stage(stage) / folder)
+            units |= {unit["key"][:KEY_DIGITS] for unit in manifest["units"]}
+    return folders | units | _under_way(root, stage)
+
+
+def _remembered(root: Root, stage: str) -> Iterator[str]:
+    for path in sorted(root.refs.glob("*.json")):
+        key = read_json(path).get("keys", {}).get(stage)
+        if key is not None:
+            yield key
+
+
+def _under_way(root: Root, stage: str) -> set[str]:
+    try:
+        attempt = read_json(root.attempt(stage))
+    except StoreError:
+        return set()
+    return {key[:KEY_DIGITS] for key in attempt["units"].values()}
+
+
+def _folders(root: Root, stage: str) -> Iterator[Path]:
+    for parent in (root.stage(stage), root.units(stage)):
+        for path in sorted(parent.glob("*")):
+            if path.is_dir() and path != root.units(stage):
+                yield path
+
+
+def _bytes(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def _age_s(folder: Path) -> float:
+    newest = max(path.stat().st_mtime for path in (folder, *folder.rglob("*")))
+    return time.time() - newest

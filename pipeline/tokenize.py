@@ -1,0 +1,249 @@
+"""Stage ``tokenize``: scenes and codebooks to tokens that training maps into memory.
+
+One unit per ingested file. Groups are uncompressed, so their chunk files are the arrays. A
+scene that cannot be written as tokens is a named row of ``refused.parquet``.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from infgen.config import TokenSettings
+from infgen.scene import Scene
+from infgen.tokens.figures import Figures, count, describe, no_figures
+from infgen.tokens.scene_tokens import SceneTokens
+from infgen.tokens.tokenizer import tokenize_scene
+from infgen.tokens.tracks import TokensError
+from pipeline.splits import split_of
+from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from pipeline.columns import Unpacked
+
+SCHEMA = "infgen.tokens/1"
+SCENES_PER_GROUP = 500
+CODEBOOKS = ("motion.zarr", "roads.zarr")
+
+_INDEX = {
+    "scenario_id": str,
+    "split": str,
+    "unit": str,
+    "group": str,
+    "row": int,
+    "agents": int,
+    "tokens": int,
+    "roads": int,
+    "words": int,
+    "entries": int,
+}
+_REFUSED = {"scenario_id": str, "split": str, "unit": str, "reason": str}
+
+
+def open_tokens(unit_folder: Path) -> "list[Unpacked[SceneTokens]]":
+    """Map the tokens of one unit into memory, group by group.
+
+    Raises:
+        StoreError: if a group is damaged.
+    """
+    from pipeline.store import read_records  # noqa: PLC0415
+
+    return [
+        read_records(path, SceneTokens, SCHEMA, mapped=True)
+        for path in sorted(unit_folder.glob("tokens-*.zarr"))
+    ]
+
+
+def plan(inputs: Inputs, settings: TokenSettings) -> list[Unit]:
+    """One unit per ingested file."""
+    codebooks = inputs.folder("build-vocab")
+    identity = inputs.content("build-vocab", *CODEBOOKS)
+    return [
+        Unit(
+            name=done.name,
+            inputs={"scenes": done.key, "codebooks": identity},
+            task={"scenes": str(done.path), "codebooks": str(codebooks)},
+        )
+        for done in inputs.units("ingest")
+    ]
+
+
+def work(unit: Unit, target: Path, settings: TokenSettings, progress: Progress) -> Report:
+    """Tokenize the scenes of one ingested file."""
+    from pipeline.ingest import read_scenes  # noqa: PLC0415
+    from pipeline.vocabulary import load_codebooks  # noqa: PLC0415
+
+    target.mkdir(parents=True, exist_ok=True)
+    motion, roads = load_codebooks(Path(unit.task["codebooks"]))
+    shard = _Shard(target, unit.name)
+    for scene in read_scenes(Path(unit.task["scenes"])):
+        try:
+            shard.keep(scene, tokenize_scene(scene, motion, roads, settings))
+        except TokensError as error:
+            shard.refuse(scene, str(error))
+    shard.close()
+    return shard.report()
+
+
+def finish(
+    inputs: Inputs,
+    units: Sequence[Done],
+    target: Path,
+    settings: TokenSettings,
+    progress: Progress,
+) -> Report:
+    """Join the units' tables, and write what the tokens add up to, split by split."""
+    from pipeline.store import write_json  # noqa: PLC0415
+
+    target.mkdir(parents=True, exist_ok=True)
+    paths = [done.path for done in units]
+    for name, columns in (("index", _INDEX), ("refused", _REFUSED)):
+        _joined(paths, f"{name}.parquet", columns).write_parquet(target / f"{name}.parquet")
+    splits = {split_of(done.name): no_figures() for done in units}
+    for done in units:
+        splits[split_of(done.name)] += _read_figures(done.path)
+    write_json(
+        target / "report.json",
+        {split: describe(figures) for split, figures in sorted(splits.items())},
+    )
+    return {
+        "scenes": sum(done.report["scenes"] for done in units),
+        "refused": sum(done.report["refused"] for done in units),
+        "words": sum(done.report["words"] for done in units),
+    }
+
+
+class _Shard:
+    """The tokens of one file on their way to disk."""
+
+    def __init__(self, target: Path, unit: str) -> None:
+        self._target, self._unit, self._split = target, unit, split_of(unit)
+        self._pending: list[SceneTokens] = []
+        self._index: list[dict[str, Any]] = []
+        self._refused: list[dict[str, Any]] = []
+        self._figures = no_figures()
+        self._groups = 0
+
+    def keep(self, scene: Scene, tokens: SceneTokens) -> None:
+        """Take one tokenized scene."""
+        self._index.append(
+            {
+                "scenario_id": tokens.scenario_id,
+                "split": self._split,
+                "unit": self._unit,
+                "group": self._group_name,
+                "row": len(self._pending),
+                "agents": tokens.num_agents,
+                "tokens": tokens.num_tokens,
+                "roads": tokens.num_roads,
+                "words": len(tokens.word),
+                "entries": len(tokens.entry_agent),
+            }
+        )
+        self._figures += count(scene, tokens)
+        self._pending.append(tokens)
+        if len(self._pending) == SCENES_PER_GROUP:
+            self._flush()
+
+    def refuse(self, scene: Scene, reason: str) -> None:
+        """Name a scene that cannot be tokenized."""
+        row = (scene.scenario_id, self._split, self._unit, reason)
+        self._refused.append(dict(zip(_REFUSED, row, strict=True)))
+
+    def close(self) -> None:
+        """Write what is left, the tables and the figures."""
+        from pipeline.store import write_json  # noqa: PLC0415
+
+        self._flush()
+        _table(self._index, _INDEX).write_parquet(self._target / "index.parquet")
+        _table(self._refused, _REFUSED).write_parquet(self._target / "refused.parquet")
+        figures = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in asdict(self._figures).items()
+        }
+        write_json(self._target / "figures.json", figures)
+
+    def report(self) -> Report:
+        """Sum up the unit."""
+        return {
+            "split": self._split,
+            "scenes": len(self._index),
+            "refused": len(self._refused),
+            "agents": int(self._figures.agents.sum()),
+            "words": self._figures.words,
+        }
+
+    @property
+    def _group_name(self) -> str:
+        return f"tokens-{self._groups:03d}.zarr"
+
+    def _flush(self) -> None:
+        from pipeline.store import write_records  # noqa: PLC0415
+
+        if not self._pending:
+            return
+        path = self._target / self._group_name
+        write_records(path, self._pending, SceneTokens, SCHEMA, compress=False)
+        self._pending = []
+        self._groups += 1
+
+
+def _read_figures(unit_folder: Path) -> Figures:
+    values: dict[str, Any] = json.loads((unit_folder / "figures.json").read_text())
+    for name, value in values.items():
+        if isinstance(value, list):
+            values[name] = np.array(value, np.int64)
+    return Figures(**values)
+
+
+def _table(
+    rows: Sequence[Mapping[str, Any]], columns: Mapping[str, type]
+) -> "pl.DataFrame":
+    import polars as pl  # noqa: PLC0415
+
+    types = {name: pl.String if kind is str else pl.Int64 for name, kind in columns.items()}
+    return pl.DataFrame(list(rows), schema=types)
+
+
+def _joined(
+    folders: Sequence[Path], name: str, columns: Mapping[str, type]
+) -> "pl.DataFrame":
+    import polars as pl  # noqa: PLC0415
+
+    tables = [pl.read_parquet(folder / name) for folder in folders]
+    return pl.concat([_table([], columns), *tables])
+
+
+STAGE = Stage(
+    name="tokenize",
+    version=1,
+    settings={"tokenize": TokenSettings},
+    plan=plan,
+    work=work,
+    finish=finish,
+    modules=(
+        "infgen.clock",
+        "infgen.geometry",
+        "infgen.tokens.agents",
+        "infgen.tokens.codebook",
+        "infgen.tokens.entries",
+        "infgen.tokens.figures",
+        "infgen.tokens.grid",
+        "infgen.tokens.moves",
+        "infgen.tokens.presence",
+        "infgen.tokens.roads",
+        "infgen.tokens.scene_tokens",
+        "infgen.tokens.sequence",
+        "infgen.tokens.signals",
+        "infgen.tokens.tokenizer",
+        "infgen.tokens.tracks",
+        "pipeline.columns",
+        "pipeline.store",
+        "pipeline.tokenize",
+    ),
+)

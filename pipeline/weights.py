@@ -1,0 +1,134 @@
+"""Weights on disk: safetensors with the codebooks in them, and a page of JSON."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from infgen.config import ModelSettings, TokenSettings, build
+from infgen.model.network import Network
+from infgen.tokens.codebook import MotionCodebook, RoadCodebook
+from pipeline.folders import StoreError, write_file, write_json
+
+SCHEMA = "infgen.model/1"
+WEIGHTS, ABOUT = "model.safetensors", "model.json"
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> str:
+    """Write named tensors whole or not at all; return the sha256 of the file."""
+    ready = {k: tensors[k].detach().cpu().contiguous() for k in sorted(tensors)}
+    data = save(ready)
+    write_file(path, data)
+    return hashlib.sha256(data).hexdigest()
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Read named tensors.
+
+    Raises:
+        StoreError: if the file is missing or damaged.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise StoreError(f"{path} cannot be read: {error}") from error
+
+
+def save_network(
+    folder: Path, network: Network, state: Mapping[str, Tensor], step: int
+) -> str:
+    """Write weights so that nothing else is needed to load them.
+
+    Args:
+        folder: Where to.
+        network: Whose sizes, codebooks and grid they are for.
+        state: The weights (of the network itself, or averaged).
+        step: Optimiser step they are from.
+
+    Returns:
+        Their fingerprint.
+    """
+    fingerprint = write_tensors(folder / WEIGHTS, state)
+    about = {
+        "schema": SCHEMA,
+        "model": asdict(network.settings),
+        "tokenize": asdict(network.grid_settings),
+        "vocabulary": vocabulary_fingerprint(
+            network.motion_codebook(), network.road_codebook()
+        ),
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "step": step,
+        "weights": fingerprint,
+    }
+    write_json(folder / ABOUT, about)
+    return fingerprint
+
+
+def load_network(folder: Path) -> Network:
+    """Load the network whose weights a folder holds, ready to be played.
+
+    Raises:
+        StoreError: if a file is missing, damaged, or of another schema.
+    """
+    about = read_about(folder)
+    tensors = read_tensors(folder / WEIGHTS)
+    motion = MotionCodebook(*_arrays(tensors, "motion_size_lw_m motion_path motion_real"))
+    roads = RoadCodebook(*_arrays(tensors, "road_curve_m road_real"))
+    where = str(folder / ABOUT)
+    network = Network(
+        build(ModelSettings, about["model"], where),
+        motion,
+        roads,
+        build(TokenSettings, about["tokenize"], where),
+    )
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise StoreError(
+            f"{folder / WEIGHTS} does not fit its settings: {error}"
+        ) from error
+    return network.eval()
+
+
+def read_about(folder: Path) -> dict[str, Any]:
+    """Read what is said about the weights in a folder.
+
+    Raises:
+        StoreError: if there are none, or they are of another schema.
+    """
+    path = folder / ABOUT
+    if not path.is_file():
+        raise StoreError(f"{path} is missing; run stage 'train' first")
+    about: dict[str, Any] = json.loads(path.read_text())
+    if about.get("schema") != SCHEMA:
+        raise StoreError(f"{path} holds {about.get('schema')!r}, expected {SCHEMA!r}")
+    return about
+
+
+def vocabulary_fingerprint(motion: MotionCodebook, roads: RoadCodebook) -> str:
+    """Identity of two codebooks: the same arrays, the same text."""
+    digest = hashlib.sha256()
+    for array in (motion.size_lw_m, motion.path, motion.real, roads.curve_m, roads.real):
+        digest.update(f"{array.shape}{array.dtype}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def state_of(network: torch.nn.Module) -> dict[str, Tensor]:
+    """Weights and codebooks of a network by name (not copied)."""
+    return {name: tensor.detach() for name, tensor in network.state_dict().items()}
+
+
+def _arrays(tensors: Mapping[str, Tensor], names: str) -> list[Any]:
+    missing = [name for name in names.split() if name not in tensors]
+    if missing:
+        raise StoreError(f"the weights lack {', '.join(missing)}")
+    return [tensors[name].numpy() for name in names.split()]

@@ -1,0 +1,221 @@
+"""Small made-up tokenized scenes, and a network small enough to check number by number."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from infgen.config import ModelSettings, TokenSettings
+from infgen.geometry import to_world
+from infgen.model.batch import Limits
+from infgen.model.network import Network
+from infgen.tokens.codebook import BOX_LW_M, MotionCodebook, RoadCodebook
+from infgen.tokens.grid import encode_cell, encode_heading, make_grid, to_grid
+from infgen.tokens.scene_tokens import (
+    FIRST_MOVE,
+    NO_CELL,
+    NO_MOVE,
+    Presence,
+    SceneTokens,
+    SignalClass,
+)
+
+NUM_MOVES, NUM_ROADS = 24, 12
+GRID = TokenSettings(grid_radius_m=60.0, grid_step_m=4.0, heading_step_deg=10.0)
+TINY = ModelSettings(
+    width=16,
+    heads=2,
+    map_blocks=2,
+    motion_blocks=2,
+    scene_blocks=2,
+    fourier_bands=4,
+    dropout=0.0,
+    window_tokens=4,
+    map_map_neighbours=8,
+    map_agent_neighbours=16,
+    agent_agent_neighbours=6,
+    query_map_neighbours=24,
+    heading_map_neighbours=8,
+    heading_agent_neighbours=4,
+    max_entries=3,
+)
+
+
+def make_motion_codebook(num_moves=NUM_MOVES):
+    random = np.random.default_rng(0)
+    end = random.uniform([0, -0.5, -0.3], [5, 0.5, 0.3], size=(3, num_moves, 3))
+    end[:, 0] = 0
+    path = end[:, :, None] * np.linspace(0, 1, 6)[:, None]
+    real = np.ones((3, num_moves), dtype=bool)
+    return MotionCodebook(BOX_LW_M, path.astype(np.float32), real)
+
+
+def make_road_codebook(num_roads=NUM_ROADS):
+    bend = np.linspace(-0.1, 0.1, num_roads)[:, None] * np.arange(11)
+    steps = 0.5 * np.stack([np.cos(bend), np.sin(bend)], axis=-1)
+    curve = np.concatenate([np.zeros((num_roads, 1, 2)), steps.cumsum(axis=1)[:, :10]], 1)
+    return RoadCodebook(curve.astype(np.float32), np.ones(num_roads, dtype=bool))
+
+
+def make_record(
+    seed=0, agents=9, tokens=7, roads=60, lives=None, kinds=(0, 1, 2), spread_m=40.0
+):
+    """A scene of random moves. ``lives`` are (first, last) tokens of rows 1, 2, ...
+
+    By default a third is there throughout, a third enters and a third leaves.
+    """
+    random = np.random.default_rng(seed)
+    if lives is None:
+        lives = [_life(random, tokens) for _ in range(agents - 1)]
+    lives = [(0, tokens - 1), *lives]
+    agents = len(lives)
+    codebook = make_motion_codebook()
+    kind = np.array([0, *random.choice(kinds, agents - 1)], dtype=np.int8)
+    move = random.integers(codebook.num_moves, size=(agents, tokens))
+    start = random.uniform(-1, 1, size=(agents, 3)) * [spread_m, spread_m, np.pi]
+    start[0] = [0, 0, 0.4]
+    pose = [start.astype(np.float32)]
+    for token in range(1, tokens):
+        ends = codebook.end_pose[kind, move[:, token]]
+        pose.append(to_world(ends, pose[-1]))
+    pose = np.stack(pose, axis=1).astype(np.float32)
+
+    presence = np.zeros((agents, tokens), dtype=np.int8)
+    for row, (first, last) in enumerate(lives):
+        presence[row, first : last + 1] = Presence.PRESENT
+        presence[row, first] = Presence.ENTERING
+        if last < tokens - 1:
+            presence[row, last] = Presence.LEAVING
+    return _record(f"scene-{seed}", kind, pose, move, presence, roads, random)
+
+
+def _life(random, tokens):
+    what = random.integers(3) if tokens > 3 else 0
+    if what == 0:
+        return 0, tokens - 1
+    if what == 1:
+        return int(random.integers(1, tokens - 1)), tokens - 1
+    return 0, int(random.integers(1, tokens - 1))
+
+
+def _record(name, kind, pose, move, presence, roads, random):
+    agents, tokens = presence.shape
+    grid = make_grid(GRID)
+    entering = presence == Presence.ENTERING
+    absent = presence == Presence.ABSENT
+    observed = ~absent & ~entering
+    move = np.where(absent, NO_MOVE, np.where(entering, FIRST_MOVE, move))
+    pose = np.where(absent[..., None], 0, pose).astype(np.float32)
+    in_grid_m = to_grid(pose[..., :2], pose[:1])
+    cell = np.where(absent, NO_CELL, encode_cell(in_grid_m, grid)).astype(np.int16)
+
+    token, row = np.nonzero(entering.T)
+    far_m = np.linalg.norm(pose[row, token, :2] - pose[0, token, :2], axis=-1)
+    order = np.lexsort([far_m, token])
+    token, row = token[order], row[order]
+    centre_m = grid.centre_m[cell[row, token]]
+    offset_m = np.where(cell[row, token, None] >= 0, in_grid_m[row, token] - centre_m, 0)
+    none = np.empty(0)
+    line = np.arange(roads) // 6
+    return SceneTokens(
+        scenario_id=name,
+        origin_xyz_m=np.zeros(3),
+        now=1,
+        ego=0,
+        track_id=np.arange(agents, dtype=np.int32),
+        kind=kind,
+        size_lwh_m=random.uniform(1, 5, size=(agents, 3)).astype(np.float32),
+        z_m=np.zeros((agents, tokens), dtype=np.float32),
+        pose=pose,
+        move=move.astype(np.int16),
+        presence=presence,
+        observed=observed,
+        cell=cell,
+        near=np.ones(agents, dtype=bool),
+        entry_token=token.astype(np.int16),
+        entry_agent=row.astype(np.int16),
+        entry_cell=cell[row, token],
+        entry_offset_m=offset_m.astype(np.float32),
+        entry_heading=encode_heading(pose[row, token, 2] - pose[0, token, 2], grid),
+        entry_residual_rad=np.zeros(len(row), dtype=np.float32),
+        road_pose=random.uniform(-1, 1, (roads, 3)).astype(np.float32)
+        * np.float32([50, 50, np.pi]),
+        road_z_m=np.zeros(roads, dtype=np.float32),
+        road_token=random.integers(NUM_ROADS, size=roads).astype(np.int16),
+        road_point_kind=random.integers(10, size=roads).astype(np.int8),
+        road_line_kind=random.integers(4, size=roads).astype(np.int8),
+        road_line=line.astype(np.int32),
+        road_signal=random.integers(len(SignalClass), size=roads).astype(np.int8),
+        signal_line=none.astype(np.int32),
+        signal_state=np.empty((0, tokens), dtype=np.int8),
+        word=none.astype(np.uint8),
+        word_value=none.astype(np.int16),
+        word_agent=none.astype(np.int16),
+        word_token=none.astype(np.uint16),
+        anchor_agent=none.astype(np.int16),
+        anchor_token=none.astype(np.int16),
+        anchor_pose=np.empty((0, 3), dtype=np.float32),
+    )
+
+
+def move_world(record, turn_rad, shift_m):
+    """The same scene with its world turned about the origin and shifted."""
+    frame = np.float32([*shift_m, turn_rad])
+    absent = record.presence == Presence.ABSENT
+    pose = to_world(record.pose, np.broadcast_to(frame, record.pose.shape))
+    road_pose = to_world(record.road_pose, np.broadcast_to(frame, record.road_pose.shape))
+    return replace(
+        record,
+        pose=np.where(absent[..., None], 0, pose).astype(np.float32),
+        road_pose=road_pose.astype(np.float32),
+    )
+
+
+@pytest.fixture(scope="session")
+def limits():
+    return Limits(agents=32, roads=200, entries=TINY.max_entries, tokens=18, grid=GRID)
+
+
+def make_network(settings=TINY, seed=0):
+    torch.manual_seed(seed)
+    network = Network(settings, make_motion_codebook(), make_road_codebook(), GRID)
+    # Biases and gains away from 0 and 1, so that tests see whether they are used.
+    for parameter in network.parameters():
+        parameter.data += 0.05 * torch.randn_like(parameter)
+    return network
+
+
+@pytest.fixture(scope="session")
+def network():
+    return make_network().eval()
+
+
+@pytest.fixture(scope="session")
+def record():
+    return make_record
+
+
+@pytest.fixture(scope="session")
+def turned():
+    return move_world
+
+
+@pytest.fixture(scope="session")
+def new_network():
+    return make_network
+
+
+@pytest.fixture(scope="session")
+def tiny():
+    return TINY
+
+
+@pytest.fixture(scope="session")
+def grid_settings():
+    return GRID
+
+
+@pytest.fixture(scope="session")
+def codebooks():
+    return make_motion_codebook(), make_road_codebook()

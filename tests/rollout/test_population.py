@@ -1,0 +1,159 @@
+import numpy as np
+import pytest
+
+from infgen.rollout.population import (
+    EGO_ROW,
+    NOBODY,
+    Newcomers,
+    enter,
+    entry_pose,
+    move_on,
+    settle,
+)
+from infgen.scene import AgentKind
+from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
+
+PRESENT, LEAVING = Presence.PRESENT, Presence.LEAVING
+
+
+def newcomers(who, cell, heading=60, offset_m=(0.0, 0.0)):
+    count = len(who)
+    return Newcomers(
+        who=np.array(who),
+        cell=np.full(count, cell, dtype=np.int16),
+        offset_m=np.tile(np.array(offset_m, dtype=np.float32), (count, 1)),
+        heading=np.full(count, heading, dtype=np.int16),
+        kind=np.full(count, AgentKind.CYCLIST, dtype=np.int8),
+        size_lwh_m=np.tile(np.array([2.0, 1.0, 1.7], dtype=np.float32), (count, 1)),
+    )
+
+
+def test_the_ego_sits_in_row_zero_and_the_others_from_near_to_far(parked, start):
+    scene = parked(3, ego=2)  # cars at x = 0, 8, 16, 24; the ego is the one at 16
+
+    now = settle([start(scene)], min_rows=6)[-1]
+
+    np.testing.assert_allclose(now.pose[0, :4, 0], [16, 8, 24, 0], atol=1e-4)
+    np.testing.assert_array_equal(now.life[0], [2, 1, 3, 0, NOBODY, NOBODY])
+    assert now.born[0] == 4
+
+
+def test_the_history_ends_at_the_logs_own_poses(drive, start):
+    scene = drive(speed_mps=9.0)  # 4.5 m per half second: between two moves
+
+    now = settle([start(scene)], min_rows=1)[-1]
+
+    np.testing.assert_allclose(now.pose[0, 0], scene.tracks.pose(scene.now)[0])
+
+
+def test_rows_grow_with_the_largest_history(parked, start):
+    history = settle([start(parked(3)), start(parked(5))], min_rows=2)
+
+    assert len(history) == 2
+    assert history[0].life.shape == (2, 6)
+
+
+def test_histories_of_two_lengths_do_not_mix(parked, start):
+    with pytest.raises(ValueError, match="one length"):
+        settle([start(parked(1)), start(parked(1, now=15))], min_rows=2)
+
+
+def test_everyone_moves_by_the_move_of_their_row(parked, start, metre_moves):
+    population = settle([start(parked(1))], min_rows=3)[-1]
+    move = np.array([[5, 10, 20]])
+
+    after, path = move_on(population, move, np.zeros((1, 3), bool), metre_moves)
+
+    np.testing.assert_allclose(after.pose[0, :2, 0], [5, 18], atol=1e-4)
+    np.testing.assert_allclose(path[0, 0, :, 0], [1, 2, 3, 4, 5], atol=1e-4)
+    np.testing.assert_array_equal(after.move[0], [5, 10, NO_MOVE])
+    np.testing.assert_array_equal(after.pose[0, 2], 0)
+
+
+def test_whoever_leaves_is_there_once_more_and_then_gone_for_good(
+    parked, start, metre_moves, nobody
+):
+    population = settle([start(parked(1))], min_rows=2)[-1]
+    move, stay = nobody(1, 2)
+    leave = np.array([[False, True]])
+
+    leaving, path = move_on(population, move, leave, metre_moves)
+    gone, after = move_on(leaving, move, leave, metre_moves)
+
+    np.testing.assert_array_equal(leaving.presence[0], [PRESENT, LEAVING])
+    assert path[0, 1].any()
+    assert gone.life[0, 1] == NOBODY
+    assert gone.presence[0, 1] == Presence.ABSENT
+    assert not after[0, 1].any()
+
+
+def test_the_ego_never_leaves(parked, start, metre_moves):
+    population = settle([start(parked(1))], min_rows=2)[-1]
+
+    after, _ = move_on(
+        population, np.zeros((1, 2), int), np.ones((1, 2), bool), metre_moves
+    )
+
+    assert after.presence[0, EGO_ROW] == PRESENT
+
+
+def test_a_newcomer_takes_the_first_free_row_with_a_life_of_its_own(parked, start, grid):
+    population = settle([start(parked(1)), start(parked(2))], min_rows=4)[-1]
+
+    after, row = enter(population, newcomers([True, False], grid.ego_cell - 5), grid)
+
+    np.testing.assert_array_equal(row, [2, -1])
+    np.testing.assert_array_equal(after.life[0], [0, 1, 2, NOBODY])
+    np.testing.assert_array_equal(after.born, [3, 3])
+    assert after.presence[0, 2] == Presence.ENTERING
+    assert after.move[0, 2] == FIRST_MOVE
+    assert not after.observed[0, 2]
+    assert population.life[0, 2] == NOBODY, "the population it came from stays as it was"
+
+
+def test_a_freed_row_is_used_again_by_another_life(
+    parked, start, metre_moves, grid, nobody
+):
+    population = settle([start(parked(1))], min_rows=2)[-1]
+    move, stay = nobody(1, 2)
+    leaving, _ = move_on(population, move, np.array([[False, True]]), metre_moves)
+    gone, _ = move_on(leaving, move, stay, metre_moves)
+
+    after, row = enter(gone, newcomers([True], grid.ego_cell - 5), grid)
+
+    assert row[0] == 1
+    assert after.life[0, 1] == 2
+
+
+def test_a_full_rollout_turns_newcomers_away(parked, start, grid):
+    population = settle([start(parked(1))], min_rows=2)[-1]
+
+    after, row = enter(population, newcomers([True], grid.ego_cell - 5), grid)
+
+    assert row[0] == -1
+    np.testing.assert_array_equal(after.life, population.life)
+
+
+@pytest.mark.parametrize(
+    ("heading_rad", "expected"),
+    [(0.0, (1.0, -9.0)), (np.pi / 2, (9.0, 1.0)), (np.pi, (-1.0, 9.0))],
+)
+def test_a_cell_to_the_egos_right_is_to_its_right_whichever_way_it_faces(
+    grid, heading_rad, expected
+):
+    # Three cells to the right of the ego, and one metre ahead within the cell.
+    ego = np.array([[0.0, 0.0, heading_rad]], dtype=np.float32)
+
+    pose = entry_pose(ego, newcomers([True], grid.ego_cell + 3, offset_m=(0.0, 1.0)), grid)
+
+    np.testing.assert_allclose(pose[0, :2], expected, atol=1e-4)
+
+
+def test_cells_tell_where_everyone_is_around_the_ego(parked, start, grid):
+    population = settle([start(parked(1))], min_rows=3)[-1]  # 8 m ahead, 2 m to the right
+
+    cells = population.cells(grid)
+
+    assert cells[0, 0] == grid.ego_cell
+    np.testing.assert_allclose(grid.centre_m[cells[0, 1]], [3, 9])
+    assert cells[0, 2] == NO_CELL
