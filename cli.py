@@ -267,6 +267,8 @@ def towns(
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
     scenes: Annotated[int, typer.Option(help="How many scenes.")] = 8,
     seed: Annotated[int, typer.Option(help="Other towns for another seed.")] = 0,
+    split: Annotated[str, typer.Option(help="Start of the file names.")] = "training",
+    scenes_per_file: Annotated[int, typer.Option(help="Most scenes of a file.")] = 20,
 ) -> None:
     """Write synthetic driving logs as WOMD records.
 
@@ -274,7 +276,8 @@ def towns(
     """
     from infgen.sources.towns import write_towns  # noqa: PLC0415
 
-    for path in write_towns(out, scenes=scenes, seed=seed):
+    words = {"split": split, "scenes_per_file": scenes_per_file}
+    for path in write_towns(out, scenes, seed, **words):
         typer.echo(path)
 
 

@@ -135,7 +135,7 @@ class OnDask:
         waiting = [(task, 0) for task in reversed(tasks)]
         window = max(1, sum(self._client.nthreads().values())) * TASKS_PER_THREAD
         under_way: dict[Any, tuple[Task, int]] = {}
-        finished = _dask().as_completed()
+        finished = _dask().as_completed(loop=self._client.loop)
         while (waiting and go_on()) or under_way:
             while waiting and go_on() and len(under_way) < window:
                 task, tries = waiting.pop()
@@ -164,5 +164,5 @@ def _failed(task: Task, future: Any) -> Outcome:
     return failure(task.unit.name, error, trace, 0.0)
 
 
-def _silent(done: float, total: float, note: str = "") -> None:
+def _silent(done: float | int, total: float | int, note: str = "") -> None:
     """Progress inside a unit stays on its worker."""

@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from pipeline.root import Root
 
@@ -13,11 +13,12 @@ Event = Mapping[str, Any]
 """``event`` says which; the rest are its figures.
 
 ``run-started``, ``stage-cached``, ``stage-started`` (units, made), ``unit-done``,
-``unit-failed`` (error, trace), ``progress`` (done, total, note; not logged), ``stage-done``
-(report), ``stage-failed``, ``stage-skipped``, ``run-ended``.
+``unit-failed`` (error, trace), ``finish-started``, ``progress`` (done, total, note; not
+logged), ``stage-done`` (report), ``stage-failed``, ``stage-skipped``, ``run-ended``.
 """
 
 
+@runtime_checkable
 class Listener(Protocol):
     """Whoever wants to know, e.g. the screen."""
 

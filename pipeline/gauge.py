@@ -26,6 +26,7 @@ class Gauge:
     before: int
     clock: Callable[[], float] = time.monotonic
     note: str = ""
+    finishing: bool = False
     _done: int = 0
     _part: tuple[float, float] = (0.0, 1.0)
     _first_part: float | None = None
@@ -40,6 +41,8 @@ class Gauge:
         if event["event"] in ("unit-done", "unit-failed"):
             self._done += 1
             self._part, self.note = (0.0, 1.0), ""
+        elif event["event"] == "finish-started":
+            self.finishing, self._part, self.note = True, (0.0, 1.0), ""
         elif event["event"] == "progress" and event["total"]:
             self._part = (float(event["done"]), float(event["total"]))
             self.note = str(event["note"])
@@ -48,12 +51,14 @@ class Gauge:
 
     @property
     def in_steps(self) -> bool:
-        """Whether the stage is told in the steps of its only unit, or of its finish."""
+        """Whether the stage is told in the steps of its only unit."""
         return self.units - self.before <= 1 and self._first_part is not None
 
     @property
     def done(self) -> float:
         """Units, or steps, that are done."""
+        if self.finishing:
+            return self.total
         if self.in_steps:
             return self._part[0]
         return self.before + self._done + self._fraction
@@ -86,11 +91,17 @@ class Gauge:
 
     def words(self) -> str:
         """Say it in one line: ``12 of 27 units, 0.8/s, 0:19 left, note``."""
+        if self.finishing:
+            return ", ".join([f"gathering {self._fraction:.0%}", *self._notes])
         what = "steps" if self.in_steps else "units"
         parts = [f"{self.done:.4g} of {self.total:g} {what}"]
         if self.per_s is not None and self.left_s is not None:
             parts += [_rate(self.per_s), f"{clock_time(self.left_s)} left"]
-        return ", ".join([*parts, *([self.note] if self.note else [])])
+        return ", ".join([*parts, *self._notes])
+
+    @property
+    def _notes(self) -> list[str]:
+        return [self.note] if self.note else []
 
 
 def _rate(per_s: float) -> str:

@@ -7,6 +7,9 @@ import yaml
 
 from infgen.config import ConfigError
 
+MAPPING = yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG
+SEQUENCE = yaml.resolver.BaseResolver.DEFAULT_SEQUENCE_TAG
+
 
 class Lined(dict[str, Any]):
     """A mapping as YAML gave it.
@@ -45,9 +48,9 @@ def load(path: Path) -> Lined:
 
 
 def _plain(node: yaml.Node, file: str) -> Any:
-    if isinstance(node, yaml.MappingNode):
+    if isinstance(node, yaml.MappingNode) and node.tag == MAPPING:
         return _mapping(node, file)
-    if isinstance(node, yaml.SequenceNode):
+    if isinstance(node, yaml.SequenceNode) and node.tag == SEQUENCE:
         return [_plain(part, file) for part in node.value]
     try:
         return yaml.constructor.SafeConstructor().construct_object(node)

@@ -47,7 +47,7 @@ class Run:
 
 def split_report(report: Report) -> tuple[Report, Report]:
     """Split a report into what is the same each time, and what is not (below ``run``)."""
-    same = {name: value for name, value in report.items() if name != "run"}
+    same = {name: value for name, value in sorted(report.items()) if name != "run"}
     return same, dict(report.get("run", {}))
 
 

@@ -145,8 +145,7 @@ def _settle(
     sources: tuple[Source, ...],
     before: Mapping[str, Planned],
 ) -> Planned:
-    stage = load_stage(entry.module)
-    _agree(stage, entry)
+    stage = _load(entry)
     sections = {
         section: _build(kind, chosen.values.get(section, {}))
         for section, kind in stage.settings.items()
@@ -167,7 +166,15 @@ def _settle(
     return Planned(stage, entry.module, only, values, inputs, read, key)
 
 
-def _agree(stage: Stage, entry: StageEntry) -> None:
+def _load(entry: StageEntry) -> Stage:
+    try:
+        stage = load_stage(entry.module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{entry.module}.".startswith(f"{error.name}."):
+            raise
+        raise PlanError(f"{entry.where}: there is no module {entry.module}") from error
+    except AttributeError as error:
+        raise PlanError(f"{entry.where}: {entry.module} ends in no STAGE") from error
     if stage.name != entry.name:
         raise PlanError(f"{entry.where}: {entry.module} holds stage {stage.name!r}")
     if set(stage.settings) != set(entry.params):
@@ -175,6 +182,7 @@ def _agree(stage: Stage, entry: StageEntry) -> None:
             f"{entry.where}: {entry.name} lists params {sorted(entry.params)}, but its "
             f"code reads {sorted(stage.settings)}"
         )
+    return stage
 
 
 def _build(kind: Any, values: Mapping[str, Value]) -> Any:

@@ -118,7 +118,7 @@ def _player(weights: Path, settings: RolloutSettings) -> "tuple[Player, str]":
 
     from infgen.model.steps import Stepper  # noqa: PLC0415
     from infgen.rollout.simulate import Player  # noqa: PLC0415
-    from pipeline.train import load_network, weights_fingerprint  # noqa: PLC0415
+    from pipeline.weights import load_network, read_about  # noqa: PLC0415
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = load_network(weights).to(device).eval()
@@ -130,7 +130,7 @@ def _player(weights: Path, settings: RolloutSettings) -> "tuple[Player, str]":
         settings=settings,
         device=device,
     )
-    return player, weights_fingerprint(weights)
+    return player, str(read_about(weights)["weights"])
 
 
 def _starts(

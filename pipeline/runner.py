@@ -274,6 +274,7 @@ class _Making:
     ) -> tuple[Report, dict[str, str]]:
         """Gather the units into the stage's folder; a failure becomes an error line."""
         begun = time.monotonic()
+        self.events.emit("finish-started", stage=self.name)
         try:
             return self._gather(inputs, tasks), {}
         except Exception as error:  # Recorded as a failed unit would be; others go on.
@@ -305,7 +306,7 @@ class _Making:
         return same
 
     def _progress(self) -> Progress:
-        def tell(done: float, total: float, note: str = "") -> None:
+        def tell(done: float | int, total: float | int, note: str = "") -> None:
             self.events.emit("progress", stage=self.name, done=done, total=total, note=note)
             stopping.check()
 

@@ -76,7 +76,7 @@ class Screen:
         kind = event["event"]
         if kind == "stage-started":
             self._start(event)
-        elif kind in ("unit-done", "unit-failed", "progress") and self._gauge is not None:
+        elif kind in _STEPS and self._gauge is not None:
             self._gauge.take(event)
             self._go_on(event)
         if kind in _LINES:
@@ -108,6 +108,7 @@ class Screen:
             self._console.print(line, markup=False, highlight=False)
 
 
+_STEPS = ("unit-done", "unit-failed", "finish-started", "progress")
 _LINES = {
     "stage-cached": "{stage}: cached ({units} units)",
     "stage-started": "{stage}: {units} units, {made} of them made before",

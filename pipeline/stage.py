@@ -11,7 +11,7 @@ what the reports of its inputs say.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 Report = dict[str, Any]
 """Few, JSON-able figures of one unit or of a whole stage, the same each time it is made.
@@ -65,6 +65,7 @@ class Done:
     report: Report
 
 
+@runtime_checkable
 class Inputs(Protocol):
     """What a stage may ask of the stages before it."""
 
@@ -89,6 +90,7 @@ class Inputs(Protocol):
         """
 
 
+@runtime_checkable
 class Progress(Protocol):
     """Where long work inside one unit or ``finish`` says how far it is."""
 

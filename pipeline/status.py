@@ -79,7 +79,7 @@ def _standing(
         about = holder(root.lock(name))
         state = "running"
         reasons = [f"process {about.get('pid')} on {about.get('host')}"]
-    if done and total is not None:
+    if done and not other_code:
         reasons = [*reasons, f"{done} of {total} units made"]
     return Standing(name, state, "; ".join(reasons), planned.key, total, done)
 

@@ -18,6 +18,7 @@ from infgen.tokens.figures import Figures, count, describe, no_figures
 from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
 from infgen.tokens.tracks import TokensError
+from pipeline.folders import write_json
 from pipeline.splits import split_of
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
@@ -98,8 +99,6 @@ def finish(
     progress: Progress,
 ) -> Report:
     """Join the units' tables, and write what the tokens add up to, split by split."""
-    from pipeline.store import write_json  # noqa: PLC0415
-
     target.mkdir(parents=True, exist_ok=True)
     paths = [done.path for done in units]
     for name, columns in (("index", _INDEX), ("refused", _REFUSED)):
@@ -157,8 +156,6 @@ class _Shard:
 
     def close(self) -> None:
         """Write what is left, the tables and the figures."""
-        from pipeline.store import write_json  # noqa: PLC0415
-
         self._flush()
         _table(self._index, _INDEX).write_parquet(self._target / "index.parquet")
         _table(self._refused, _REFUSED).write_parquet(self._target / "refused.parquet")

@@ -58,6 +58,8 @@ def work(
     unit: Unit, target: Path, settings: Mapping[str, Any], progress: Progress
 ) -> Report:
     """Train, or go on training, and write the averaged weights."""
+    import torch  # noqa: PLC0415
+
     from pipeline.checkpoint import drop_checkpoints  # noqa: PLC0415
     from pipeline.loader import TokenScenes  # noqa: PLC0415
     from pipeline.training import Course, begin, final_state, train  # noqa: PLC0415
@@ -83,7 +85,10 @@ def work(
         "parameters": sum(p.numel() for p in training.network.parameters()),
         "weights": weights,
         "validation": found,
-        "run": {"seconds": round(time.monotonic() - begun, 1)},
+        "run": {
+            "seconds": round(time.monotonic() - begun, 1),
+            "threads": torch.get_num_threads(),
+        },
     }
 
 

@@ -5,46 +5,76 @@ chosen by hashes of what they are, so neither workers nor the order of files mat
 """
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from infgen.config import VocabSettings
+from infgen.config import TokenSettings, VocabSettings
+from infgen.scene import Scene
+from infgen.tokens.clusters import cluster_moves, cluster_roads
 from infgen.tokens.codebook import MotionCodebook, RoadCodebook
+from infgen.tokens.coverage import describe_moves, describe_roads, match_paths
+from infgen.tokens.curves import NO_CURVES, Curves, sample_curves, scene_curves
+from infgen.tokens.limits import limits_of
+from infgen.tokens.sample_keys import name_key
+from infgen.tokens.segments import (
+    NO_SEGMENTS,
+    Segments,
+    sample_segments,
+    scene_segments,
+)
+from infgen.tokens.tracks import Paths, TokensError, read_paths
+from infgen.views.codebooks import codebook_page
+from pipeline.ingest import read_scenes
 from pipeline.plan import PlanError
 from pipeline.splits import in_split, split_of
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
 if TYPE_CHECKING:
-    from infgen.scene import Scene
-    from infgen.tokens.tracks import Paths
+    from pipeline.columns import Unpacked
+
+T = TypeVar("T")
 
 MOTION_SCHEMA, ROADS_SCHEMA = "infgen.motion/1", "infgen.roads/1"
+SEGMENTS_SCHEMA, CURVES_SCHEMA = "infgen.segments/1", "infgen.curves/1"
+PATHS_SCHEMA = "infgen.paths/1"
 
 LEARN, HELD_OUT, BOTH = "learn", "held-out", "both"
 """Roles of a file: source of moves, measure of them, or (by scene) either."""
+_SIDES = (LEARN, HELD_OUT)
 HELD_OUT_EVERY = 8
 """Without a split to hold out, one scene in so many is."""
 
 SCENES_PER_UNIT = {LEARN: 8, HELD_OUT: 250}
-"""Scenes of a file whose tracks are matched when the codebook stands ..."""
+"""Scenes of a file whose tracks are matched once the codebooks stand ..."""
 SCENES_IN_ALL = {LEARN: 200, HELD_OUT: 1000}
 """... and of all files."""
 
 _MERGE_EVERY = 16
 
-T = TypeVar("T")
-
 
 @dataclass(frozen=True, slots=True)
 class KeyedPaths:
-    """The tracks of one scene, and its hash."""
+    """The tracks of one scene.
+
+    Attributes:
+        key: Hash of the scene's id.
+        paths: Its road users, ready for matching.
+    """
 
     key: int
-    paths: "Paths"
+    paths: Paths
+
+
+class _Gathered(NamedTuple):
+    """One side's samples of all files."""
+
+    segments: Segments
+    curves: Curves
+    paths: Sequence[Paths]
 
 
 def load_codebooks(folder: Path) -> tuple[MotionCodebook, RoadCodebook]:
@@ -53,12 +83,8 @@ def load_codebooks(folder: Path) -> tuple[MotionCodebook, RoadCodebook]:
     Raises:
         StoreError: if one is missing or damaged.
     """
-    from pipeline.store import read_records  # noqa: PLC0415
-
-    motion = read_records(
-        folder / "motion.zarr", MotionCodebook, MOTION_SCHEMA, mapped=False
-    )
-    roads = read_records(folder / "roads.zarr", RoadCodebook, ROADS_SCHEMA, mapped=False)
+    motion = _read(folder / "motion.zarr", MotionCodebook, MOTION_SCHEMA)
+    roads = _read(folder / "roads.zarr", RoadCodebook, ROADS_SCHEMA)
     return motion[0], roads[0]
 
 
@@ -104,21 +130,14 @@ def plan(inputs: Inputs, settings: VocabSettings) -> list[Unit]:
 
 def work(unit: Unit, target: Path, settings: VocabSettings, progress: Progress) -> Report:
     """Sample the moves, map pieces and tracks of one file."""
-    from infgen.tokens.sample_keys import name_key  # noqa: PLC0415
-    from pipeline.ingest import read_scenes  # noqa: PLC0415
-
     role = unit.task["role"]
-    samples = {LEARN: _Sample(LEARN, settings), HELD_OUT: _Sample(HELD_OUT, settings)}
+    samples = {side: _Sample(side, settings) for side in _SIDES}
     for scene in read_scenes(Path(unit.task["scenes"])):
-        held_out = name_key(scene.scenario_id) % HELD_OUT_EVERY == 0
-        side = role if role != BOTH else HELD_OUT if held_out else LEARN
-        samples[side].take(scene)
+        held_out = role == BOTH and name_key(scene.scenario_id) % HELD_OUT_EVERY == 0
+        samples[HELD_OUT if held_out or role == HELD_OUT else LEARN].take(scene)
     for sample in samples.values():
         sample.write(target)
-    return {
-        "role": role,
-        **{f"scenes_{side}": sample.scenes for side, sample in samples.items()},
-    }
+    return {"role": role, **{side: sample.scenes for side, sample in samples.items()}}
 
 
 def finish(
@@ -129,31 +148,172 @@ def finish(
     progress: Progress,
 ) -> Report:
     """Cluster all samples, and measure the codebooks on what was held out."""
-    from infgen.tokens.clusters import cluster_moves, cluster_roads  # noqa: PLC0415
-    from infgen.tokens.coverage import (  # noqa: PLC0415
-        describe_moves,
-        describe_roads,
-        match_paths,
-    )
-    from infgen.views.codebooks import codebook_page  # noqa: PLC0415
-    from pipeline.store import write_file, write_json, write_records  # noqa: PLC0415
-
-    progress(0, 4, "segments")
-    known, unknown = (_gather(units, side, settings) for side in (LEARN, HELD_OUT))
+    progress(0, 4, "samples")
+    learn, held_out = (_gather(units, side, settings) for side in _SIDES)
     progress(1, 4, "moves")
-    motion, motion_origin = cluster_moves(known.segments, settings)
+    motion, move_origin = cluster_moves(learn.segments, settings)
     progress(2, 4, "roads")
-    roads, roads_origin, tolerance_m = cluster_roads(known.curves.curve_m, settings)
-    write_records(
-        target / "motion.zarr", [motion], MotionCodebook, MOTION_SCHEMA, compress=False
-    )
-    write_records(
-        target / "roads.zarr", [roads], RoadCodebook, ROADS_SCHEMA, compress=False
-    )
+    roads, road_origin, tolerance_m = cluster_roads(learn.curves.curve_m, settings)
+    _write(target / "motion.zarr", [motion], MotionCodebook, MOTION_SCHEMA)
+    _write(target / "roads.zarr", [roads], RoadCodebook, ROADS_SCHEMA)
+
     progress(3, 4, "coverage")
+    matches, familiar = (match_paths(side.paths, motion) for side in (held_out, learn))
     report = {
+        "scenes": {side: sum(done.report[side] for done in units) for side in _SIDES},
         "held_out": _held_out_words(units, settings),
-        "scenes": sum(done.report[f"scenes_{LEARN}"] for done in units),
-        "scenes_held_out": sum(done.report[f"scenes_{HELD_OUT}"] for done in units),
+        "tolerance_m": settings.tolerance_m,
+        "road_tolerance_m": round(tolerance_m, 5),
+        "motion": describe_moves(motion, move_origin, matches, familiar, settings),
+        "roads": describe_roads(
+            roads, road_origin, held_out.curves.curve_m, learn.curves.curve_m
+        ),
     }
-    return report
+    from pipeline.store import write_file, write_json  # noqa: PLC0415
+
+    write_json(target / "report.json", report)
+    page = codebook_page(report, motion, move_origin, roads, road_origin)
+    write_file(target / "report.html", page.encode())
+    return _headline(report)
+
+
+class _Sample:
+    """One side's sample of one file, while it is read."""
+
+    def __init__(self, side: str, settings: VocabSettings) -> None:
+        self.scenes = 0
+        self._side, self._settings = side, settings
+        self._limits = limits_of(settings)
+        self._segments: list[Segments] = []
+        self._curves: list[Curves] = []
+        self._paths: dict[int, Paths] = {}
+
+    def take(self, scene: Scene) -> None:
+        """Add one scene."""
+        self.scenes += 1
+        if self._side == LEARN:
+            still_m = self._settings.tolerance_m
+            self._segments.append(scene_segments(scene, self._limits, still_m))
+        self._curves.append(scene_curves(scene))
+        self._take_paths(scene)
+        if len(self._curves) == _MERGE_EVERY:
+            self._merge()
+
+    def write(self, target: Path) -> None:
+        """Write the sample, if there is any, below the unit's folder."""
+        if self.scenes == 0:
+            return
+        self._merge()
+        folder = target / self._side
+        folder.mkdir(parents=True)
+        paths = [KeyedPaths(key, self._paths[key]) for key in sorted(self._paths)]
+        _write(folder / "segments.zarr", self._segments, Segments, SEGMENTS_SCHEMA)
+        _write(folder / "curves.zarr", self._curves, Curves, CURVES_SCHEMA)
+        _write(folder / "paths.zarr", paths, KeyedPaths, PATHS_SCHEMA)
+
+    def _take_paths(self, scene: Scene) -> None:
+        # A key that fits the signed integers of the store.
+        key, most = name_key(scene.scenario_id) >> 1, SCENES_PER_UNIT[self._side]
+        if len(self._paths) == most and key > max(self._paths):
+            return
+        try:
+            self._paths[key] = read_paths(scene, TokenSettings())
+        except TokensError:
+            return  # ``tokenize`` names the scenes that cannot be written as tokens.
+        if len(self._paths) > most:
+            del self._paths[max(self._paths)]
+
+    def _merge(self) -> None:
+        most = self._settings.segments_per_shard
+        if self._segments:
+            self._segments = [sample_segments(self._segments, most)]
+        self._curves = [sample_curves(self._curves, most)]
+
+
+def _gather(units: Sequence[Done], side: str, settings: VocabSettings) -> _Gathered:
+    """Merge one side's samples of all files, one file in memory at a time."""
+    segments, curves, paths = NO_SEGMENTS, NO_CURVES, dict[int, Paths]()
+    most = settings.segments_per_kind
+    for done in units:
+        folder = done.path / side
+        if not folder.is_dir():
+            continue
+        parts = _read(folder / "segments.zarr", Segments, SEGMENTS_SCHEMA)
+        segments = sample_segments([segments, *parts], most)
+        pieces = _read(folder / "curves.zarr", Curves, CURVES_SCHEMA)
+        curves = sample_curves([curves, *pieces], most)
+        scenes = _read(folder / "paths.zarr", KeyedPaths, PATHS_SCHEMA)
+        paths |= {scene.key: scene.paths for scene in scenes}
+        paths = {key: paths[key] for key in sorted(paths)[: SCENES_IN_ALL[side]]}
+    return _Gathered(segments, curves, list(paths.values()))
+
+
+def _held_out_words(units: Sequence[Done], settings: VocabSettings) -> str:
+    """Say in words what the coverage is measured on."""
+    scenes = sum(done.report[HELD_OUT] for done in units)
+    if any(done.report["role"] == HELD_OUT for done in units):
+        return f"{scenes} scenes of split {settings.held_out}"
+    return (
+        f"{scenes} scenes of split {settings.split}, held out by the hash of their id: "
+        f"there is no split {settings.held_out}"
+    )
+
+
+def _headline(report: dict[str, Any]) -> Report:
+    """Pick the few figures that the run's log shows."""
+    kinds = report["motion"].items()
+    return {
+        "scenes": report["scenes"][LEARN],
+        "held_out": report["held_out"],
+        "real": {kind: figures["real"] for kind, figures in kinds},
+        "error_m": {
+            kind: (figures["held_out_error_m"] or {}).get("mean") for kind, figures in kinds
+        },
+        "roads_real": report["roads"]["real"],
+    }
+
+
+def _write(path: Path, records: Sequence[Any], kind: type, schema: str) -> None:
+    from pipeline.store import write_records  # noqa: PLC0415
+
+    write_records(path, records, kind, schema, compress=False)
+
+
+def _read(path: Path, kind: type[T], schema: str) -> "Unpacked[T]":
+    from pipeline.store import read_records  # noqa: PLC0415
+
+    return read_records(path, kind, schema, mapped=False)
+
+
+STAGE = Stage(
+    name="build-vocab",
+    version=1,
+    settings={"build-vocab": VocabSettings},
+    plan=plan,
+    work=work,
+    finish=finish,
+    modules=(
+        "infgen.clock",
+        "infgen.geometry",
+        "infgen.scene",
+        "infgen.tokens.agents",
+        "infgen.tokens.arcs",
+        "infgen.tokens.clusters",
+        "infgen.tokens.codebook",
+        "infgen.tokens.coverage",
+        "infgen.tokens.curves",
+        "infgen.tokens.entries",
+        "infgen.tokens.fan",
+        "infgen.tokens.grid",
+        "infgen.tokens.kdisks",
+        "infgen.tokens.limits",
+        "infgen.tokens.moves",
+        "infgen.tokens.presence",
+        "infgen.tokens.roads",
+        "infgen.tokens.sample_keys",
+        "infgen.tokens.segments",
+        "infgen.tokens.tracks",
+        "infgen.views.codebooks",
+        "pipeline.vocabulary",
+    ),
+)

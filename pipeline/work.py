@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from pipeline import stopping
 from pipeline.folders import publish
@@ -55,6 +55,7 @@ class Outcome:
     trace: str = ""
 
 
+@runtime_checkable
 class Executor(Protocol):
     """Does tasks, and yields what became of each as it is known."""
 

@@ -59,7 +59,7 @@ class Binned:
 def edges_of(scene: Scene) -> RoadEdges | None:
     """Road edges of a scene, in its own frame; None if it has none."""
     rows = scene.road_map.rows(FeatureKind.ROAD_EDGE)
-    lines_m = [scene.road_map.points(row) for row in rows]
+    lines_m = [scene.road_map.points(row) for row in rows.tolist()]
     return build_edges(lines_m) if any(len(line) >= 2 for line in lines_m) else None
 
 

@@ -31,7 +31,7 @@ class Histogram:
     pool_objects: bool = False
 
     @property
-    def edges(self) -> Float32[np.ndarray, " bins+1"]:
+    def edges(self) -> Float32[np.ndarray, " edge"]:
         """Edges of the bins, exactly as the official metric has them.
 
         Multiples of a float32 width from ``low``, and ``high`` itself; numpy's and torch's

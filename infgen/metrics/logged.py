@@ -63,7 +63,7 @@ class LoggedScene:
     valid: Bool[np.ndarray, "agent 91"]
     ego: int
     predict_row: Int32[np.ndarray, " predict"]
-    edge_offsets: Int64[np.ndarray, " edge+1"]
+    edge_offsets: Int64[np.ndarray, " edge_offset"]
     edge_m: Float32[np.ndarray, "edge_point 3"]
     lane_id: Int64[np.ndarray, " lane"]
     lane_offsets: Int64[np.ndarray, " lane+1"]
@@ -162,9 +162,9 @@ def from_scene(scene: Scene) -> LoggedScene:
 
 def _features(
     scene: Scene, rows: np.ndarray
-) -> tuple[Float32[np.ndarray, "point 3"], Int64[np.ndarray, " feature+1"]]:
+) -> tuple[Float32[np.ndarray, "point 3"], Int64[np.ndarray, " offset"]]:
     """World points of some map features, end to end, and where each starts."""
-    points = [scene.road_map.points(row) for row in rows]
+    points = [scene.road_map.points(row) for row in rows.tolist()]
     offsets = np.cumsum([0, *map(len, points)]).astype(np.int64)
     return _to_world(
         np.concatenate([np.zeros((0, 3), np.float32), *points]), scene

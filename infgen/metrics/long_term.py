@@ -86,23 +86,28 @@ def score_binned(
 
 
 def bucket_scores(
-    features: Float64[np.ndarray, "*rows feature"],
-) -> Float64[np.ndarray, "*rows bucket"]:
-    """Weighted mean of each bucket's features; those without a value are left out."""
+    features: Float64[np.ndarray, "row feature"],
+) -> Float64[np.ndarray, "row bucket"]:
+    """Weighted mean of each bucket's features.
+
+    A feature without a value is left out, but where nobody enters or leaves, the distance
+    at which they do scores 0: otherwise doing nothing would be the best placement.
+    """
     buckets = []
     for bucket in BUCKETS:
         rows = [row for row, feature in enumerate(FEATURES) if feature.bucket == bucket]
         weights = np.array([FEATURES[row].weight for row in rows])
         values = features[..., rows]
+        zero = np.array([FEATURES[row].scoring is Scoring.DISTANCE for row in rows])
         known = ~np.isnan(values)
         total = (np.where(known, values, 0) * weights).sum(axis=-1)
-        buckets.append(_ratio(total, (known * weights).sum(axis=-1)))
+        buckets.append(_ratio(total, ((known | zero) * weights).sum(axis=-1)))
     return np.stack(buckets, axis=-1)
 
 
 def composite(
-    buckets: Float64[np.ndarray, "*rows bucket"], *, placement: bool
-) -> Float64[np.ndarray, "*rows"]:
+    buckets: Float64[np.ndarray, "row bucket"], *, placement: bool
+) -> Float64[np.ndarray, " row"]:
     """Weigh the buckets to one number, with or without placement."""
     used = [b for b in BUCKETS if placement or b != PLACEMENT]
     weights = np.array([COMPOSITE_WEIGHTS[bucket] for bucket in used])

@@ -60,8 +60,10 @@ class Feature:
 _EVENT = Histogram(-0.5, 1.5, 2)
 
 FEATURES = (
-    Feature("linear_speed", KINEMATIC, 0.05, Histogram(0, 25, 10), Scoring.STEPS),
-    Feature("linear_acceleration", KINEMATIC, 0.05, Histogram(-12, 12, 11), Scoring.STEPS),
+    Feature("linear_speed", KINEMATIC, 0.05, Histogram(0.0, 25.0, 10), Scoring.STEPS),
+    Feature(
+        "linear_acceleration", KINEMATIC, 0.05, Histogram(-12.0, 12.0, 11), Scoring.STEPS
+    ),
     Feature("angular_speed", KINEMATIC, 0.05, Histogram(-0.628, 0.628, 11), Scoring.STEPS),
     Feature(
         "angular_acceleration", KINEMATIC, 0.05, Histogram(-3.14, 3.14, 11), Scoring.STEPS
@@ -70,28 +72,28 @@ FEATURES = (
         "distance_to_nearest_object",
         INTERACTIVE,
         0.1,
-        Histogram(-5, 40, 10),
+        Histogram(-5.0, 40.0, 10),
         Scoring.STEPS,
         is_distance=True,
     ),
     Feature("collision_indication", INTERACTIVE, 0.25, _EVENT, Scoring.EVENT),
-    Feature("time_to_collision", INTERACTIVE, 0.1, Histogram(0, 5, 10), Scoring.STEPS),
+    Feature("time_to_collision", INTERACTIVE, 0.1, Histogram(0.0, 5.0, 10), Scoring.STEPS),
     Feature(
         "distance_to_road_edge",
         MAP,
         0.1,
-        Histogram(-20, 40, 10),
+        Histogram(-20.0, 40.0, 10),
         Scoring.STEPS,
         is_distance=True,
     ),
     Feature("offroad_indication", MAP, 0.25, _EVENT, Scoring.EVENT),
-    Feature("num_entries", PLACEMENT, 0.1, Histogram(0, 10, 5), Scoring.COUNT),
-    Feature("num_exits", PLACEMENT, 0.1, Histogram(0, 10, 5), Scoring.COUNT),
+    Feature("num_entries", PLACEMENT, 0.1, Histogram(0.0, 10.0, 5), Scoring.COUNT),
+    Feature("num_exits", PLACEMENT, 0.1, Histogram(0.0, 10.0, 5), Scoring.COUNT),
     Feature(
         "entry_distance",
         PLACEMENT,
         0.1,
-        Histogram(0, 75, 10),
+        Histogram(0.0, 75.0, 10),
         Scoring.DISTANCE,
         is_distance=True,
     ),
@@ -99,7 +101,7 @@ FEATURES = (
         "exit_distance",
         PLACEMENT,
         0.1,
-        Histogram(0, 75, 10),
+        Histogram(0.0, 75.0, 10),
         Scoring.DISTANCE,
         is_distance=True,
     ),

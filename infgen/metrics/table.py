@@ -83,8 +83,8 @@ def make_row(binned: Binned, against: Against) -> Row:
     curves: dict[str, np.ndarray] = {}
     scores = score_binned(binned, against.log_p, windows)
     for at, protocol in enumerate(PROTOCOLS):
-        for name, value in named(scores.overall[at]):
-            numbers[f"{protocol.name}/{name}"] = float(value)
+        for name, value in named(scores.overall[at][None]):
+            numbers[f"{protocol.name}/{name}"] = float(value[0])
         for name, value in named(scores.windows[at].T):
             curves[f"{protocol.name}/{name}"] = value
         for name, feature in (
@@ -101,8 +101,8 @@ def make_row(binned: Binned, against: Against) -> Row:
 
 
 def named(
-    features: Float64[np.ndarray, "*rows feature"],
-) -> Iterator[tuple[str, Float64[np.ndarray, "*rows"]]]:
+    features: Float64[np.ndarray, "row feature"],
+) -> Iterator[tuple[str, Float64[np.ndarray, " row"]]]:
     """Name feature scores, and the buckets and composites that follow from them."""
     buckets = bucket_scores(features)
     yield COMPOSITE, composite(buckets, placement=True)
@@ -125,7 +125,7 @@ def _add_counts(
         ("all", binned.num_all, against.split_all),
     ):
         counts = mean_counts(number, windows)
-        numbers[f"agents/{who}"] = float(counts.mean())
+        numbers[f"agents/{who}"] = float(counts.mean()) if windows.count else float("nan")
         curves[f"agents/{who}"] = counts
         own, true = _log_reference(log, who, windows, against)
         for name, reference in (("own", own), ("split", split), ("truth", true)):

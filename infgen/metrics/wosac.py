@@ -120,7 +120,7 @@ def score_versions(
     """
     tables = [_version(name) for name in versions]
     measured = {
-        whole: _measure_both(log, rollouts, whole_log=whole)
+        whole: measure_both(log, rollouts, whole_log=whole)
         for whole in sorted({table.whole_log for table in tables})
     }
     return [combine(log.scenario_id, *measured[t.whole_log], t) for t in tables]
@@ -232,7 +232,7 @@ def _version(name: str) -> Version:
     return VERSIONS[name]
 
 
-def _measure_both(
+def measure_both(
     log: LoggedScene, rollouts: Rollouts, *, whole_log: bool
 ) -> tuple[Features, Features]:
     """Features of the log and of the rollouts, over what a version scores."""

@@ -84,6 +84,24 @@ class FourierEmbedding(nn.Module):
         return embedded
 
 
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Range of a scalar that a table covers; values beyond are taken as its ends.
+
+    Attributes:
+        first: Where the first node is.
+        last: Where the last node is.
+        nodes: Number of nodes, evenly spaced.
+        closed: Whether the two ends mean the same, as for angles of -pi and pi: rounding
+            must not tell them apart.
+    """
+
+    first: float
+    last: float
+    nodes: int
+    closed: bool = False
+
+
 class RelationEmbedding(FourierEmbedding):
     """A Fourier embedding of relations, read from tables instead of computed per pair.
 
@@ -92,33 +110,33 @@ class RelationEmbedding(FourierEmbedding):
     simulation use the same tables, so there is no difference between the two.
     """
 
-    def __init__(
-        self, ranges: Sequence[tuple[float, float, int]], bands: int, width: int
-    ) -> None:
-        """Make tables of (first node, last node, number of nodes) per scalar."""
-        super().__init__(len(ranges), bands, width)
-        self.ranges = tuple(ranges)
+    def __init__(self, spans: Sequence[Span], bands: int, width: int) -> None:
+        super().__init__(len(spans), bands, width)
+        self.spans = tuple(spans)
 
     def table(self) -> Tensor:
         """Evaluate all scalars at their nodes: [P, D], one scalar after the other."""
+        return torch.cat([self._nodes(i, span) for i, span in enumerate(self.spans)])
+
+    def _nodes(self, number: int, span: Span) -> Tensor:
         device = self.frequency.weight.device
-        return torch.cat(
-            [
-                self.scalar(i, torch.linspace(first, last, nodes, device=device))
-                for i, (first, last, nodes) in enumerate(self.ranges)
-            ]
-        )
+        at = torch.linspace(span.first, span.last, span.nodes, device=device)
+        values = self.scalar(number, at)
+        if not span.closed:
+            return values
+        middle = (values[:1] + values[-1:]) / 2
+        return torch.cat([middle, values[1:-1], middle])
 
     def look_up(self, values: Tensor, table_PD: Tensor) -> Tensor:
         """Embed relations [N, K, F] by a table: normed features [N, K, D]."""
-        first = values.new_tensor([low for low, _, _ in self.ranges])
-        gaps = values.new_tensor([nodes - 1 for _, _, nodes in self.ranges])
-        span = values.new_tensor([high - low for low, high, _ in self.ranges])
-        position = ((values - first) * (gaps / span)).clamp(min=0).minimum(gaps)
+        first = values.new_tensor([span.first for span in self.spans])
+        gaps = values.new_tensor([span.nodes - 1 for span in self.spans])
+        length = values.new_tensor([span.last - span.first for span in self.spans])
+        position = ((values - first) * (gaps / length)).clamp(min=0).minimum(gaps)
         lower = position.floor().minimum(gaps - 1)
         share = position - lower
 
-        starts = torch.tensor([0, *(nodes for _, _, nodes in self.ranges[:-1])])
+        starts = torch.tensor([0, *(span.nodes for span in self.spans[:-1])])
         node = lower.long() + starts.cumsum(0).to(values.device)
         bags = torch.cat([node, node + 1], dim=-1).flatten(0, -2)  # [pair, 2 F]
         shares = torch.cat([1 - share, share], dim=-1).flatten(0, -2)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from infgen.model.layers import RelationEmbedding
+from infgen.model.layers import RelationEmbedding, Span
 
 BLOCK_PAIRS = 1 << 22
 """Distances held at once while neighbours are searched."""
@@ -20,6 +20,8 @@ SQUARE_PER_M2 = 1024
 INDEX_BITS = 20
 NO_DIRECTION_M = 0.01
 """Nearer points have no direction: rounding would decide it."""
+
+_NOBODY = 1 << 62
 
 ANGLE_NODES = 1025
 DISTANCE_STEP_M = 0.05
@@ -106,9 +108,6 @@ def nearest(
     return Neighbours(index, present)
 
 
-_NOBODY = 1 << 62
-
-
 def within_radius(
     pose: Float32[Tensor, "*pair 3"], other: Float32[Tensor, "*pair 3"], radius_m: float
 ) -> Bool[Tensor, "*pair"]:
@@ -118,7 +117,13 @@ def within_radius(
 
 def _square(away_m: Tensor) -> Tensor:
     """Squared distances in whole units."""
-    return (away_m.square().sum(dim=-1) * SQUARE_PER_M2).round().long()
+    return _whole_units(away_m[..., 0], away_m[..., 1])
+
+
+def _whole_units(x_m: Tensor, y_m: Tensor) -> Tensor:
+    """Squared lengths in whole units: a new tensor, made with few passes over memory."""
+    square = (x_m * x_m).addcmul_(y_m, y_m)
+    return square.mul_(SQUARE_PER_M2).round_().long()
 
 
 def _square_limit(radius_m: float) -> int:
@@ -129,11 +134,14 @@ def _nearest_keys(
     target_xy_m: Tensor, source_xy_m: Tensor, allowed: Tensor, radius_m: float, count: int
 ) -> Tensor:
     """Smallest keys [group, target, count]: squared distance, then position."""
-    square = _square(target_xy_m[:, :, None] - source_xy_m[:, None])
+    x_m, y_m = (
+        target_xy_m[:, :, None, axis] - source_xy_m[:, None, :, axis] for axis in (0, 1)
+    )
+    square = _whole_units(x_m, y_m)  # [group, target, source]; changed in place below
+    hidden = (square > _square_limit(radius_m)) | ~allowed
     position = torch.arange(source_xy_m.shape[1], device=square.device)
-    key = (square << INDEX_BITS) | position
-    seen = allowed & (square <= _square_limit(radius_m))
-    return key.masked_fill(~seen, _NOBODY).topk(count, dim=-1, largest=False).values
+    key = square.mul_(1 << INDEX_BITS).add_(position).masked_fill_(hidden, _NOBODY)
+    return key.topk(count, dim=-1, largest=False).values
 
 
 def wrap_angle(angle_rad: Tensor) -> Tensor:
@@ -172,10 +180,10 @@ def relation_embedding(
         width: Of the features.
         past_tokens: If not 0, relations end in a time difference of -1 to so many tokens.
     """
-    turn = (-math.pi, math.pi, ANGLE_NODES)
+    turn = Span(-math.pi, math.pi, ANGLE_NODES, closed=True)
     nodes = math.ceil(radius_m / DISTANCE_STEP_M) + 1
-    ranges = [(0.0, radius_m, nodes), turn, turn]
+    spans = [Span(0.0, radius_m, nodes), turn, turn]
     if past_tokens:
         # One node more than there are tokens, so that a window of one is a range too.
-        ranges.append((-float(past_tokens), 0.0, past_tokens + 1))
-    return RelationEmbedding(ranges, bands, width)
+        spans.append(Span(-float(past_tokens), 0.0, past_tokens + 1))
+    return RelationEmbedding(spans, bands, width)

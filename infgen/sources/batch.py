@@ -93,7 +93,7 @@ def decode(
         while len(left) and layouts < _MAX_LAYOUTS:
             layouts += 1
             left = _decode_alike(data, buffer, rows.start, left, size, columns, out)
-        for row in left:
+        for row in left.tolist():
             _decode_one(data, int(rows.start[row]), size, row, columns, out)
     return out
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Protocol, runtime_checkable
 
 import google_crc32c
 
@@ -71,13 +71,16 @@ class RecordError(ValueError):
     """A record that is no usable scene; the message is the reason."""
 
 
+@runtime_checkable
+class ByteSource(Protocol):
+    """An open file, local or remote."""
+
+    def read(self, size: int, /) -> bytes:
+        """Return up to so many bytes; none at the end."""
+
+
 class _StreamError(ValueError):
     """The compressed stream below the records is damaged."""
-
-
-class _Blocks(Protocol):
-    def some(self) -> bytes:
-        """Return the next bytes; none at the end."""
 
 
 def masked_crc(data: bytes) -> int:
@@ -93,13 +96,13 @@ def frame(data: bytes) -> bytes:
     return length + ends[0] + data + ends[1]
 
 
-def open_bytes(url: str | Path) -> AbstractContextManager[BinaryIO]:
+def open_bytes(url: str | Path) -> AbstractContextManager[ByteSource]:
     """Open a local path or any fsspec URL for reading."""
     if "://" not in str(url):
         return Path(url).open("rb")
     import fsspec  # noqa: PLC0415
 
-    opened: AbstractContextManager[BinaryIO] = fsspec.open(str(url), "rb")
+    opened: AbstractContextManager[ByteSource] = fsspec.open(str(url), "rb")
     return opened
 
 
@@ -186,7 +189,7 @@ def _is_header(head: bytes) -> bool:
     return bool(_HEADER.unpack(head)[1] == masked_crc(head[:8]))
 
 
-def _unpacked(file: BinaryIO) -> _Blocks:
+def _unpacked(file: ByteSource) -> "_Plain | _Gunzip":
     """Look at the first bytes and gunzip if need be.
 
     A plain file may start like a GZIP one: its first record need only be 559,903 bytes
@@ -201,7 +204,7 @@ def _unpacked(file: BinaryIO) -> _Blocks:
 class _Plain:
     """The bytes of a file as they are."""
 
-    def __init__(self, file: BinaryIO, head: bytes) -> None:
+    def __init__(self, file: ByteSource, head: bytes) -> None:
         self._file, self._head = file, head
 
     def some(self) -> bytes:
@@ -213,7 +216,7 @@ class _Plain:
 class _Gunzip:
     """The bytes of a GZIP file of one or more members, unpacked in bounded blocks."""
 
-    def __init__(self, file: BinaryIO, head: bytes) -> None:
+    def __init__(self, file: ByteSource, head: bytes) -> None:
         self._file, self._packed, self._fault = file, head, ""
         self._member = zlib.decompressobj(wbits=31)
 
@@ -270,7 +273,7 @@ def _salvage(member: "zlib._Decompress", packed: bytes) -> bytes:
 class _Reader:
     """Exact numbers of bytes out of blocks of any size, never more than asked in memory."""
 
-    def __init__(self, blocks: _Blocks) -> None:
+    def __init__(self, blocks: _Plain | _Gunzip) -> None:
         self._blocks, self._block, self._at = blocks, b"", 0
 
     def take(self, size: int) -> bytes:

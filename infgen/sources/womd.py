@@ -161,7 +161,8 @@ def _predictions(
 
 def _not_a_scenario(data: bytes, fields: Mapping[int, list[Field]]) -> str:
     """Say what a record without tracks is."""
-    if set(fields) == {1} and all(_is_features(data, field) for field in fields[1]):
+    numbers = {number for number, found in fields.items() if found}
+    if numbers == {1} and all(_is_features(data, field) for field in fields[1]):
         return "record holds a tf.Example, not a Scenario: use WOMD's scenario files"
     if fields[_LIDAR] or fields[_CAMERA]:
         return "record holds only lidar or camera data, no tracks"

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64
 
 from infgen.scene import (
     FeatureKind,
@@ -238,7 +238,7 @@ def _check(road_map: RoadMap) -> None:
         raise RecordError(f"polyline {ids[np.argmax(flat)]} has zero length")
 
 
-def _moves(road_map: RoadMap) -> Int64[np.ndarray, " feature"]:
+def _moves(road_map: RoadMap) -> Bool[np.ndarray, " feature"]:
     """Tell which features have two successive points in different places."""
     steps = (np.diff(road_map.xyz_m, axis=0) != 0).any(axis=1)
     moved = np.concatenate([[0], np.cumsum(steps)])

@@ -8,6 +8,7 @@ structured array, tags included.
 import gzip
 import struct
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -134,11 +135,12 @@ def _points(number: int, xyz_m: Float64[np.ndarray, "point 3"]) -> bytes:
 
 def _dynamic_states(signals: Signals, origin_xyz_m: np.ndarray, num_steps: int) -> bytes:
     """Write one message per step, also of steps without signals."""
-    stops_m = signals.stop_xyz_m.astype(np.float64) + origin_xyz_m
-    lanes, states = signals.lane_id.tolist(), signals.state.tolist()
+    stops = _points(3, signals.stop_xyz_m.astype(np.float64) + origin_xyz_m)
+    size = len(stops) // max(1, len(signals.step))
+    lights = zip(signals.lane_id.tolist(), signals.state.tolist(), strict=True)
     rows = [
-        _message(1, _int(1, lanes[row]) + _int(2, states[row]) + _points(3, stops_m[[row]]))
-        for row in range(len(lanes))
+        _message(1, _int(1, lane) + _int(2, state) + stops[row * size : (row + 1) * size])
+        for row, (lane, state) in enumerate(lights)
     ]
     ends = np.searchsorted(signals.step, np.arange(num_steps + 1))
     return b"".join(
@@ -241,6 +243,7 @@ def _boundary(road_map: RoadMap, at: int) -> bytes:
     return _int(1, first) + _int(2, last) + _int(3, feature) + _int(4, kind)
 
 
+@cache
 def _key(number: int, wire: int) -> bytes:
     return _varint(number << 3 | wire)
 

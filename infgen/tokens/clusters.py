@@ -24,11 +24,15 @@ ANCHOR_M = 0.5
 """Where logs show no move within this distance of a possible one, one is made."""
 ANCHOR_SHARE = 1 / 8
 """Of a codebook, at most, goes to such moves before logged ones have had their turn."""
+RARE_SHARE = 1 / 4
+"""Of a codebook is kept for what common moves or shapes leave uncovered ..."""
+RARE_MOVES, RARE_ROADS = 2.0, 3.0
+"""... by disks so many times the tolerance. Better cover all roughly than most finely."""
 COARSEST = 8
 """Made shapes are laid coarsely first (so many tolerances apart), then ever finer."""
 
 LEAST_ROAD_TOLERANCE_M, MOST_ROAD_TOLERANCE_M = 0.01, 0.64
-_BISECTIONS = 10
+_BISECTIONS = 8
 
 
 class Origin(IntEnum):
@@ -115,6 +119,19 @@ class _Shelf:
         self.rows = np.concatenate([self.rows, laid])
         self.origin += [origin] * len(laid)
 
+    def cover(
+        self,
+        logged: Items,
+        order: np.ndarray,
+        tolerance_m: float,
+        rare: float,
+        spare: int = 0,
+    ) -> None:
+        """Cover logged items: the common finely, the rare at ``rare`` times as roughly."""
+        kept = spare + int((self.room - spare) * RARE_SHARE)
+        for radius_m, left in ((tolerance_m, kept), (tolerance_m * rare, spare)):
+            self.lay(logged, order, radius_m, origin=Origin.LOGGED, spare=left)
+
     def fill(
         self,
         logged: Items,
@@ -123,7 +140,11 @@ class _Shelf:
         mirrored: Items,
         made: Callable[[float], Items],
     ) -> None:
-        """Fill all rows: mirror images, made shapes, then all at ever less tolerance."""
+        """Fill all rows: what logs still give, mirror images, shapes made by rule.
+
+        If all that is not enough, then the same again at ever less tolerance.
+        """
+        self.lay(logged, order, tolerance_m, origin=Origin.LOGGED)
         self.lay(mirrored, order[: len(mirrored)], tolerance_m, origin=Origin.MIRRORED)
         apart_m = tolerance_m * COARSEST
         while self.room:
@@ -164,7 +185,7 @@ def cluster_roads(
     if tolerance_m == 0:
         tolerance_m = _road_tolerance(space, logged, order, settings.num_roads)
     shelf = _Shelf(space, settings.num_roads, logged[:0])
-    shelf.lay(logged, order, tolerance_m, origin=Origin.LOGGED)
+    shelf.cover(logged, order, tolerance_m, RARE_ROADS)
     mirrored = logged * np.array([1, -1], np.float32) if settings.mirror else logged[:0]
     shelf.fill(logged, order, tolerance_m, mirrored, line_arcs)
     origin = np.array(shelf.origin, dtype=np.int8)
@@ -185,7 +206,7 @@ def _cluster_kind(
     shelf = _Shelf(space, settings.num_moves, still, [Origin.MADE])
     anchors = _anchors(space, logged, int(settings.num_moves * ANCHOR_SHARE))
     tolerance_m = settings.tolerance_m
-    shelf.lay(logged, order, tolerance_m, origin=Origin.LOGGED, spare=len(anchors))
+    shelf.cover(logged, order, tolerance_m, RARE_MOVES, spare=len(anchors))
     shelf.lay(anchors, None, tolerance_m, origin=Origin.MADE)
     shelf.fill(
         logged, order, tolerance_m, mirrored, lambda apart_m: fan(kind, limits, apart_m)
@@ -214,8 +235,9 @@ def _road_tolerance(
     low_m, high_m = LEAST_ROAD_TOLERANCE_M, MOST_ROAD_TOLERANCE_M
 
     def suffices(tolerance_m: float) -> bool:
-        laid = lay_disks(space, logged, order, tolerance_m, count + 1, logged[:0])
-        return len(laid) <= count
+        shelf = _Shelf(space, count + 1, logged[:0])
+        shelf.cover(logged, order, tolerance_m, RARE_ROADS)
+        return shelf.room > 0
 
     if suffices(low_m):
         return low_m
@@ -227,5 +249,7 @@ def _road_tolerance(
 
 def _distinct(items: Items) -> Items:
     """Drop items that equal an earlier one to the millimetre."""
+    if len(items) == 0:
+        return items
     flat = np.round(items.reshape(len(items), -1) * 1000).astype(np.int32)
     return items[np.sort(np.unique(flat, axis=0, return_index=True)[1])]

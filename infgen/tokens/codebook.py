@@ -25,7 +25,7 @@ ROAD_SAMPLES = (0, 5, 10)
 """Points of a piece that pieces are compared by: first, middle, last."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False, slots=True)
 class MotionCodebook:
     """The moves that agents choose from, ``num_moves`` for each of three kinds.
 

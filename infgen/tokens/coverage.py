@@ -94,8 +94,8 @@ def describe_moves(
 def describe_roads(
     codebook: RoadCodebook,
     origin: Int8[np.ndarray, " road"],
-    held_out_m: Float32[np.ndarray, "piece 11 2"],
-    familiar_m: Float32[np.ndarray, "piece 11 2"],
+    held_out_m: Float32[np.ndarray, "unknown 11 2"],
+    familiar_m: Float32[np.ndarray, "known 11 2"],
 ) -> dict[str, Any]:
     """Say what the shapes of map pieces are and how well they fit held-out ones."""
     space = RoadSpace()

@@ -23,6 +23,9 @@ class Curves:
     curve_m: Float32[np.ndarray, "curve 11 2"]
 
 
+NO_CURVES = Curves(np.empty(0, np.uint64), np.empty((0, 11, 2), np.float32))
+
+
 def scene_curves(scene: Scene) -> Curves:
     """Cut all pieces out of a scene's map."""
     curve_m = road_pieces(scene.road_map).curve_m

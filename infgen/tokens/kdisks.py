@@ -3,12 +3,11 @@
 An item stands for a few points (the corners of a box where a move ends; the points of a
 line). Two items are as far apart as their points are on average. A disk is all free items
 within the tolerance of a seed. Its mean becomes a centre, unless it stands within the
-tolerance of an earlier one, or is no allowed item; then the member nearest to the mean,
-then the seed itself, stands for the disk. Items within the tolerance of a centre are free
-no longer, so a seed is always far enough from every centre.
+tolerance of an earlier one or is no allowed item; then the member nearest to the mean does.
+Items within the tolerance of a centre are free no longer, so members are far enough.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -17,6 +16,7 @@ Items = np.ndarray
 """Items [item, ...] of one space, float32."""
 
 
+@runtime_checkable
 class Space(Protocol):
     """What k-disks must know of its items."""
 
@@ -66,9 +66,10 @@ def lay_disks(
             continue
         disk = pool.near(pool.points_m[seed], tolerance_m)
         members = items[disk[free[disk]]]
-        choices = _choices(space, members, items[seed]) if average else items[seed, None]
         used = len(taken) + len(centres)
-        centre = _first_apart(space, choices, laid_m[:used], tolerance_m)
+        centre = items[seed]
+        if average:
+            centre = _stand_in(space, members, laid_m[:used], tolerance_m)
         laid_m[used] = space.points_m(centre[None])[0]
         free[disk] = False
         free[pool.near(laid_m[used], tolerance_m)] = False
@@ -81,7 +82,7 @@ def gap_m(
 ) -> Float64[np.ndarray, "*rows"]:
     """Return how far items are from one: the mean distance of their points."""
     away_m = points_m - point_m
-    return np.hypot(away_m[..., 0], away_m[..., 1]).mean(axis=-1)
+    return np.sqrt(away_m[..., 0] ** 2 + away_m[..., 1] ** 2).mean(axis=-1)
 
 
 class _Pool:
@@ -109,21 +110,13 @@ class _Pool:
         return self.row[strip][gap_m(self._sorted_m[strip], point_m) <= within_m]
 
 
-def _choices(space: Space, members: Items, seed: Items) -> Items:
-    """Return what may stand for a disk, best first: mean, medoid, seed."""
-    mean = space.mean(members)
-    gaps = gap_m(space.points_m(members), space.points_m(mean[None])[0])
-    return np.stack([mean, members[gaps.argmin()], seed])
-
-
-def _first_apart(
-    space: Space, choices: Items, laid_m: np.ndarray, tolerance_m: float
+def _stand_in(
+    space: Space, members: Items, laid_m: np.ndarray, tolerance_m: float
 ) -> Items:
-    """Return the first allowed choice beyond the tolerance of all centres; or the last."""
-    allowed = space.allowed(choices)
-    for choice, point_m, may in zip(
-        choices[:-1], space.points_m(choices), allowed, strict=False
-    ):
-        if may and (gap_m(laid_m, point_m) > tolerance_m).all():
-            return choice
-    return choices[-1]
+    """Return the mean of a disk if it may be a centre, else the member nearest to it."""
+    mean = space.mean(members)
+    mean_m = space.points_m(mean[None])[0]
+    if space.allowed(mean[None])[0] and (gap_m(laid_m, mean_m) > tolerance_m).all():
+        return mean
+    nearest = gap_m(space.points_m(members), mean_m).argmin()
+    return members[nearest]

@@ -18,16 +18,17 @@ from infgen.scene import AgentKind
 PEDESTRIAN_MAX_YAW_RATE_RAD_S = 2 * np.pi
 """A pedestrian turns round on the spot within one move; others obey the setting."""
 
-MAX_REVERSE_MPS = (6.0, np.inf, 3.0)
-"""Vehicles and cyclists that go backwards faster are logged with a wrong heading."""
+MAX_REVERSE_MPS = (6.0, 2.0, 1.5)
+"""Who goes backwards faster is logged with a wrong heading (row: ``AgentKind``)."""
 
 JUMP = 4.0
 """A step that changes velocity by so many times the limit is a jump of the log, not noise
 that may be smoothed."""
 
-SLIP_M, LONGEST_PIVOT_M = 0.3, 3.0
-"""A vehicle turns about its rear axle, at most ``LONGEST_PIVOT_M`` behind its centre, which
-swings out; beyond that its centre goes sideways by no more than ``SLIP_M``."""
+SLIP_M, LONGEST_PIVOT_M = 0.3, (3.0, 0.0, 1.0)
+"""Wheels turn a body about the rear axle, at most ``LONGEST_PIVOT_M`` behind its centre,
+which swings out; beyond that the centre goes sideways by no more than ``SLIP_M``. A
+pedestrian may step aside."""
 
 _INSIDE, _EASED = 1 - 1e-3, 1 - 2e-3
 """Moves keep this far inside the limits, so that no rounding brings them outside."""
@@ -137,8 +138,8 @@ def _goes_straight(path: np.ndarray, kind: int) -> np.ndarray:
     end_m = rotate(path[:, -1, :2], -turn_rad / 2)  # seen along the mean heading
     forward_m, left_m = end_m[:, 0], end_m[:, 1]
     straight = forward_m >= -MAX_REVERSE_MPS[kind] * CLOCK.token_s
-    if kind == AgentKind.VEHICLE:
-        swing_m = 2 * LONGEST_PIVOT_M * np.sin(turn_rad / 2)
-        straight &= left_m <= np.maximum(swing_m, 0) + SLIP_M
-        straight &= left_m >= np.minimum(swing_m, 0) - SLIP_M
-    return straight
+    if kind == AgentKind.PEDESTRIAN:
+        return straight
+    swing_m = 2 * LONGEST_PIVOT_M[kind] * np.sin(turn_rad / 2)
+    straight &= left_m <= np.maximum(swing_m, 0) + SLIP_M
+    return straight & (left_m >= np.minimum(swing_m, 0) - SLIP_M)

@@ -4,6 +4,7 @@ Two moves are as far apart as the corners of a box at their ends are on average 
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int16
@@ -28,27 +29,28 @@ class MoveTable:
     Attributes:
         codebook: The moves.
         reach_m: Half the diagonal of each kind's box.
-        spread: Spread of each move's end, kind by kind: one column per move.
-        square: Its squared length.
+        weights: One column per move and kind: the spread of its end times -2, then its
+            squared length. The product with a spread and a one is the squared distance of
+            the two less the square of the one.
         corners_m: Corners of each kind's box at each move's end: x of the four, then y.
     """
 
     codebook: MotionCodebook
     reach_m: Float32[np.ndarray, " 3"]
-    spread: Float32[np.ndarray, "3 4 move"]
-    square: Float32[np.ndarray, "3 move"]
+    weights: Float32[np.ndarray, "3 5 move"]
     corners_m: Float64[np.ndarray, "3 move 8"]
 
 
+@lru_cache(maxsize=4)
 def make_move_table(codebook: MotionCodebook) -> MoveTable:
-    """Lay a codebook out for matching."""
+    """Lay a codebook out for matching; of the last few codebooks only once."""
     reach_m = np.linalg.norm(codebook.size_lw_m, axis=1) / np.float32(2)
-    spread = _spread(codebook.end_pose, reach_m[:, None])
+    spread = _spread(codebook.end_pose, reach_m[:, None]).swapaxes(1, 2)
+    square = (spread**2).sum(axis=1, keepdims=True)
     return MoveTable(
         codebook=codebook,
         reach_m=reach_m,
-        spread=np.ascontiguousarray(spread.swapaxes(1, 2)),
-        square=(spread**2).sum(axis=-1),
+        weights=np.concatenate([-2 * spread, square], axis=1),
         corners_m=_corners(codebook.end_pose, codebook.size_lw_m[:, None]),
     )
 
@@ -70,9 +72,10 @@ def nearest_moves(
         kind: ``AgentKind`` of each agent.
         table: The moves to choose from.
     """
-    move = np.empty(len(target), dtype=np.int16)
-    for start in range(0, len(target), _ROWS_AT_ONCE):
-        rows = slice(start, start + _ROWS_AT_ONCE)
+    order = np.argsort(kind, kind="stable")
+    move = np.empty(len(order), dtype=np.int16)
+    for start in range(0, len(order), _ROWS_AT_ONCE):
+        rows = order[start : start + _ROWS_AT_ONCE]
         move[rows] = _nearest(to_local(target[rows], pose[rows]), kind[rows], table)
     return move
 
@@ -107,7 +110,7 @@ def follow(
 
 
 def _nearest(wanted: np.ndarray, kind: np.ndarray, table: MoveTable) -> np.ndarray:
-    """Return the nearest move of each pose wanted in the frame of the one before."""
+    """Return the nearest move of each pose wanted; ``kind`` ascends."""
     corners_m = _corners(wanted, table.codebook.size_lw_m[kind])  # [row, 8]
     row, move = _candidates(wanted, corners_m, kind, table)
     gap_m = _mean_gap(table.corners_m[kind[row], move], corners_m[row])
@@ -123,19 +126,22 @@ def _candidates(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return rows and moves, ascending, among which each row's nearest move surely is."""
     spread = _spread(wanted, table.reach_m[kind])
-    gap = np.empty((len(wanted), table.codebook.num_moves), np.float32)  # less square
-    for number in np.unique(kind):
-        rows = np.flatnonzero(kind == number)
-        gap[rows] = table.square[number] - 2 * spread[rows] @ table.spread[number]
-    guess_m = _mean_gap(table.corners_m[kind, gap.argmin(axis=1)], corners_m)
-
-    # The nearest move is at most as far as the guess, and its spread 1.42 times as far.
     square = (spread**2).sum(axis=-1)
-    twice = (2 * guess_m**2).astype(np.float32)
-    # Sixty roundings of a float32, relative to moves about as long as the one wanted.
-    slack = np.float32(5e-6) * (square + twice)
-    flat = np.flatnonzero(gap <= (twice - square + slack)[:, None])
-    return np.divmod(flat, gap.shape[1])
+    spread = np.column_stack([spread, np.ones_like(square)])
+    ends = np.searchsorted(kind, np.arange(4))
+    found = []
+    for number in np.flatnonzero(np.diff(ends)):
+        rows = slice(ends[number], ends[number + 1])
+        gap = spread[rows] @ table.weights[number]  # [row, move], less square
+        guess_m = _mean_gap(table.corners_m[number, gap.argmin(axis=1)], corners_m[rows])
+
+        # The nearest move is no farther than the guess, its spread at most 1.42 times.
+        twice = (2 * guess_m**2).astype(np.float32)
+        # Sixty roundings of a float32, relative to moves about as long as the one wanted.
+        slack = np.float32(5e-6) * (square[rows] + twice)
+        flat = np.flatnonzero(gap <= (twice - square[rows] + slack)[:, None])
+        found.append(flat + ends[number] * gap.shape[1])
+    return np.divmod(np.concatenate(found), table.codebook.num_moves)
 
 
 def _mean_gap(one_m: np.ndarray, other_m: np.ndarray) -> np.ndarray:

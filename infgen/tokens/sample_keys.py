@@ -7,7 +7,7 @@ with the smallest keys, so samples of samples are samples of the whole.
 import hashlib
 
 import numpy as np
-from jaxtyping import Int64, UInt64
+from jaxtyping import Int, Int64, UInt64
 
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 
@@ -17,9 +17,7 @@ def name_key(name: str) -> int:
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little")
 
 
-def item_keys(
-    name: str, *numbers: Int64[np.ndarray, " item"]
-) -> UInt64[np.ndarray, " item"]:
+def item_keys(name: str, *numbers: Int[np.ndarray, " item"]) -> UInt64[np.ndarray, " item"]:
     """Hash items that are told apart by a name and whole numbers."""
     keys = np.full(len(numbers[0]), name_key(name), dtype=np.uint64)
     for number in numbers:

@@ -43,6 +43,11 @@ class Segments:
         return self.path[self.kind == kind]
 
 
+NO_SEGMENTS = Segments(
+    np.empty(0, np.uint64), np.empty(0, np.int8), np.empty((0, 6, 3), np.float32)
+)
+
+
 def scene_segments(
     scene: Scene, limits: MotionLimits, still_m: float, clock: Clock = CLOCK
 ) -> Segments:

@@ -218,4 +218,7 @@ def grid_settings():
 
 @pytest.fixture(scope="session")
 def codebooks():
-    return make_motion_codebook(), make_road_codebook()
+    def make(num_moves=NUM_MOVES, num_roads=NUM_ROADS):
+        return make_motion_codebook(num_moves), make_road_codebook(num_roads)
+
+    return make

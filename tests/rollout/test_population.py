@@ -74,7 +74,7 @@ def test_whoever_leaves_is_there_once_more_and_then_gone_for_good(
     parked, start, metre_moves, nobody
 ):
     population = settle([start(parked(1))], min_rows=2)[-1]
-    move, stay = nobody(1, 2)
+    move, _ = nobody(1, 2)
     leave = np.array([[False, True]])
 
     leaving, path = move_on(population, move, leave, metre_moves)

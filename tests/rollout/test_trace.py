@@ -96,7 +96,7 @@ def test_boxes_stand_on_the_road(parked, start, metre_moves, grid):
     frames = list(play(begin, metre_moves, grid, 2.0, add_at=3))
     (rollout,) = collect([begin], frames, "weights")
 
-    # The road is flat at height 0: logged cars keep their 0.8 m, the new one gets half 1.5 m.
+    # The road is flat at height 0: logged cars keep 0.8 m, the new one gets half of 1.5 m.
     np.testing.assert_allclose(rollout.xyz_m[:2, :, 2], 0.8, atol=1e-5)
     np.testing.assert_allclose(rollout.xyz_m[2, 21:, 2], 0.75, atol=1e-5)
 

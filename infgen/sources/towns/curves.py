@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float64
 
-Points = Float64[np.ndarray, "point 2"]
+Points = Float64[np.ndarray, "_ 2"]
 
 
 def arc_lengths(xy_m: Points) -> Float64[np.ndarray, " point"]:

@@ -65,7 +65,7 @@ def draw_users(
     pace_mps = {AgentKind.VEHICLE: 10.0, AgentKind.CYCLIST: 4.5, AgentKind.PEDESTRIAN: 1.3}
     per_hour = {
         AgentKind.VEHICLE: rng.uniform(180.0, 780.0),
-        AgentKind.CYCLIST: rng.uniform(30.0, 150.0),
+        AgentKind.CYCLIST: rng.uniform(60.0, 240.0),
         AgentKind.PEDESTRIAN: rng.uniform(5.0, 70.0),
     }
     trips: list[_Trip] = []

@@ -24,6 +24,7 @@ CLAIM_MPS2 = 2.0
 """A claim is made while one could still brake this gently instead."""
 STOPPING_MPS2 = 3.0
 """A light that warns is heeded by those who need not brake harder."""
+OVERSHOOT_M = 1.0
 NO_CLAIM = -1
 
 
@@ -95,7 +96,8 @@ class Gates:
 
     def _next(self, here: Positions) -> tuple[np.ndarray, np.ndarray]:
         """Next gated strip of each user (-1: none) and the way to it."""
-        row = self.routes.row(here.route, here.front_m)
+        # Who stops a little past the line has not passed it.
+        row = self.routes.row(here.route, here.front_m - OVERSHOOT_M)
         return self.routes.gate[row], self.routes.gate_m[row] - here.front_m
 
     def _claim_m(self, here: Positions) -> Float64[np.ndarray, " here"]:
@@ -151,7 +153,8 @@ class Gates:
         gate_m: Float64[np.ndarray, " here"],
     ) -> Bool[np.ndarray, " here"]:
         """Whether nobody without a claim is ahead on the strip. Walkers stand abreast."""
-        strip = self.routes.strip[self.routes.row(here.route, here.front_m)]
+        row = self.routes.row(here.route, here.front_m - OVERSHOOT_M)
+        strip = self.routes.strip[row]
         order = np.lexsort((here.user, gate_m, strip, ~wanting))
         first = np.ones(len(order), bool)
         first[1:] = strip[order][1:] != strip[order][:-1]

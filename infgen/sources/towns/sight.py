@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from infgen.geometry import to_local
+from infgen.geometry import rotate
 
 TALL_M = 2.2
 """Vehicles at least so high hide what is behind them."""
@@ -53,7 +53,7 @@ def seen(
         walls: Boxes that hide: [x, y, heading, length, width].
         rng: Of the sensor's range and flicker.
     """
-    reach_m = rng.uniform(72.0, 98.0) * np.array([1.0, 0.75, 0.85])[actors.kind]
+    reach_m = rng.uniform(60.0, 95.0) * np.array([1.0, 0.75, 0.85])[actors.kind]
     reach_m = reach_m + rng.normal(0.0, 4.0, len(actors.kind))
     eye_m = actors.pose[ego, :, :2]
     apart_m = np.linalg.norm(actors.pose[..., :2] - eye_m, axis=-1)  # [actor, step]
@@ -91,8 +91,8 @@ def _behind(
 ) -> Bool[np.ndarray, "actor step"]:
     hidden = np.zeros(target_m.shape[:2], bool)
     for wall in walls:
-        pose = np.broadcast_to(wall[:3], (*target_m.shape[:2], 3))
-        hidden |= _crosses(np.broadcast_to(eye_m, target_m.shape), target_m, pose, wall[3:])
+        pose = np.broadcast_to(wall[:3], (len(eye_m), 3))
+        hidden |= _crosses(eye_m, target_m, pose, wall[3:])
     return hidden
 
 
@@ -106,34 +106,27 @@ def _behind_tall(
     for tall in np.flatnonzero(actors.size_lwh_m[:, 2] >= TALL_M):
         if tall == ego:
             continue
-        pose = np.broadcast_to(actors.pose[tall], (*target_m.shape[:2], 3))
         size_m = actors.size_lwh_m[tall, :2]
-        behind = _crosses(np.broadcast_to(eye_m, target_m.shape), target_m, pose, size_m)
+        behind = _crosses(eye_m, target_m, actors.pose[tall], size_m)
         behind[tall] = False
         hidden |= behind & actors.present[tall]
     return hidden
 
 
 def _crosses(
-    eye_m: Float64[np.ndarray, "actor step 2"],
+    eye_m: Float64[np.ndarray, "step 2"],
     target_m: Float64[np.ndarray, "actor step 2"],
-    pose: Float64[np.ndarray, "actor step 3"],
+    pose: Float64[np.ndarray, "step 3"],
     size_lw_m: Float64[np.ndarray, "2"],
 ) -> Bool[np.ndarray, "actor step"]:
     """Whether the line of sight meets a box (clipping it by the box's two slabs)."""
-    start_m, end_m = (
-        to_local(np.concatenate([xy_m, pose[..., 2:]], axis=-1), pose)[..., :2]
-        for xy_m in (eye_m, target_m)
-    )
-    way_m = end_m - start_m
+    start_m = rotate(eye_m - pose[:, :2], -pose[:, 2])
+    way_m = rotate(target_m - eye_m, np.broadcast_to(-pose[:, 2], target_m.shape[:2]))
     way_m = np.where(np.abs(way_m) < 1e-9, 1e-9, way_m)
-    sides = np.stack(
-        [(-size_lw_m / 2 - start_m) / way_m, (size_lw_m / 2 - start_m) / way_m]
-    )
-    enters = sides.min(axis=0).max(axis=-1).clip(0.0)
-    leaves = sides.max(axis=0).min(axis=-1).clip(None, 1.0)
-    met: Bool[np.ndarray, "actor step"] = np.less(enters, leaves)
-    return met
+    one, other = (-size_lw_m / 2 - start_m) / way_m, (size_lw_m / 2 - start_m) / way_m
+    enters = np.minimum(one, other).max(axis=-1).clip(0.0)
+    leaves = np.maximum(one, other).min(axis=-1).clip(None, 1.0)
+    return np.less(enters, leaves)
 
 
 def _flicker(
@@ -163,4 +156,5 @@ def _closed(
     wide = np.hstack([np.zeros(shape, bool), shown, np.zeros(shape, bool)])
     windows = np.lib.stride_tricks.sliding_window_view(wide, gap, axis=1)
     grown = windows.any(axis=-1)
-    return np.lib.stride_tricks.sliding_window_view(grown, gap, axis=1).all(axis=-1)
+    both = np.lib.stride_tricks.sliding_window_view(grown, gap, axis=1)
+    return np.asarray(both.all(axis=-1))

@@ -108,7 +108,7 @@ class SignalPlan:
 
     def walk(self, group: int, time_s: float) -> bool:
         """Say whether walkers along the traffic of a group may set out."""
-        return self._since_green(group, time_s) < self.walk_s
+        return bool(self._since_green(group, time_s) < self.walk_s)
 
     def _since_green(self, group: int, time_s: float) -> float:
         turn_s = [green_s + self.caution_s + self.clear_s for green_s in self.green_s]

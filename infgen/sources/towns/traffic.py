@@ -21,6 +21,8 @@ HARDEST_MPS2 = 6.5
 JERK_MPS3 = (6.0, 14.0)
 """How fast the acceleration may rise and fall."""
 STANDING_GAP_M = {AgentKind.VEHICLE: 1.8, AgentKind.PEDESTRIAN: 0.4, AgentKind.CYCLIST: 1.0}
+SHORT_OF_LINE_M = 0.6
+"""Where one stands before a closed gate."""
 TAIL_M = 7.0
 """Someone who turns off still blocks those who go on until so far behind is clear."""
 CHANGE_S = 4.0
@@ -36,6 +38,7 @@ class Traffic:
         route: Route of each user at each step.
         along_m: Position of the middle of the user on it.
         aside_m: How far left of the route a change of lane has still left them.
+        aside_mps: How fast that changes.
         speed_mps: Speed along it.
         present: Whether the user was under way.
     """
@@ -43,6 +46,7 @@ class Traffic:
     route: Int64[np.ndarray, "user step"]
     along_m: Float64[np.ndarray, "user step"]
     aside_m: Float64[np.ndarray, "user step"]
+    aside_mps: Float64[np.ndarray, "user step"]
     speed_mps: Float64[np.ndarray, "user step"]
     present: Bool[np.ndarray, "user step"]
 
@@ -85,7 +89,8 @@ class _Crowd:
         """Return the columns of ``Traffic`` at this moment."""
         part = np.clip(self.since_shift_s / CHANGE_S, 0.0, 1.0)
         aside_m = self.shift_m * (1 - part**3 * (10 - 15 * part + 6 * part**2))
-        state = (self.route, self.along_m, aside_m, self.speed_mps, self.present)
+        aside_mps = -self.shift_m * 30 * part**2 * (1 - part) ** 2 / CHANGE_S
+        state = (self.route, self.along_m, aside_m, aside_mps, self.speed_mps, self.present)
         return tuple(column.copy() for column in state)
 
     def advance(self, time_s: float) -> None:
@@ -180,7 +185,8 @@ class _Crowd:
         free = most * (1 - (speed_mps / wished_mps) ** 4)
         free = np.where(speed_mps > wished_mps, 1.5 * (wished_mps - speed_mps), free)
         behind = free.clip(-BRAKING_MPS2) - self._push(here, ahead_m, speed_mps - ahead_mps)
-        at_gate = free.clip(-BRAKING_MPS2) - self._push(here, gate_m + 1.0, speed_mps)
+        line_m = gate_m + self.standing_m[here] - SHORT_OF_LINE_M
+        at_gate = free.clip(-BRAKING_MPS2) - self._push(here, line_m, speed_mps)
         wanted = np.minimum(behind, at_gate).clip(-HARDEST_MPS2, most)
         rise, fall = JERK_MPS3[0] * CLOCK.step_s, JERK_MPS3[1] * CLOCK.step_s
         before = self.accel_mps2[here]
@@ -220,7 +226,7 @@ class _Crowd:
         held_up = (ahead_m < 25.0) & (ahead_mps < 0.85 * self.wished_mps(here))
         eager = self.rng.random(len(here)) < np.where(held_up, 0.35, _RARE)
         ready = (self.speed_mps[here] > 5.0) & (self.since_shift_s[here] > 2 * CHANGE_S)
-        for user in here[eager & ready & self.present[here]]:
+        for user in here[eager & ready & self.present[here]].tolist():
             strip = self.routes.strips[self.route[user]][-1]
             on_strip_m = self.along_m[user] - self.routes.start_m[self.route[user], strip]
             last_m = self.routes.length_m[self.route[user]] - self.along_m[user]

@@ -1,0 +1,250 @@
+"""From tokenized scenes to padded tensors: what is taken, in which order, and when."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from infgen.model.batch import NOBODY, OUTSIDE, collate, collate_roads, to_device
+from infgen.model.window import cut_window
+from infgen.tokens.grid import decode_cell, from_grid, make_grid
+from infgen.tokens.scene_tokens import FIRST_MOVE, NO_MOVE, Presence
+
+
+def tensors(batch):
+    for part in (batch.agents, batch.roads, batch.entries, batch.details):
+        for field in fields(part):
+            yield field.name, getattr(part, field.name)
+
+
+def test_the_ego_is_first_and_the_others_come_from_near_to_far(record, limits):
+    scene = record(0, agents=9)
+
+    agents = collate([scene], limits, 0).agents
+
+    assert torch.equal(agents.pose[0, :, 0], torch.from_numpy(scene.pose[0]))
+    away_m = (agents.pose[0] - agents.pose[0, :, :1])[..., :2].norm(dim=-1)
+    nearest_m = away_m.masked_fill(~agents.visible[0], torch.inf).amin(dim=0)
+    assert (nearest_m.diff() >= 0).all()
+
+
+def test_an_ego_in_another_row_is_first_all_the_same(record, limits):
+    scene = record(0, agents=4, lives=[(0, 6)] * 3)
+
+    agents = collate([replace(scene, ego=2)], limits, 0).agents
+
+    assert torch.equal(agents.pose[0, :, 0], torch.from_numpy(scene.pose[2]))
+
+
+def test_only_the_nearest_agents_are_kept_the_ego_always(record, limits):
+    scene = record(0, agents=9)
+    whole = collate([scene], limits, 0).agents
+
+    few = collate([scene], replace(limits, agents=3), 0).agents
+
+    assert few.kind.shape == (1, 3)
+    assert torch.equal(few.pose, whole.pose[:, :, :3])
+
+
+def test_newcomers_that_are_not_kept_are_not_asked_for(record, limits):
+    scene = record(0, tokens=4, lives=[(0, 3), (2, 3)])
+
+    entries = collate([scene], replace(limits, agents=1), 0).entries
+
+    assert entries.count[0, 1:].sum() == 0
+
+
+def test_only_the_roads_nearest_to_the_egos_path_are_kept_in_order(record, limits):
+    scene = record(0, roads=60)
+
+    roads = collate([scene], replace(limits, roads=10), 0).roads
+
+    path = scene.pose[0, :, :2]
+    away_m = np.linalg.norm(scene.road_pose[:, None, :2] - path, axis=-1).min(axis=1)
+    kept = np.sort(np.argsort(away_m)[:10])
+    assert torch.equal(roads.pose[0], torch.from_numpy(scene.road_pose[kept]))
+
+
+def test_a_road_token_follows_the_one_before_it_on_the_same_line(record, limits):
+    scene = record(0, roads=8)
+    line = np.array([0, 0, 0, 1, 1, 2, 3, 3], dtype=np.int32)
+
+    roads = collate([replace(scene, road_line=line)], limits, 0).roads
+
+    assert roads.follows[0].tolist() == [False, True, True, False, True, False, False, True]
+
+
+def test_padding_is_absent_and_unreal(record, limits):
+    batch = collate(
+        [record(0, agents=3, tokens=4, roads=10), record(1, agents=6, tokens=7)], limits, 0
+    )
+
+    assert not batch.agents.visible[0, 4:].any()
+    assert not batch.agents.visible[0, :, 3:].any()
+    assert (batch.agents.move[0, 4:] == NO_MOVE).all()
+    assert batch.roads.real.sum(dim=1).tolist() == [10, 60]
+    assert not batch.entries.asked[0, 4:].any()
+
+
+def test_newcomers_take_turns_from_near_to_far(record, limits):
+    scene = record(8, tokens=5, lives=[(0, 4), (2, 4), (2, 4), (3, 4)], spread_m=20.0)
+
+    batch = collate([scene], limits, 0)
+
+    entries, agents = batch.entries, batch.agents
+    assert entries.asked[0].tolist() == [False, True, True, True, True]
+    assert entries.count[0, 1:].tolist() == [0, 2, 1, 0]
+    first, second = entries.agent[0, 2, :2].tolist()
+    away_m = (agents.pose[0, 2] - agents.pose[0, 2, 0])[:, :2].norm(dim=-1)
+    assert away_m[first] < away_m[second]
+    assert agents.turn[0, 2, [first, second]].tolist() == [0, 1]
+    assert entries.cell[0, 2, 0] == agents.cell[0, 2, first]
+    assert entries.agent[0, 1].tolist() == [NOBODY] * entries.agent.shape[2]
+
+
+def test_all_others_have_no_turn_and_those_outside_the_grid_an_endless_one(record, limits):
+    scene = record(8, tokens=4, lives=[(0, 3), (2, 3)], spread_m=20.0)
+    far = replace(
+        scene, entry_cell=np.where(scene.entry_agent == 2, -1, scene.entry_cell).astype("i2")
+    )
+
+    turn = collate([far], limits, 0).agents.turn[0]
+
+    assert turn[3].tolist() == [-1, -1, -1]
+    assert turn[2, 1:].sort().values.tolist() == [-1, OUTSIDE]
+    assert turn[:, 0].tolist() == [-1] * 4
+
+
+def test_details_decode_to_where_the_agent_is(record, limits, grid_settings):
+    batch = collate([record(3, agents=12, tokens=9)], limits, 0)
+    details, agents = batch.details, batch.agents
+    grid = make_grid(grid_settings)
+
+    for row in details.present[0].nonzero()[:, 0].tolist():
+        token, agent = int(details.token[0, row]), int(details.agent[0, row])
+        cell = np.int16(details.cell[0, row])
+        ego_pose = agents.pose[0, token, 0].numpy()
+        in_grid_m = decode_cell(np.asarray(cell), grid) + details.offset_m[0, row].numpy()
+        pose = agents.pose[0, token, agent].numpy()
+        np.testing.assert_allclose(from_grid(in_grid_m, ego_pose), pose[:2], atol=1e-3)
+        turned_rad = pose[2] - ego_pose[2] - grid.heading_centre_rad[details.heading[0, row]]
+        assert abs((turned_rad + np.pi) % (2 * np.pi) - np.pi) < np.radians(5.001)
+
+
+def test_those_who_play_newcomers_are_there_already_and_not_the_ego(record, limits):
+    batch = collate([record(3, agents=12, tokens=9)], limits, 0)
+    details, agents = batch.details, batch.agents
+    players = details.present & ~details.newcomer
+
+    assert players.sum() == 16  # Two per token.
+    scene, row = players.nonzero(as_tuple=True)
+    token, agent = details.token[scene, row], details.agent[scene, row]
+    assert (agents.presence[scene, token, agent] == Presence.PRESENT).all()
+    assert (agent > 0).all()
+    assert (token > 0).all()
+    assert (details.turn[scene, row] == 0).all()
+
+
+def test_equal_draws_make_equal_batches_and_others_others(record, limits):
+    scenes = [record(3, agents=12, tokens=9), record(4)]
+
+    same = zip(
+        tensors(collate(scenes, limits, 7)), tensors(collate(scenes, limits, 7)), strict=True
+    )
+    other = collate(scenes, limits, 8)
+
+    assert all(torch.equal(one, two) for (_, one), (_, two) in same)
+    assert not torch.equal(other.roads.picked, collate(scenes, limits, 7).roads.picked)
+
+
+def test_a_scenes_draw_does_not_depend_on_its_batch(record, limits):
+    scene, more = record(3, agents=12, tokens=9), record(4)
+
+    alone, together = collate([scene], limits, 7), collate([more, scene], limits, 7)
+
+    assert torch.equal(alone.roads.picked[0], together.roads.picked[1])
+
+
+def test_long_logs_give_a_part_that_depends_on_the_draw(record, limits):
+    scene = record(3, agents=5, tokens=39)
+
+    starts = set()
+    for draw in range(20):
+        pose = collate([scene], limits, draw).agents.pose[0, :, 0]
+        assert len(pose) == 18
+        gap_m = np.abs(scene.pose[0] - pose[0].numpy()).sum(axis=-1)
+        starts.add(int(gap_m.argmin()))
+    assert len(starts) > 8
+    assert min(starts) >= 0
+    assert max(starts) <= 21
+
+
+LIVES = [(0, 9), (3, 9), (0, 4), (0, 2), (5, 9), (0, 3)]
+
+
+@pytest.fixture
+def window(record):
+    scene = record(2, tokens=10, lives=LIVES)
+    return scene, cut_window(scene, 3, 18, 99, 99)
+
+
+def row_in(window, scene, row):
+    return int(np.flatnonzero(window.size_lwh_m[:, 0] == scene.size_lwh_m[row, 0])[0])
+
+
+def test_who_is_there_when_a_window_begins_enters_then(window):
+    scene, part = window
+    row = row_in(part, scene, 1)
+
+    assert part.presence[row, 0] == Presence.ENTERING
+    assert part.move[row, 0] == FIRST_MOVE
+    assert not part.observed[row, 0]
+    assert (part.presence[row, 1:] == Presence.PRESENT).all()
+    np.testing.assert_array_equal(part.pose[row], scene.pose[1, 3:])
+
+
+def test_who_leaves_as_a_window_begins_or_before_is_not_in_it(window):
+    scene, part = window
+    sizes = part.size_lwh_m[:, 0]
+
+    assert scene.size_lwh_m[4, 0] not in sizes  # Left before.
+    assert scene.size_lwh_m[6, 0] not in sizes  # Leaves at its first token.
+    assert scene.size_lwh_m[3, 0] in sizes  # Leaves one token later.
+    assert len(sizes) == 5
+
+
+def test_newcomers_of_a_window_keep_their_tokens_less_its_start(window):
+    scene, part = window
+    entered = dict(zip(part.entry_row.tolist(), part.entry_token.tolist(), strict=True))
+
+    assert entered == {row_in(part, scene, 2): 0, row_in(part, scene, 5): 2}
+
+
+def test_who_is_in_a_gap_when_a_window_begins_enters_after_it(record):
+    scene = record(2, tokens=10, lives=[(0, 9)])
+    observed = scene.observed.copy()
+    observed[1, 2:5] = False
+
+    part = cut_window(replace(scene, observed=observed), 3, 18, 99, 99)
+
+    wanted = [Presence.ABSENT] * 2 + [Presence.ENTERING] + [Presence.PRESENT] * 4
+    assert part.presence[1].tolist() == wanted
+
+
+def test_maps_alone_are_whole_and_hide_nothing(record):
+    scenes = [record(0, roads=7), record(1, roads=5)]
+
+    roads = collate_roads(scenes, 100)
+
+    assert roads.real.sum(dim=1).tolist() == [7, 5]
+    assert not roads.picked.any()
+
+
+def test_batches_move_whole(record, limits):
+    batch = collate([record(0)], limits, 0)
+
+    moved = to_device(batch, torch.device("meta"))
+
+    assert moved.scenario_ids == batch.scenario_ids
+    assert all(tensor.device.type == "meta" for _, tensor in tensors(moved))

@@ -1,0 +1,68 @@
+import pytest
+from rich.console import Console
+
+from pipeline.screen import Screen, gibibytes, show_table
+
+STARTED = {"event": "stage-started", "stage": "count", "key": "k", "units": 3, "made": 1}
+DONE = {"event": "unit-done", "stage": "count", "unit": "a", "seconds": 1.0, "report": {}}
+ENDED = {"event": "stage-done", "stage": "count", "report": {"words": 6}}
+
+
+def test_without_a_terminal_there_is_a_line_per_stage_and_no_bar(capsys):
+    with Screen() as screen:
+        for event in (STARTED, DONE, DONE, ENDED):
+            screen(event)
+
+    out, err = capsys.readouterr()
+    assert out == ""
+    lines = [line[9:] for line in err.splitlines()]
+    assert lines == ["count: 3 units, 1 of them made before", "count: made; words 6"]
+
+
+def test_progress_is_told_at_most_every_ten_seconds(capsys, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    with Screen() as screen:
+        screen(STARTED)
+        for _ in range(100):
+            now[0] += 0.25
+            screen({"event": "progress", "done": 1, "total": 4, "note": ""})
+
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 + 2
+    assert "count: 1.25 of 3 units" in lines[1]
+
+
+def test_with_a_terminal_there_is_a_bar(monkeypatch):
+    console = Console(force_terminal=True, width=100, record=True)
+    monkeypatch.setattr("pipeline.screen.Console", lambda **words: console)
+    with Screen() as screen:
+        for event in (STARTED, DONE, ENDED):
+            screen(event)
+
+    text = console.export_text()
+    assert "count: made; words 6" in text
+    assert "2 of 3 units" in text
+
+
+def test_failures_are_told_with_their_reason(capsys):
+    with Screen() as screen:
+        screen(STARTED)
+        about = {"stage": "count", "unit": "a", "seconds": 1.0, "trace": ""}
+        screen({"event": "unit-failed", "error": "ValueError: [x]", **about})
+
+    assert "count: unit a failed: ValueError: [x]" in capsys.readouterr().err
+
+
+def test_tables_show_cells_as_they_are(capsys):
+    show_table("title", ("a", "b"), [(1, "[bold]x"), (0.123456, None)])
+
+    out = capsys.readouterr().out
+    assert "title" in out
+    assert "[bold]x" in out
+    assert "0.1235" in out
+
+
+@pytest.mark.parametrize(("count", "words"), [(1500, "0.0 MB"), (3 << 30, "3.00 GiB")])
+def test_bytes_are_written_for_people(count, words):
+    assert gibibytes(count) == words

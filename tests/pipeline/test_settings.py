@@ -1,0 +1,157 @@
+from pathlib import Path
+
+import pytest
+
+from infgen.config import ConfigError
+from pipeline.plan import needed
+from pipeline.settings import DEFAULT_FILE, SOURCES, load_stages
+from pipeline.stages import MODULES
+
+OWN_FILE = Path(__file__).parents[2] / "stages.yaml"
+GOOD = """\
+version: 1
+sources: ${RECORDS:-data/*.tfrecord}
+stages:
+  ingest: {deps: [sources], params: [ingest]}
+  train:
+    deps: [ingest]
+    params: [model, train]
+params:
+  train: {learning_rate: 5e-4, steps: 10}
+profiles:
+  small:
+    sources: [one.tfrecord, two.tfrecord]
+    train: {steps: 3}
+  plain: {}
+"""
+
+
+@pytest.fixture
+def load(tmp_path):
+    def build(text=GOOD, environ=None):
+        path = tmp_path / "stages.yaml"
+        path.write_text(text)
+        return load_stages(path, environ or {})
+
+    return build
+
+
+def values(overlay):
+    return {
+        f"{section}.{key}": value.value
+        for section, given in overlay.values.items()
+        for key, value in given.items()
+    }
+
+
+def test_the_packaged_file_is_the_repositorys():
+    assert DEFAULT_FILE.read_bytes() == OWN_FILE.read_bytes()
+
+
+def test_the_packaged_file_loads_and_lists_every_stage_in_order():
+    file = load_stages(DEFAULT_FILE, {})
+
+    assert list(file.stages) == list(MODULES)
+    assert needed(file.stages, ["report"]) == list(MODULES)
+    assert {"demo", "smoke", "small", "paper"} <= file.profiles.keys()
+
+
+def test_stages_name_their_modules_deps_and_params(load):
+    train = load().stages["train"]
+
+    assert train.module == "pipeline.train"
+    assert (train.deps, train.params) == (("ingest",), ("model", "train"))
+    assert train.where == "stages.yaml:5"
+
+
+def test_profile_and_words_are_laid_over_the_base_in_this_order(load):
+    file = load()
+
+    assert values(file.choose(None))["train.steps"] == 10
+    assert values(file.choose("small"))["train.steps"] == 3
+    chosen = values(file.choose("small", ["train.steps=7", "model.width=32"]))
+    assert chosen == {
+        "train.learning_rate": "5e-4",
+        "train.steps": "7",
+        "model.width": "32",
+    }
+
+
+def test_a_profile_may_name_its_own_sources(load):
+    file = load()
+
+    assert file.choose(None).sources == ("data/*.tfrecord",)
+    assert file.choose("plain").sources == ("data/*.tfrecord",)
+    assert file.choose("small").sources == ("one.tfrecord", "two.tfrecord")
+    assert file.names_sources("small")
+    assert not file.names_sources("plain")
+
+
+def test_variables_are_filled_in_in_the_paths_of_sources(load):
+    assert load(environ={"RECORDS": "/x/*"}).choose(None).sources == ("/x/*",)
+
+
+def test_every_value_knows_its_line(load):
+    file = load()
+
+    assert file.choose("small").values["train"]["steps"].where == "stages.yaml:13: train"
+    assert file.choose(None, ["train.steps=1"]).values["train"]["steps"].where == "-s train"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("version: 1", "version: 2", "version is 2, expected 1"),
+        ("profiles:", "profile:", r"stages.yaml:10: .*'profile'; did you mean 'profiles'"),
+        ("  plain: {}", "  small: {}", "stages.yaml:14: 'small' stands twice, .* line 11"),
+        ("steps: 10", "steps: 10, steps: 11", "stages.yaml:9: 'steps' stands twice"),
+        ("deps: [ingest]", "deps: ingest", "stages.yaml:6: deps is 'ingest'"),
+        ("deps: [ingest]", "dep: [ingest]", "stages.yaml:6: .*did you mean 'deps'"),
+        ("  train: {l", "  trian: {l", "stages.yaml:9: .*'trian'; did you mean 'train'"),
+        ("  train:\n", "  trainn:\n", "stages.yaml:5: stage 'trainn' needs a `module`"),
+        ("train: {steps: 3}", "train: 3", "stages.yaml:13: train is 3"),
+        (
+            "${RECORDS:-data/*.tfrecord}",
+            "${RECORDS}",
+            "stages.yaml:2: .*RECORDS is not set",
+        ),
+        ("sources: ${", "sources: {a: ${", "stages.yaml:"),
+        ("[one.tfrecord, two.tfrecord]", "[1]", "stages.yaml:12: expected a path"),
+        ("version: 1", "version: 1\n\tx: 1", "stages.yaml: while scanning"),
+        (GOOD, "- 1\n", "expected a mapping, got list"),
+        (GOOD, "", "version is None"),
+        ("steps: 10", "steps: 2020-99-99", "stages.yaml:9: "),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_line(load, old, new, message):
+    with pytest.raises(ConfigError, match=message):
+        load(GOOD.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("profile", "words", "message"),
+    [
+        ("smal", [], "no profile 'smal'; did you mean 'small'"),
+        (None, ["train.steps"], "expected section.key=value"),
+        (None, ["trian.steps=1"], "no section 'trian'; did you mean 'train'"),
+    ],
+)
+def test_wrong_words_are_named(load, profile, words, message):
+    with pytest.raises(ConfigError, match=message):
+        load().choose(profile, words)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"none\.yaml is missing; `infgen init`"):
+        load_stages(tmp_path / "none.yaml", {})
+
+
+def test_nothing_is_executed_or_built_by_tags(load):
+    with pytest.raises(ConfigError, match="could not determine a constructor"):
+        load(GOOD.replace("steps: 10", "steps: !!python/object/apply:os.getcwd []"))
+
+
+def test_only_stages_that_read_sources_say_so(load):
+    readers = [e.name for e in load().stages.values() if SOURCES in e.deps]
+
+    assert readers == ["ingest"]

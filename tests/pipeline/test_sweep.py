@@ -1,0 +1,89 @@
+import os
+
+import pytest
+
+from pipeline.locks import LockedError, locked
+from pipeline.runner import Orders
+from pipeline.sweep import PARTIAL_AGE_S, find_garbage, sweep
+
+
+def kinds(garbage):
+    return sorted(each.why for each in garbage)
+
+
+def test_after_one_run_there_is_no_garbage(workshop):
+    workshop.run()
+
+    assert find_garbage(workshop.root) == []
+
+
+def test_what_the_latest_run_replaced_is_garbage_and_is_counted(workshop):
+    workshop.run()
+    workshop.run("total.times=3")
+
+    garbage = find_garbage(workshop.root)
+
+    assert kinds(garbage) == [
+        "stage of climb",
+        "stage of total",
+        "unit of climb",
+        "unit of total",
+        "unit of total",
+    ]
+    assert all(each.bytes > 0 for each in garbage)
+
+
+def test_finding_removes_nothing_and_sweeping_removes_just_that(workshop):
+    workshop.run()
+    workshop.run("total.times=3")
+    garbage = find_garbage(workshop.root)
+    assert all(each.path.is_dir() for each in garbage)
+
+    assert sweep(workshop.root) == garbage
+
+    assert not any(each.path.exists() for each in garbage)
+    assert {r.state for r in workshop.run("total.times=3").values()} == {"cached"}
+
+
+def test_each_profile_keeps_its_latest(workshop):
+    workshop.run()
+    workshop.request(profile="short").remember(
+        workshop.request(profile="short").plan((), {})
+    )
+    workshop.run("total.times=3")
+
+    assert find_garbage(workshop.root) != []
+    workshop.request(profile="short").remember(workshop.plan())
+    assert find_garbage(workshop.root) == []
+
+
+def test_units_of_an_unfinished_stage_are_kept(workshop):
+    workshop.text("a.txt", "fail")
+    workshop.run(orders=Orders(keep_going=True))
+
+    assert find_garbage(workshop.root) == []
+
+
+def test_partial_folders_are_garbage_after_a_day(workshop):
+    workshop.run()
+    partial = workshop.root.units("count") / "0123456789abcdef.partial"
+    partial.mkdir()
+    assert find_garbage(workshop.root) == []
+    old = partial.stat().st_mtime - PARTIAL_AGE_S - 60
+    os.utime(partial, (old, old))
+
+    assert kinds(find_garbage(workshop.root)) == ["left by a killed run"]
+
+
+def test_nothing_is_swept_while_a_run_goes_on(workshop):
+    workshop.run()
+    workshop.run("total.times=3")
+
+    with locked(workshop.root.lock("climb")), pytest.raises(LockedError):
+        sweep(workshop.root)
+
+    assert len(find_garbage(workshop.root)) == 5
+
+
+def test_an_empty_root_has_no_garbage(workshop):
+    assert find_garbage(workshop.root) == []

@@ -1,0 +1,52 @@
+"""Counts the words of every source file. A file that says ``fail`` makes its unit fail, one
+that says ``die`` ends its process."""
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.folders import write_json
+from pipeline.stage import Stage, Unit
+
+
+@dataclass(frozen=True, slots=True)
+class CountSettings:
+    longest: int = 100
+    sleep_s: float = 0.0
+
+
+def plan(inputs, settings):
+    return [Unit(s.name, {"file": s.fingerprint}, {"url": s.url}) for s in inputs.sources]
+
+
+def work(unit, target, settings, progress):
+    words = Path(unit.task["url"]).read_text().split()
+    if "die" in words:
+        os._exit(1)
+    if "fail" in words:
+        raise ValueError(f"{unit.name} says fail")
+    for part in range(3):
+        time.sleep(settings.sleep_s / 3)
+        (target / f"part-{part}.txt").write_text(" ".join(words[part::3]))
+        progress(part + 1, 3)
+    lengths = [len(word) for word in words if len(word) <= settings.longest]
+    write_json(target / "count.json", {"words": len(lengths), "letters": sum(lengths)})
+    return {"words": len(lengths), "run": {"letters_per_s": time.monotonic()}}
+
+
+def finish(inputs, units, target, settings, progress):
+    words = {unit.name: unit.report["words"] for unit in units}
+    write_json(target / "words.json", words)
+    return {"words": sum(words.values()), "files": len(words)}
+
+
+STAGE = Stage(
+    name="count",
+    version=1,
+    settings={"count": CountSettings},
+    plan=plan,
+    work=work,
+    finish=finish,
+    modules=("toy_count",),
+)

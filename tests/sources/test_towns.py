@@ -1,0 +1,355 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from infgen.geometry import box_corners, wrap_angle
+from infgen.scene import (
+    AgentKind,
+    FeatureKind,
+    LaneType,
+    LinkKind,
+    RoadEdgeType,
+    SignalState,
+)
+from infgen.sources.towns import builtin_records, write_towns
+from infgen.sources.towns.recording import BUILTIN, BUILTIN_SEED
+from infgen.sources.towns.scenes import draw_scene
+from infgen.sources.womd import iter_scenes
+from tests.sources.test_womd_write import assert_same
+
+GRID_M = 75.0
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return [scene for path in builtin_records() for scene in iter_scenes(path)]
+
+
+# Records
+
+
+def test_records_that_come_with_the_package_are_small_and_whole(scenes):
+    paths = builtin_records()
+
+    assert [path.name for path in paths] == [
+        "training.tfrecord-00000-of-00002.gz",
+        "training.tfrecord-00001-of-00002.gz",
+        "validation.tfrecord-00000-of-00001.gz",
+    ]
+    assert sum(path.stat().st_size for path in paths) < 3e6
+    assert len(scenes) == sum(count for count, _ in BUILTIN.values()) == 32
+    assert len({scene.scenario_id for scene in scenes}) == 32
+
+
+@pytest.mark.parametrize(
+    ("split", "number", "row"), [("training", 13, 13), ("validation", 2, 26)]
+)
+def test_built_in_records_are_what_their_seed_draws(scenes, split, number, row):
+    # Within a grid step: another processor may round a sine differently.
+    assert_same(scenes[row], draw_scene(BUILTIN_SEED, split, number), atol=2.0**-7)
+
+
+@pytest.mark.slow
+def test_a_fifth_of_the_built_in_records_is_what_its_seed_draws(scenes):
+    names = [(split, at) for split, (count, _) in BUILTIN.items() for at in range(count)]
+    for scene, (split, number) in list(zip(scenes, names, strict=True))[::5]:
+        assert_same(scene, draw_scene(BUILTIN_SEED, split, number), atol=2.0**-7)
+
+
+def test_a_seed_always_writes_the_same_bytes(tmp_path):
+    once, twice = (
+        write_towns(tmp_path / name, 2, 5, split="training", scenes_per_file=1)
+        for name in ("once", "twice")
+    )
+
+    assert [path.name for path in once] == [
+        "training.tfrecord-00000-of-00002.gz",
+        "training.tfrecord-00001-of-00002.gz",
+    ]
+    assert [a.read_bytes() for a in once] == [b.read_bytes() for b in twice]
+    # A scene depends on its number in the split, not on the file it is in.
+    assert_same(next(iter(iter_scenes(once[1]))), draw_scene(5, "training", 1))
+
+
+def test_seed_and_split_change_the_scene(scenes):
+    other = draw_scene(BUILTIN_SEED + 1, "training", 0)
+
+    ids = {scene.scenario_id for scene in (other, scenes[0], scenes[24])}
+    sizes = {len(scene.road_map.xyz_m) for scene in (other, scenes[0], scenes[24])}
+    assert len(ids) == len(sizes) == 3
+
+
+@pytest.mark.parametrize(("scenes", "per_file"), [(0, 1), (1, 0)])
+def test_nothing_to_write_is_an_error(tmp_path, scenes, per_file):
+    with pytest.raises(ValueError, match="expected 1 or more"):
+        write_towns(tmp_path, scenes, 1, split="training", scenes_per_file=per_file)
+
+
+# Scenes
+
+
+def test_scenes_have_the_steps_and_roles_of_womd(scenes):
+    for scene in scenes:
+        assert scene.tracks.num_steps == 91
+        assert scene.now == 10
+        np.testing.assert_allclose(np.diff(scene.timestamps_s), 0.1)
+        assert scene.tracks.valid[scene.ego].all()
+        assert scene.tracks.kind[scene.ego] == AgentKind.VEHICLE
+        assert scene.ego not in scene.predict_row
+        assert scene.tracks.valid[scene.predict_row, scene.now].all()
+        assert set(scene.predict_difficulty) <= {1, 2}
+        assert set(scene.interest_id) <= set(scene.tracks.id)
+
+
+def test_all_kinds_of_agents_come_in_both_splits(scenes):
+    for part in (scenes[:24], scenes[24:]):
+        kinds = np.concatenate([scene.tracks.kind for scene in part])
+        assert set(kinds) == {AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST}
+
+
+def test_agents_enter_and_leave_the_grid_of_the_ego(scenes):
+    entries, exits = [], []
+    for scene in scenes:
+        valid, apart_m = scene.tracks.valid, _apart_m(scene)
+        near = apart_m < GRID_M
+        later = np.arange(90) >= scene.now
+        entries.append((~valid[:, :-1] & valid[:, 1:] & near[:, 1:] & later).sum())
+        exits.append((valid[:, :-1] & ~valid[:, 1:] & near[:, :-1] & later).sum())
+    assert np.mean(entries) > 3
+    assert np.mean(exits) > 3
+    assert np.mean(np.array(entries) > 0) > 0.8
+
+
+def _apart_m(scene):
+    xy_m = scene.tracks.xyz_m[..., :2]
+    return np.linalg.norm(xy_m - xy_m[scene.ego], axis=-1)
+
+
+def test_values_of_steps_that_are_not_seen_are_the_records_zeros(scenes):
+    for scene in scenes:
+        unseen = ~scene.tracks.valid
+        world_m = scene.tracks.xyz_m[unseen] + scene.origin_xyz_m
+        assert not world_m.any()
+        assert not scene.tracks.size_lwh_m[unseen].any()
+        assert not scene.tracks.velocity_mps[unseen].any()
+
+
+def test_vehicles_stay_on_the_road(scenes):
+    # The road lies to the left of a road edge.
+    outside = np.concatenate([_off_road_m(scene) > 0 for scene in scenes])
+    assert outside.mean() < 0.005
+
+
+def _off_road_m(scene):
+    """Signed distance to the nearest road edge of each vehicle's most off-road corner."""
+    tracks = scene.tracks
+    rows = tracks.kind == AgentKind.VEHICLE
+    pose = np.concatenate([tracks.xyz_m[..., :2], tracks.heading_rad[..., None]], axis=-1)
+    shown = tracks.valid[rows][:, ::15]
+    corners_m = box_corners(pose[rows][:, ::15], tracks.size_lwh_m[rows][:, ::15, :2])[
+        shown
+    ]
+    starts_m, ends_m = [], []
+    for row in scene.road_map.rows(FeatureKind.ROAD_EDGE):
+        points_m = scene.road_map.points(int(row))[:, :2]
+        starts_m.append(points_m[:-1])
+        ends_m.append(points_m[1:])
+    start_m, way_m = (
+        np.concatenate(starts_m),
+        np.concatenate(ends_m) - np.concatenate(starts_m),
+    )
+    return _signed_m(corners_m.reshape(-1, 2), start_m, way_m).reshape(-1, 4).max(axis=1)
+
+
+def _signed_m(points_m, start_m, way_m):
+    to_m = points_m[:, None] - start_m
+    part = ((to_m * way_m).sum(-1) / (way_m**2).sum(-1)).clip(0, 1)
+    apart_m = np.linalg.norm(to_m - part[..., None] * way_m, axis=-1)
+    nearest = apart_m.argmin(axis=1)
+    rows = np.arange(len(points_m))
+    to_m, way_m = to_m[rows, nearest], way_m[nearest]
+    right = to_m[:, 0] * way_m[:, 1] - to_m[:, 1] * way_m[:, 0]
+    return np.sign(right) * apart_m[rows, nearest]
+
+
+def test_vehicles_do_not_overlap(scenes):
+    for scene in scenes:
+        tracks = scene.tracks
+        cars = np.flatnonzero(tracks.kind == AgentKind.VEHICLE)
+        for step in range(0, 91, 10):
+            rows = cars[tracks.valid[cars, step]]
+            pose = np.column_stack(
+                [tracks.xyz_m[rows, step, :2], tracks.heading_rad[rows, step]]
+            )
+            corners_m = box_corners(pose, 0.97 * tracks.size_lwh_m[rows, step, :2])
+            assert not _overlaps(corners_m).any()
+
+
+def _overlaps(corners_m):
+    """Which boxes [box, box] overlap (separating axes); none with itself."""
+    sides_m = np.roll(corners_m, -1, axis=1)[:, :2] - corners_m[:, :2]
+    on_axis = np.einsum("aid,bkd->abik", sides_m, corners_m)
+    low, high = on_axis.min(-1), on_axis.max(-1)  # [axis of, box, axis]
+    own = np.arange(len(corners_m))
+    apart = (high[own, own][:, None] < low) | (low[own, own][:, None] > high)
+    apart = apart.any(-1)
+    return ~(apart | apart.T) & ~np.eye(len(corners_m), dtype=bool)
+
+
+def test_motion_is_smooth(scenes):
+    for scene in scenes:
+        tracks = scene.tracks
+        cars = tracks.kind == AgentKind.VEHICLE
+        step_m = np.linalg.norm(np.diff(tracks.xyz_m[cars, :, :2], axis=1), axis=-1)
+        both = tracks.valid[cars, 1:] & tracks.valid[cars, :-1]
+        accel_mps2 = np.diff(step_m / 0.1, axis=1) / 0.1
+        turned_rad = wrap_angle(np.diff(tracks.heading_rad[cars], axis=1))
+        assert np.abs(accel_mps2[both[:, 1:] & both[:, :-1]]).max() < 8
+        assert np.abs(turned_rad[both]).max() < 0.1
+        assert step_m[both].max() < 2.2
+
+
+def test_velocity_is_the_change_of_position(scenes):
+    for scene in scenes[:8]:
+        tracks = scene.tracks
+        moved_mps = (tracks.xyz_m[:, 2:, :2] - tracks.xyz_m[:, :-2, :2]) / 0.2
+        seen_thrice = tracks.valid[:, 2:] & tracks.valid[:, 1:-1] & tracks.valid[:, :-2]
+        off_mps = np.linalg.norm(moved_mps - tracks.velocity_mps[:, 1:-1], axis=-1)
+        assert np.percentile(off_mps[seen_thrice], 95) < 0.3
+        assert off_mps[seen_thrice].max() < 1.5
+
+
+def test_nobody_runs_a_red_light(scenes):
+    checked = 0
+    for scene in scenes:
+        for lane in np.unique(scene.signals.lane_id):
+            checked += _check_lane(scene, lane)
+    assert checked > 100
+
+
+def _check_lane(scene, lane):
+    signals, road_map = scene.signals, scene.road_map
+    rows = np.flatnonzero(signals.lane_id == lane)
+    path_m = road_map.points(int(np.flatnonzero(road_map.feature_id == lane)[0]))[:, :2]
+    ahead = (path_m[1] - path_m[0]) / np.linalg.norm(path_m[1] - path_m[0])
+    to_m = scene.tracks.xyz_m[..., :2] - signals.stop_xyz_m[rows[0], :2]
+    along_m = to_m @ ahead
+    aside_m = np.abs(to_m @ np.array([-ahead[1], ahead[0]]))
+    seen_twice = scene.tracks.valid[:, 1:] & scene.tracks.valid[:, :-1]
+    crossing = (
+        seen_twice & (along_m[:, :-1] < 0) & (along_m[:, 1:] >= 0) & (aside_m[:, 1:] < 1.2)
+    )
+    red = signals.state[rows[1:]] == SignalState.STOP
+    walking = scene.tracks.kind == AgentKind.PEDESTRIAN
+    assert not (crossing & red & ~walking[:, None]).any()
+    return len(rows)
+
+
+def test_boxes_stand_on_the_ground(scenes):
+    for scene in scenes[:4]:
+        tracks = scene.tracks
+        bottom_m = tracks.xyz_m[..., 2] - tracks.size_lwh_m[..., 2] / 2
+        points_m = scene.road_map.xyz_m
+        plane = np.column_stack([points_m[:, :2], np.ones(len(points_m))])
+        slope, *_ = np.linalg.lstsq(plane, points_m[:, 2], rcond=None)
+        ground_m = tracks.xyz_m[..., :2] @ slope[:2] + slope[2]
+        np.testing.assert_allclose(
+            bottom_m[tracks.valid], ground_m[tracks.valid], atol=0.02
+        )
+
+
+# Maps
+
+
+def test_every_kind_of_feature_appears(scenes):
+    kinds = set(np.concatenate([scene.road_map.feature_kind for scene in scenes]))
+    assert kinds == set(FeatureKind)
+
+
+def test_lanes_that_follow_each_other_touch(scenes):
+    for scene in scenes[:8]:
+        road_map = scene.road_map
+        row = {int(feature): at for at, feature in enumerate(road_map.feature_id)}
+        exits = road_map.link_kind == LinkKind.EXIT
+        for lane, other in zip(
+            road_map.link_lane_id[exits], road_map.link_other_id[exits], strict=True
+        ):
+            end, start = road_map.points(row[lane])[-1], road_map.points(row[other])[0]
+            np.testing.assert_allclose(end, start, atol=0.01)
+        pairs = [
+            set(
+                zip(
+                    road_map.link_lane_id[kind].tolist(),
+                    road_map.link_other_id[kind].tolist(),
+                    strict=True,
+                )
+            )
+            for kind in (exits, ~exits)
+        ]
+        assert pairs[0] == {(lane, other) for other, lane in pairs[1]}
+
+
+def test_neighbours_and_boundaries_name_features_on_the_right_side(scenes):
+    for scene in scenes[:8]:
+        road_map = scene.road_map
+        row = {int(feature): at for at, feature in enumerate(road_map.feature_id)}
+        sides = [
+            *zip(
+                road_map.neighbour_lane_id,
+                road_map.neighbour_side,
+                road_map.neighbour_other_id,
+                strict=True,
+            ),
+            *zip(
+                road_map.boundary_lane_id,
+                road_map.boundary_side,
+                road_map.boundary_feature_id,
+                strict=True,
+            ),
+        ]
+        for lane, side, other in sides:
+            path_m = road_map.points(row[lane])[:, :2]
+            other_m = road_map.points(row[other])[:, :2]
+            middle = len(path_m) // 2
+            ahead = path_m[middle + 1] - path_m[middle]
+            nearest = np.linalg.norm(other_m - path_m[middle], axis=1).argmin()
+            to_m = other_m[nearest] - path_m[middle]
+            left = ahead[0] * to_m[1] - ahead[1] * to_m[0] > 0
+            assert left == (side == 0)
+            assert np.linalg.norm(to_m) < 6
+
+
+def test_roads_have_two_kerbs_and_named_types(scenes):
+    for scene in scenes:
+        road_map = scene.road_map
+        edges = road_map.rows(FeatureKind.ROAD_EDGE)
+        assert len(edges) in (2, 3, 4)
+        assert set(road_map.feature_type[edges]) == {RoadEdgeType.BOUNDARY}
+        lanes = road_map.rows(FeatureKind.LANE)
+        assert set(road_map.feature_type[lanes]) <= {
+            LaneType.SURFACE_STREET,
+            LaneType.BIKE_LANE,
+        }
+
+
+def test_signals_stand_where_their_lane_begins_and_change_in_order(scenes):
+    lit = [scene for scene in scenes if len(scene.signals.step)]
+    assert len(lit) > 4
+    follows = {
+        SignalState.GO: SignalState.CAUTION,
+        SignalState.CAUTION: SignalState.STOP,
+        SignalState.STOP: SignalState.GO,
+    }
+    for scene in lit:
+        signals, road_map = scene.signals, scene.road_map
+        for lane in np.unique(signals.lane_id):
+            rows = np.flatnonzero(signals.lane_id == lane)
+            np.testing.assert_array_equal(signals.step[rows], np.arange(91))
+            feature = int(np.flatnonzero(road_map.feature_id == lane)[0])
+            np.testing.assert_allclose(
+                signals.stop_xyz_m[rows[0]], road_map.points(feature)[0]
+            )
+            states = signals.state[rows]
+            for before, after in pairwise(states):
+                assert after in (before, follows[SignalState(before)])
