@@ -225,6 +225,8 @@ class RolloutSettings:
         scenes: Scenes to play; 0 for all of the split.
         scenes_per_task: Scenes of one unit of work.
         batch: Rollouts that are played at once.
+        everyone: Whether to play every agent of the log that is there at now, however far
+            from the ego (the WOSAC protocol), or those within ``tokenize.max_distance_m``.
         insert: Whether agents may enter.
         remove: Whether agents may leave.
         top_moves: Most likely moves that are sampled from.
@@ -240,6 +242,7 @@ class RolloutSettings:
     scenes: int = 0
     scenes_per_task: int = 8
     batch: int = 32
+    everyone: bool = False
     insert: bool = True
     remove: bool = True
     top_moves: int = 5

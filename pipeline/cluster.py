@@ -21,6 +21,10 @@ LOOPBACK = "127.0.0.1"  # Dask runs what anyone who connects sends it.
 RETRIES = 2
 RESUBMISSIONS = 2
 TASKS_PER_THREAD = 2
+LOST_WORKER = {"distributed.deploy.lost-worker-timeout": "1 day"}
+"""A worker that is just being restarted when this time is up is given up for good; with the
+usual 15 seconds a few crashes leave a cluster without workers, and a run that never ends.
+"""
 WORKER_ENVIRONMENT = {"ZARR_ASYNC__CONCURRENCY": "4", "ZARR_THREADING__MAX_WORKERS": "2"}
 
 
@@ -67,6 +71,7 @@ def _client(words: str) -> Iterator[Any]:
     kind, rest = parse(words)
     place = {"scheduler_file": rest} if kind == "file" else {"address": words}
     with ExitStack() as stack:
+        stack.enter_context(import_module("dask").config.set(LOST_WORKER))
         if kind == "local":
             cluster = _local(int(rest or os.cpu_count() or 1))
             place = {"address": stack.enter_context(cluster)}
@@ -136,8 +141,12 @@ class OnDask:
         window = max(1, sum(self._client.nthreads().values())) * TASKS_PER_THREAD
         under_way: dict[Any, tuple[Task, int]] = {}
         finished = _dask().as_completed(loop=self._client.loop)
-        while (waiting and go_on()) or under_way:
-            while waiting and go_on() and len(under_way) < window:
+
+        def more() -> bool:
+            return bool(waiting) and go_on() and self._client.status == "running"
+
+        while more() or under_way:
+            while more() and len(under_way) < window:
                 task, tries = waiting.pop()
                 future = self._submit(task, tries)
                 under_way[future] = (task, tries)
@@ -159,7 +168,7 @@ class OnDask:
 def _failed(task: Task, future: Any) -> Outcome:
     error = future.exception()
     if error is None:
-        error = RuntimeError(f"the task was {future.status}")
+        error = RuntimeError(f"{future.status}: the scheduler, or its connection, is lost")
     trace = "".join(traceback.format_tb(future.traceback()))
     return failure(task.unit.name, error, trace, 0.0)
 

@@ -4,7 +4,9 @@ One unit is some scenes of one shard with all their rollouts, so a task is long 
 overhead. What a rollout does depends on its scene, its index and the seed alone.
 """
 
+import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from itertools import groupby, islice
 from pathlib import Path
@@ -142,11 +144,14 @@ def _starts(
     from pipeline.ingest import read_scenes  # noqa: PLC0415
 
     first, count = unit.task["first"], unit.task["count"]
+    tokens = player.tokens
+    if settings.everyone:
+        tokens = replace(tokens, max_distance_m=math.inf)
     starts, refused = [], []
     for scene in islice(read_scenes(Path(unit.task["scenes"])), first, first + count):
         try:
             history = tokenize_scene(
-                scene, player.codebook, player.roads, player.tokens, until=scene.now
+                scene, player.codebook, player.roads, tokens, until=scene.now
             )
         except ValueError as error:
             refused.append(f"{scene.scenario_id}: {error}")

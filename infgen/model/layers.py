@@ -12,10 +12,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from infgen.model.pairs import look_at_pairs
+
 FEED_FORWARD = 4
 """The feed-forward part is so many times as wide as the features."""
-HIDDEN_SCORE = -1e9
-"""Score of what a target does not see: its weight is exactly zero beside any other."""
 
 
 def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
@@ -217,23 +217,29 @@ class Attention(nn.Module):
         heads = (targets, slots, self.heads)
         query = self.query(normal_NSD).view(*heads, width // self.heads)
         source, relation = self._folded()
-        keys = [seen.features.transpose(1, 2), seen.relation.transpose(1, 2)]  # [N, D, K]
-        score = torch.bmm(_per_head(query, source[0]), keys[0])
-        score = torch.baddbmm(score, _per_head(query, relation[0]), keys[1])
-        score = score.view(*heads, seen.features.shape[1]) * query.shape[-1] ** -0.5
-
-        hidden = ~seen.present[:, :, None]  # [N, S, 1, K]
-        weight = score.masked_fill(hidden, HIDDEN_SCORE).softmax(dim=-1)
-        weight = functional.dropout(
-            weight.masked_fill(hidden, 0.0), self.dropout, self.training
+        query = query * query.shape[-1] ** -0.5
+        hidden = (~seen.present)[:, :, None].expand(-1, -1, self.heads, -1).flatten(1, 2)
+        looked = look_at_pairs(
+            _per_head(query, source[0]),
+            _per_head(query, relation[0]),
+            seen.features,
+            seen.relation,
+            hidden,
+            self._kept(hidden),
         )
-        flat = weight.flatten(1, 2)  # [N, S H, K]
-        from_source = torch.bmm(flat, seen.features).view(*heads, width)
-        from_relation = torch.bmm(flat, seen.relation).view(*heads, width)
+        from_source = looked.features.view(*heads, width)
+        from_relation = looked.relation.view(*heads, width)
         value = torch.einsum("nshd,hcd->nshc", from_source, source[1])
         value = value + torch.einsum("nshd,hcd->nshc", from_relation, relation[1])
         bias = self._value_bias().view(self.heads, -1)  # [H, C]
-        return (value + weight.sum(dim=-1)[..., None] * bias).flatten(2)
+        return (value + looked.weight.view(*heads, 1) * bias).flatten(2)
+
+    def _kept(self, like: Tensor) -> Tensor | None:
+        """Factors of dropout: 0, or what makes up for the zeros."""
+        if not (self.training and self.dropout):
+            return None
+        drawn = torch.rand(like.shape, device=like.device)
+        return (drawn >= self.dropout).to(drawn.dtype).div_(1 - self.dropout)
 
     def source_norm(self) -> nn.LayerNorm:
         """Norm of the neighbours' features: the targets' own unless they differ."""

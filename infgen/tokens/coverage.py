@@ -26,6 +26,8 @@ from infgen.tokens.tracks import Paths
 
 MOVING_M = 0.05
 """A move whose end is nearer than this to its start does not count as moving."""
+STRAIGHT_DEG = 0.1
+"""What turns less is counted neither as left nor as right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +114,7 @@ def describe_roads(
         "held_out_error_m": _spread(np.linalg.norm(away_m, axis=-1).mean(axis=-1)),
         **_describe_shapes(space, codebook.curve_m, np.array([1, -1], dtype=np.float32)),
         "length_m": _range(np.linalg.norm(steps_m, axis=-1).sum(axis=-1)),
-        "turn_deg": _range(turn_deg),
+        **_turns(turn_deg),
     }
 
 
@@ -138,13 +140,7 @@ def _describe_shapes(space: Space, items: Items, mirror: np.ndarray) -> dict[str
     points_m, mirrored_m = space.points_m(items), space.points_m(items * mirror)
     gaps_m = np.array([np.partition(gap_m(points_m, one), 1)[1] for one in points_m])
     mirror_m = np.array([gap_m(points_m, one).min() for one in mirrored_m])
-    left_m = points_m.mean(axis=1)[:, 1]
-    return {
-        "nearest_gap_m": _range(gaps_m),
-        "mirror_gap_m": _range(mirror_m),
-        "left": int((left_m > 1e-3).sum()),
-        "right": int((left_m < -1e-3).sum()),
-    }
+    return {"nearest_gap_m": _range(gaps_m), "mirror_gap_m": _range(mirror_m)}
 
 
 def _describe_motion(
@@ -155,8 +151,17 @@ def _describe_motion(
     beyond = ~within(path, kind, limits_of(settings))
     return {
         "speed_mps": _range(speed_mps),
-        "turn_deg": _range(np.degrees(end[:, 2])),
+        **_turns(np.degrees(end[:, 2])),
         "beyond_limits": int(beyond.sum()),
+    }
+
+
+def _turns(turn_deg: np.ndarray) -> dict[str, Any]:
+    """Say how far rows turn, and how many turn to either side."""
+    return {
+        "turn_deg": _range(turn_deg),
+        "left": int((turn_deg > STRAIGHT_DEG).sum()),
+        "right": int((turn_deg < -STRAIGHT_DEG).sum()),
     }
 
 

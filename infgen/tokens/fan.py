@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from infgen.clock import CLOCK
+from infgen.geometry import rotate
+from infgen.scene import AgentKind
 from infgen.tokens.codebook import BOX_LW_M
 from infgen.tokens.limits import MAX_REVERSE_MPS, MotionLimits, within
 
@@ -22,6 +24,9 @@ REVERSE_MPS = (4.0, 1.5, 1.0)
 
 GRIP_MPS2 = 8.0
 """Sideways acceleration that tyres hold."""
+
+STROLL_MPS = 1.5
+"""How fast a pedestrian goes in a direction that it does not face."""
 
 COMFORT_MPS2, COMFORT_RAD_S = 3.0, 1.0
 """Sideways acceleration and yaw rate that are still ordinary."""
@@ -39,9 +44,26 @@ def fan(
     """
     length_m, turn_rad = _grid(kind, limits, spacing_m)
     effort = _effort(length_m, turn_rad, float(limits.speed_mps[kind]))
-    order = np.lexsort((turn_rad, length_m, effort))
-    path = _arcs(length_m[order], turn_rad[order], PIVOT_M[kind])
+    path = _arcs(length_m, turn_rad, PIVOT_M[kind])
+    if kind == AgentKind.PEDESTRIAN:
+        path, effort = _with_strolls(path, effort)
+    order = np.lexsort((*path[:, -1].T, effort))
+    path = path[order]
     return path[within(path, kind, limits)]
+
+
+def _with_strolls(path: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Add slow moves in all directions, whatever way a pedestrian faces."""
+    slow = np.hypot(path[:, -1, 0], path[:, -1, 1]) <= STROLL_MPS * CLOCK.token_s
+    slow &= path[:, -1, 0] > 0
+    paths, efforts = [path], [effort]
+    for eighths in (1, -1, 2, -2, 3, -3, 4):
+        aside = path[slow]
+        turn_rad = np.full(aside.shape[:2], eighths * np.pi / 4)
+        xy_m = rotate(aside[..., :2].astype(np.float64), turn_rad)
+        paths.append(np.concatenate([xy_m, aside[..., 2:]], axis=-1).astype(np.float32))
+        efforts.append(effort[slow] + np.abs(eighths))
+    return np.concatenate(paths), np.round(np.concatenate(efforts), 6)
 
 
 def _grid(

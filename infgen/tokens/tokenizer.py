@@ -96,9 +96,8 @@ def tokenize_scene(
 
 
 def _kept(paths: Paths, *, whole_log: bool) -> np.ndarray:
-    """Return rows of the agents to write: the ego, those at ``now``, those with a move."""
-    kept = paths.at_now.copy()
-    kept[paths.ego] = True
+    """Return rows of the agents to write: those there now (as the ego is) or moving."""
+    kept = paths.at_now
     if whole_log:
-        kept |= makes_a_move(seen_tokens(paths.valid))
+        kept = kept | makes_a_move(seen_tokens(paths.valid))
     return np.flatnonzero(kept)

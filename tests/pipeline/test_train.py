@@ -291,14 +291,14 @@ def test_without_held_out_scenes_there_is_no_validation(course, books):
 
 
 def test_the_loss_goes_down(course, books):
-    how = replace(course.train, steps=60, learning_rate=1e-2, label_smoothing=0.0)
+    how = replace(course.train, steps=30, learning_rate=1e-2, label_smoothing=0.0)
     longer = replace(course, train=replace(how, checkpoint_every=1000, validate_every=0))
 
     train(longer, begin(longer, *books), quiet)
 
     motion = [line["motion"] for line in read_log(course.folder / "train.jsonl")[:-1]]
-    assert len(motion) == 60
-    assert np.mean(motion[-5:]) < 0.5 * np.mean(motion[:5])
+    assert len(motion) == 30
+    assert np.mean(motion[-5:]) < 0.7 * np.mean(motion[:5])
 
 
 def test_weights_are_all_that_loading_needs(whole, metre_moves, bent_roads):
@@ -339,7 +339,7 @@ def test_finish_gathers_what_the_unit_made(whole, tmp_path):
     folder, report = whole
     target = tmp_path / "stage"
 
-    found = finish(None, [Done("weights", "k", folder, report)], target, SETTINGS, quiet)
+    found = finish(MadeInputs(), [Done("weights", "k", folder, report)], target, SETTINGS, quiet)
 
     assert contents(target) == contents(folder)
     assert found == {name: value for name, value in report.items() if name != "run"}
@@ -349,6 +349,10 @@ class MadeInputs:
     """Token shards of three files, as the engine shows them."""
 
     names = ("training.tfrecord-0", "training.tfrecord-1", "validation.tfrecord-0")
+    sources = ()
+
+    def key(self, stage):
+        return f"key-{stage}"
 
     def units(self, stage):
         assert stage == "tokenize"

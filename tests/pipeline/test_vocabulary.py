@@ -239,14 +239,16 @@ def test_a_missing_codebook_is_an_error_that_says_so(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs real records in ../shared/data/womd")
 def test_codebooks_from_a_few_real_files_write_held_out_scenes_closely(tmp_path):
-    files = [*sorted(SHARED.glob("training*"))[:3], *sorted(SHARED.glob("validation*"))[:1]]
+    files = [*sorted(SHARED.glob("training*"))[:2], *sorted(SHARED.glob("validation*"))]
     done = []
     for file in files:
         target = tmp_path / "ingest" / file.name
         unit = Unit(file.name, {}, {"url": str(file)})
-        report = ingest.work(unit, target, IngestSettings(limit=15), no_progress)
+        report = ingest.work(unit, target, IngestSettings(limit=10), no_progress)
         done.append(Done(file.name, file.name, target, report))
-    folder, figures = build(Ingested(done), tmp_path, VocabSettings(segments_per_shard=4096))
+    folder, figures = build(
+        Ingested(done), tmp_path, VocabSettings(segments_per_shard=4096)
+    )
     motion, _ = load_codebooks(folder)
     report = json.loads((folder / "report.json").read_text())
 
@@ -257,4 +259,4 @@ def test_codebooks_from_a_few_real_files_write_held_out_scenes_closely(tmp_path)
         assert row["nearest_gap_m"]["min"] >= 0.05
         assert row["held_out_error_m"] is None or row["held_out_error_m"]["mean"] <= most_m
     assert report["roads"]["held_out_error_m"]["mean"] <= 0.05
-    assert figures["real"]["vehicle"] > 1024
+    assert figures["real"]["vehicle"] > 500

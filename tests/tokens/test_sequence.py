@@ -106,6 +106,20 @@ def test_a_half_second_moves_everybody_then_keeps_or_removes_then_adds(tokens_of
     assert not any(agent == 3 for _, agent in said(tokens, 12))
 
 
+def test_near_and_far_are_measured_before_the_move(tokens_of, build_scene):
+    # Row 1 drives away from a standing ego, row 2 stands 10.5 m away: when a token starts
+    # with row 1 at 10 m, it is the nearer one, though at the end it is 15 m away.
+    away_m = np.arange(31.0)
+    path = np.zeros((3, 31, 3))
+    path[1, :, 0], path[2, :, 1] = away_m, 10.5
+
+    tokens = tokens_of(build_scene(path, [0, 0, 0]))
+
+    moves = [[agent for word, agent in said(tokens, k) if word == "MOVE"] for k in (2, 3)]
+    assert tokens.pose[1, 1, 0] == 10
+    assert moves == [[0, 1, 2], [0, 2, 1]]
+
+
 def test_an_unseen_agent_stays_without_a_move(tokens_of, build_scene):
     x_m = np.arange(91.0)
     path = np.stack([np.column_stack([x_m, 0 * x_m + y, 0 * x_m]) for y in (0, 5)])
