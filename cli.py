@@ -27,7 +27,7 @@ from pipeline.manifest import verify as find_damage
 from pipeline.options import Asked, Running, gathers
 from pipeline.plan import PlanError
 from pipeline.request import Request
-from pipeline.root import KEY_DIGITS, Root, read_json
+from pipeline.root import Root
 from pipeline.runner import Result
 from pipeline.runner import run as make
 from pipeline.screen import Screen, gibibytes, show_table
@@ -35,6 +35,7 @@ from pipeline.settings import DEFAULT_FILE
 from pipeline.status import Standing, standings
 from pipeline.sweep import find_garbage
 from pipeline.sweep import sweep as remove_garbage
+from pipeline.tables import show_results, show_standings
 
 FAILED, WRONG, STALE, LOCKED = 1, 2, 3, 75
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -132,7 +133,7 @@ def status(
     request = asked.request()
     while True:
         found = _standings(request, [], strict_code=strict_code)
-        _show_standings(found, as_json=json_)
+        _tell_standings(found, as_json=json_)
         if not watch:
             break
         time.sleep(WATCH_S)
@@ -276,8 +277,9 @@ def towns(
     """
     from infgen.sources.towns import write_towns  # noqa: PLC0415
 
-    words = {"split": split, "scenes_per_file": scenes_per_file}
-    for path in write_towns(out, scenes, seed, **words):
+    for path in write_towns(
+        out, scenes, seed, split=split, scenes_per_file=scenes_per_file
+    ):
         typer.echo(path)
 
 
@@ -294,7 +296,11 @@ def _run(
     with stopping.listening(), Screen() as screen:
         events = Events(request.root, (screen,))
         results = make(plan, orders, events)
-    _show_results(request, results, as_json=as_json, log=events.log)
+    if as_json:
+        log = str(events.log)
+        _print_json({"stages": [asdict(each) for each in results], "log": log})
+    else:
+        show_results(request.root, results, events.log)
     if any(result.errors for result in results):
         raise typer.Exit(FAILED)
     _check_quarantine(request, results, running.max_bad)
@@ -304,7 +310,14 @@ def _dry(
     request: Request, targets: Sequence[str], running: Running, *, as_json: bool
 ) -> None:
     found = _standings(request, targets, strict_code=running.strict_code)
-    _show_standings(found, as_json=as_json)
+    _tell_standings(found, as_json=as_json)
+
+
+def _tell_standings(found: Sequence[Standing], *, as_json: bool) -> None:
+    if as_json:
+        _print_json({"stages": [asdict(standing) for standing in found]})
+    else:
+        show_standings(found)
 
 
 def _standings(
@@ -312,44 +325,6 @@ def _standings(
 ) -> list[Standing]:
     plan = request.plan(targets, os.environ)
     return standings(plan, request.made(), strict_code=strict_code)
-
-
-def _show_standings(found: Sequence[Standing], *, as_json: bool) -> None:
-    if as_json:
-        _print_json({"stages": [asdict(standing) for standing in found]})
-        return
-    rows = [
-        (each.stage, each.state, each.progress, each.key[:KEY_DIGITS], each.why)
-        for each in found
-    ]
-    show_table("stages", ("stage", "state", "units", "key", "why"), rows)
-
-
-def _show_results(
-    request: Request, results: Sequence[Result], *, as_json: bool, log: Path
-) -> None:
-    if as_json:
-        _print_json({"stages": [asdict(each) for each in results], "log": str(log)})
-        return
-    rows = [
-        (each.stage, each.state, each.units, each.made, each.seconds, each.words)
-        for each in results
-    ]
-    columns = ("stage", "state", "units", "made now", "seconds", "figures")
-    show_table("run", columns, rows)
-    for result in results:
-        for unit, error in result.errors.items():
-            typer.echo(f"{result.stage}: {unit}: {error} (traceback in {log})", err=True)
-    _show_scores(request, results)
-
-
-def _show_scores(request: Request, results: Sequence[Result]) -> None:
-    made = [each for each in results if each.stage == "report" and not each.errors]
-    table = request.root.path / "report" / "table.json"
-    if made and made[0].state != "skipped" and table.is_file():
-        scores = read_json(table)
-        show_table("scores", scores["columns"], scores["rows"])
-        typer.echo(f"report: {request.root.path / 'report'}")
 
 
 def _check_quarantine(request: Request, results: Sequence[Result], max_bad: float) -> None:

@@ -19,7 +19,7 @@ from pipeline.work import Executor, InProcess, Outcome, Task, do, failure
 HELP = "none | local[:N] | gpu[:0,1] | tcp://HOST:PORT | file:scheduler.json"
 LOOPBACK = "127.0.0.1"  # Dask runs what anyone who connects sends it.
 RETRIES = 2
-RESUBMISSIONS = 2
+RESUBMISSIONS = 1
 TASKS_PER_THREAD = 2
 LOST_WORKER = {"distributed.deploy.lost-worker-timeout": "1 day"}
 """A worker that is just being restarted when this time is up is given up for good; with the
@@ -71,6 +71,7 @@ def _client(words: str) -> Iterator[Any]:
     kind, rest = parse(words)
     place = {"scheduler_file": rest} if kind == "file" else {"address": words}
     with ExitStack() as stack:
+        _dask()  # First: it adds to the settings that are put back in the end.
         stack.enter_context(import_module("dask").config.set(LOST_WORKER))
         if kind == "local":
             cluster = _local(int(rest or os.cpu_count() or 1))

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from infgen.views.published import CAVEAT, PAPER, Published
-from infgen.views.tables import Cell, Table
+from infgen.views.tables import Cell, Table, words
 
 COMPOSITES = {
     "composite": "composite",
@@ -79,7 +79,7 @@ def score_table(summary: Mapping[str, Any]) -> Table:
             "rollouts",
             "95 % interval",
             "log",
-            *(each.method for each in PAPER),
+            *(f"published {each.method}" for each in PAPER),
         ],
         rows=rows,
         note=_about(summary),
@@ -107,7 +107,7 @@ def long_term_table(summary: Mapping[str, Any], *, motion_only: bool) -> Table:
         ):
             ours = [_score(part["scores"], name, field, motion_only) for name in names]
             errors = [_entry(summary["numbers"], name, field) for name in _PAPER_ACE]
-            rows.append([words, *ours, *errors])
+            rows.append([label, *ours, *errors])
     columns = ["method", *[(FEATURES | BUCKETS).get(name, name) for name in names]]
     return Table(
         title=f"Beside the paper's table {number}",
@@ -176,7 +176,11 @@ def _entry(entries: Mapping[str, Any], name: str, field: str) -> float | None:
 def _cells(entry: Mapping[str, float | None]) -> list[Cell]:
     low, high = entry["low"], entry["high"]
     known = low is not None and high is not None
-    return [entry["mean"], f"{low:.4g} to {high:.4g}" if known else None, entry.get("log")]
+    return [
+        entry["mean"],
+        f"{words(low)} to {words(high)}" if known else None,
+        entry.get("log"),
+    ]
 
 
 def _published_ace(each: Published, name: str) -> float | None:
@@ -190,5 +194,5 @@ def _about(summary: Mapping[str, Any]) -> str:
         f"Means over {summary['scenes']} scenes ({summary['rollouts']} rollouts), windows "
         f"of {summary['window_s']:g} s every {summary['stride_s']:g} s; near means within "
         f"{summary['count_radius_m']:g} m of the ego. Reference: {summary['logs']} logs, "
-        "whose own scores are the ceiling to aim at. The last three columns: the paper."
+        "whose own scores are the ceiling to aim at. Published: by the paper."
     )

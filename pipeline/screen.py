@@ -20,10 +20,10 @@ QUIET_S = 10.0
 PLAIN_WIDTH = 160
 
 
-def console() -> Console:
-    """Standard output; as wide as a log may be where it is no terminal."""
-    plain = Console()
-    return plain if plain.is_terminal else Console(width=PLAIN_WIDTH)
+def console(*, stderr: bool = False) -> Console:
+    """Standard output (or error); as wide as a log may be where it is no terminal."""
+    plain = Console(stderr=stderr)
+    return plain if plain.is_terminal else Console(stderr=stderr, width=PLAIN_WIDTH)
 
 
 def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

@@ -14,7 +14,7 @@ import tarfile
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -42,6 +42,14 @@ MAX_HEAD_BYTES = 20
 _ROLLOUTS, _SCENARIO_ID, _JOINT = tag(1, BYTES), tag(1, BYTES), tag(2, BYTES)
 _TRAJECTORY, _OBJECT_ID = tag(1, BYTES), tag(6, VARINT)
 _AXES = {"center_x": 2, "center_y": 3, "center_z": 4, "heading": 5}
+
+
+@runtime_checkable
+class Readable(Protocol):
+    """A file, or a member of an archive."""
+
+    def read(self, size: int, /) -> bytes:
+        """Read up to so many bytes."""
 
 
 class Refused(NamedTuple):
@@ -97,7 +105,7 @@ def _read_members(
 
 
 def _read_file(
-    name: str, file: IO[bytes], size: int, num_rollouts: int
+    name: str, file: Readable, size: int, num_rollouts: int
 ) -> Iterator[Rollouts | Refused]:
     """Read one message, scene by scene."""
     found = 0
@@ -112,7 +120,7 @@ def _read_file(
         yield Refused(name, "holds no scenario_rollouts")
 
 
-def _scene_bytes(file: IO[bytes], size: int) -> Iterator[bytes]:
+def _scene_bytes(file: Readable, size: int) -> Iterator[bytes]:
     """Yield each ``ScenarioRollouts`` of a submission; a bare one is yielded whole.
 
     Raises:

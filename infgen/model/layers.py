@@ -218,7 +218,7 @@ class Attention(nn.Module):
         query = self.query(normal_NSD).view(*heads, width // self.heads)
         source, relation = self._folded()
         query = query * query.shape[-1] ** -0.5
-        hidden = (~seen.present)[:, :, None].expand(-1, -1, self.heads, -1).flatten(1, 2)
+        hidden = (~seen.present)[:, :, None].expand(*heads, -1).flatten(1, 2)
         looked = look_at_pairs(
             _per_head(query, source[0]),
             _per_head(query, relation[0]),

@@ -18,8 +18,8 @@ from infgen.model.outputs import (
     RoadOutputs,
 )
 from infgen.model.relations import Rows, relations
-from infgen.model.roads import RoadEncoder, RoadFeatures
-from infgen.model.sight import cell_pose, look_around, see_roads
+from infgen.model.roads import RoadEncoder
+from infgen.model.sight import RoadFeatures, cell_pose, look_around, see_roads
 from infgen.tokens.codebook import MotionCodebook, RoadCodebook
 from infgen.tokens.grid import Grid, make_grid
 
@@ -81,12 +81,13 @@ class Network(nn.Module):
             batch: The scenes.
             hidden_roads: Also predict hidden road tokens (a second pass over the maps).
         """
-        roads = self.roads(batch.roads)
+        sight = self.roads.look(batch.roads)
+        roads = self.roads(batch.roads, sight)
         agents = batch.agents
         rows = Rows.where(agents.visible)
         x = self.embed(_agent_rows(agents, rows), self.embed.tables())
         raw = normed(x)
-        hidden = self.roads.predict_hidden(batch.roads) if hidden_roads else None
+        hidden = self.roads.predict_hidden(batch.roads, sight) if hidden_roads else None
         return Outputs(
             motion=self._motion(agents, rows, x, roads),
             entries=self._entries(agents, batch.entries, rows, raw, roads),

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from infgen.model.layers import RelationEmbedding, Span
 
-BLOCK_PAIRS = 1 << 22
+BLOCK_PAIRS = 1 << 17
 """Distances held at once while neighbours are searched."""
 SQUARE_PER_M2 = 1024
 """Squared distances are compared in units of 1/1024 m2, so that rounding makes no order."""

@@ -8,27 +8,19 @@ from torch import Tensor, nn
 from infgen.config import ModelSettings
 from infgen.model.batch import Roads
 from infgen.model.layers import Attention, Seen, embedding_mlp, gather, mlp, normed
-from infgen.model.relations import Neighbours, Rows, nearest, relation_embedding, relations
+from infgen.model.relations import Rows, relation_embedding
+from infgen.model.sight import Around, Reach, RoadFeatures, look_around
 from infgen.tokens.codebook import RoadCodebook
 from infgen.tokens.roads import LineKind, PointKind
 from infgen.tokens.scene_tokens import SignalClass
 
 
 @dataclass(frozen=True, slots=True)
-class RoadFeatures:
-    """Encoded maps, one after the other.
-
-    Attributes:
-        rows: Which places of the padded maps they are.
-        features: Normed features [row, D].
-        pose: Poses of the padded maps [scene, road, 3].
-        real: Which places of the padded maps hold a road token [scene, road].
-    """
+class RoadSight:
+    """Who sees whom on the maps: the rows, and the neighbours of each."""
 
     rows: Rows
-    features: Tensor
-    pose: Tensor
-    real: Tensor
+    around: Around
 
 
 class RoadEncoder(nn.Module):
@@ -54,49 +46,44 @@ class RoadEncoder(nn.Module):
         )
         self.next_token = mlp(width, width, codebook.num_roads)
 
-    def forward(self, roads: Roads) -> RoadFeatures:
-        """Encode every road token."""
+    def look(self, roads: Roads) -> RoadSight:
+        """Find who sees whom on the maps."""
         rows = Rows.where(roads.real)
-        found = self._nearest(roads, roads.real)
-        encoded = normed(self._encode(roads, rows, found))
-        return RoadFeatures(rows, encoded, roads.pose, roads.real)
+        count = roads.real.shape[1]
+        others = ~torch.eye(count, dtype=torch.bool, device=roads.real.device)
+        allowed = roads.real[:, None] & others
+        reach = Reach.of(self.radius_m, self.neighbours, self.relation)
+        around = look_around(reach, rows, roads.pose, roads.pose, rows.number, allowed)
+        return RoadSight(rows, around)
 
-    def predict_hidden(self, roads: Roads) -> tuple[Tensor, Tensor]:
+    def forward(self, roads: Roads, sight: RoadSight) -> RoadFeatures:
+        """Encode every road token."""
+        encoded = self._encode(roads, sight, sight.around.present)
+        return RoadFeatures(sight.rows, normed(encoded), roads.pose, roads.real)
+
+    def predict_hidden(self, roads: Roads, sight: RoadSight) -> tuple[Tensor, Tensor]:
         """Predict hidden road tokens from their predecessors, which cannot see them.
 
-        A token is predicted if it is hidden and its predecessor is not. The hidden ones are
-        taken off the map altogether: in its relations a place alone would give them away.
+        A token is predicted if it is hidden and its predecessor is not. Nobody sees a
+        hidden token, not even its place: relations to it would give it away.
 
         Returns:
             Logits [prediction, token] and the true tokens [prediction].
         """
-        kept = roads.real & ~roads.picked
+        rows, around = sight.rows, sight.around
+        kept = ~rows.pack(roads.picked)
+        encoded = self._encode(roads, sight, around.present & kept[around.index])
         wanted = roads.real & roads.picked & roads.follows
-        wanted[:, 1:] &= kept[:, :-1]
-        rows = Rows.where(kept)
-        encoded = self._encode(roads, rows, self._nearest(roads, kept))
+        wanted[:, 1:] &= ~roads.picked[:, :-1]
         before = rows.number.roll(1, dims=1)[wanted]
         return self.next_token(encoded[before]), roads.token[wanted]
 
-    def _nearest(self, roads: Roads, real: Tensor) -> Neighbours:
-        """Find the neighbours of each road token, itself left out."""
-        count = real.shape[1]
-        others = ~torch.eye(count, dtype=torch.bool, device=real.device)
-        xy_m = roads.pose[..., :2]
-        allowed = real[:, None] & others
-        return nearest(xy_m, xy_m, allowed, self.radius_m, self.neighbours)
-
-    def _encode(self, roads: Roads, rows: Rows, found: Neighbours) -> Tensor:
-        """Features [row, D] of the road tokens that are rows."""
-        scene = torch.arange(len(roads.real), device=roads.real.device)
-        index = rows.pack(rows.number[scene[:, None, None], found.index])  # [row, K]
-        pose = rows.pack(roads.pose)
-        related = self.relation.look_up(relations(pose, pose[index]), self.relation.table())
-        present = rows.pack(found.present)
-
-        x = self._embed(roads, rows)
+    def _encode(self, roads: Roads, sight: RoadSight, present: Tensor) -> Tensor:
+        """Features [row, D] of all road tokens, given which neighbours they see."""
+        around = sight.around
+        x = self._embed(roads, sight.rows)
         for block in self.blocks:
-            x = block(x, Seen(gather(normed(x), index), related, present))
+            x = block(x, Seen(gather(normed(x), around.index), around.relation, present))
         return x
 
     def _embed(self, roads: Roads, rows: Rows) -> Tensor:

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from infgen.model.layers import RelationEmbedding, Seen, gather
 from infgen.model.relations import Rows, nearest, relations
-from infgen.model.roads import RoadFeatures
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +56,23 @@ class Around:
     def seen(self, features: Tensor) -> Seen:
         """Join with the features of all rows [row, D]."""
         return Seen(gather(features, self.index), self.relation, self.present)
+
+
+@dataclass(frozen=True, slots=True)
+class RoadFeatures:
+    """Encoded maps, one after the other.
+
+    Attributes:
+        rows: Which places of the padded maps they are.
+        features: Normed features [row, D].
+        pose: Poses of the padded maps [scene, road, 3].
+        real: Which places of the padded maps hold a road token [scene, road].
+    """
+
+    rows: Rows
+    features: Tensor
+    pose: Tensor
+    real: Tensor
 
 
 def look_around(

@@ -31,8 +31,7 @@ from infgen.model.batch import Roads
 from infgen.model.layers import Seen, normed
 from infgen.model.network import EGO, Network
 from infgen.model.relations import Rows, relations, within_radius
-from infgen.model.roads import RoadFeatures
-from infgen.model.sight import cell_pose, look_around, see_roads
+from infgen.model.sight import RoadFeatures, cell_pose, look_around, see_roads
 from infgen.tokens.scene_tokens import Presence
 
 
@@ -200,7 +199,7 @@ class Stepper:
         pose = torch.zeros((*shape, 3), device=scene.device)
         features = pose.new_zeros((settings.motion_blocks, *shape, settings.width))
         return Memory(
-            roads=self.network.roads(roads),
+            roads=self.network.roads(roads, self.network.roads.look(roads)),
             scene=scene,
             columns=0,
             pose=pose,

@@ -18,9 +18,6 @@ from jaxtyping import Bool, Int64, UInt8
 from infgen.sources import wire
 from infgen.sources.wire import BYTES, FIXED32, FIXED64, VARINT, Field, Spans, WireError
 
-MAX_MESSAGES = 4_000_000
-"""Points of one record; the largest real record has about 100,000."""
-
 _MAX_LAYOUTS = 32
 _DECIDES = {VARINT: 0x80, FIXED32: 0, FIXED64: 0, BYTES: 0}
 """Bits of a value's bytes, by wire type, that decide where the next field starts."""
@@ -49,15 +46,7 @@ class Messages:
 
 
 def messages(spans: Spans) -> Messages:
-    """Spell out runs of messages.
-
-    Raises:
-        WireError: if there are more than any real record holds.
-    """
-    if spans.total > MAX_MESSAGES:
-        raise WireError(
-            f"record holds {spans.total} points or states, more than {MAX_MESSAGES}"
-        )
+    """Spell out runs of messages."""
     first, size, count = spans.runs().T
     within = np.arange(spans.total) - np.repeat(np.cumsum(count) - count, count)
     start = np.repeat(first, count) + np.repeat(size + 2, count) * within

@@ -21,6 +21,11 @@ _MAX_TAG = 1 << 32
 _MAX_DEPTH = 100
 _MAX_RUN = 512
 
+MAX_MESSAGES = 4_000_000
+"""Points or states of one record; the largest real record has about 100,000."""
+MAX_FIELDS = 500_000
+"""Other fields of one message, or values of a repeated one. Real ones have thousands."""
+
 
 class WireError(ValueError):
     """Bytes that are no protobuf message."""
@@ -60,9 +65,15 @@ class Spans:
         self.total = 0
 
     def add(self, first: int, size: int, count: int = 1) -> None:
-        """Append so many messages of ``size`` bytes, two header bytes before each."""
+        """Append so many messages of ``size`` bytes, two header bytes before each.
+
+        Raises:
+            WireError: if there are more than any real record holds.
+        """
         self._runs.extend((first, size, count))
         self.total += count
+        if self.total > MAX_MESSAGES:
+            raise WireError(f"record holds more than {MAX_MESSAGES} points or states")
 
     def runs(self) -> Int64[np.ndarray, "run 3"]:
         """Start of the first message, size of each and number of messages of all runs."""
@@ -147,12 +158,12 @@ def split(data: bytes, start: int, end: int, repeated: int, spans: Spans) -> lis
         All other fields.
 
     Raises:
-        WireError: if the message is not sound.
+        WireError: if the message is not sound, or holds more than any real one.
     """
-    others = []
+    others: list[Field] = []
     at = start
     try:
-        while at < end:
+        while at < end and len(others) < MAX_FIELDS:
             key, low = data[at], data[at + 1]
             kind = key & 7 if 7 < key < 0x80 and low < 0x80 else GROUP
             if kind == VARINT:
@@ -172,6 +183,8 @@ def split(data: bytes, start: int, end: int, repeated: int, spans: Spans) -> lis
                 at += 2 + low
     except IndexError:
         at = end + 1
+    if at < end:
+        raise WireError(f"message at byte {start} holds more than {MAX_FIELDS} fields")
     if at > end:
         raise WireError(f"message at byte {start} runs past its end")
     return others
@@ -226,6 +239,8 @@ def varints(data: bytes, fields: Sequence[Field], number: int) -> list[int]:
             while at < field.end:
                 value, at = read_varint(data, at, field.end)
                 values.append(signed(value))
+                if len(values) > MAX_FIELDS:
+                    raise WireError(f"field {number} has more than {MAX_FIELDS} values")
     return values
 
 

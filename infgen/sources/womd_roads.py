@@ -65,6 +65,12 @@ class _Tables:
         self.sign: list[tuple[int, int]] = []
         self.point_spans, self.boundary_spans = Spans(), Spans()
 
+    def check_size(self) -> None:
+        """Refuse a map with more relations than any real one, while memory lasts."""
+        total = len(self.link) + len(self.neighbour) + len(self.boundary) + len(self.sign)
+        if total > wire.MAX_FIELDS:
+            raise RecordError(f"map has more than {wire.MAX_FIELDS} relations")
+
 
 def read_road_map(
     data: bytes, features: Sequence[Field], origin_xyz_m: Float64[np.ndarray, "3"]
@@ -81,6 +87,7 @@ def read_road_map(
     tables = _Tables()
     for feature in features:
         _read_feature(data, feature, tables)
+        tables.check_size()
     ids, kinds, types, speeds, interpolating, starts = _columns(tables.feature, 6)
     offsets = np.array([*starts, tables.point_spans.total], np.int64)
     road_map = RoadMap(

@@ -63,7 +63,8 @@ class RoadCodebook:
     """The shapes that a road token may have.
 
     Attributes:
-        curve_m: Points every 0.5 m; the first at the origin, the first interval along +x.
+        curve_m: Eleven points, evenly spaced along the shape (by 0.5 m in a whole piece,
+            less in one cut short); the first at the origin, the first interval along +x.
         real: Whether a shape is the mean of logged lines; False for a mirrored or made one.
     """
 

@@ -53,11 +53,11 @@ def fan(
 
 
 def _with_strolls(path: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Add slow moves in all directions, whatever way a pedestrian faces."""
+    """Add slow moves aside, whatever way a pedestrian faces."""
     slow = np.hypot(path[:, -1, 0], path[:, -1, 1]) <= STROLL_MPS * CLOCK.token_s
     slow &= path[:, -1, 0] > 0
     paths, efforts = [path], [effort]
-    for eighths in (1, -1, 2, -2, 3, -3, 4):
+    for eighths in (1, -1, 2, -2, 3, -3):
         aside = path[slow]
         turn_rad = np.full(aside.shape[:2], eighths * np.pi / 4)
         xy_m = rotate(aside[..., :2].astype(np.float64), turn_rad)

@@ -11,13 +11,13 @@ from html import escape
 import numpy as np
 from jaxtyping import Float
 
-WIDTH_PX, HEIGHT_PX = 520, 300
+WIDTH_PX, HEIGHT_PX = 520.0, 300.0
 NUM_COLOURS = 6
 """Colours that a page defines: classes ``c0`` and so on."""
-_LEFT_PX, _RIGHT_PX, _TOP_PX, _BOTTOM_PX = 58, 14, 34, 66
-_LEGEND_ENTRY_PX = 150
-_ROW_PX = 22
-_LABELS_PX = 190
+_LEFT_PX, _RIGHT_PX, _TOP_PX, _BOTTOM_PX = 58.0, 14.0, 34.0, 66.0
+_LEGEND_ENTRY_PX = 150.0
+_ROW_PX = 22.0
+_LABELS_PX = 190.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +115,9 @@ def interval_chart(
     key_px = bottom_px + 52
     parts += [
         _text((_LABELS_PX + WIDTH_PX) / 2, bottom_px + 32, x_label, "middle"),
-        f'<circle class="c0 dot" cx="{_LABELS_PX}" cy="{key_px - 4:g}" r="4"/>',
+        f'<circle class="c0 dot" cx="{_LABELS_PX:g}" cy="{key_px - 4:g}" r="4"/>',
         _text(_LABELS_PX + 10, key_px, "rollouts, 95 % interval"),
-        f'<circle class="c1 ring" cx="{_LABELS_PX + 175}" cy="{key_px - 4:g}" r="4"/>',
+        f'<circle class="c1 ring" cx="{_LABELS_PX + 175:g}" cy="{key_px - 4:g}" r="4"/>',
         _text(_LABELS_PX + 185, key_px, reference),
     ]
     return _svg(WIDTH_PX, height, title, parts)
@@ -203,7 +203,7 @@ def _interval(row: Interval, y_px: float, axis: _Axis) -> str:
 
 
 def _legend_columns() -> int:
-    return (WIDTH_PX - _LEFT_PX) // _LEGEND_ENTRY_PX
+    return int((WIDTH_PX - _LEFT_PX) // _LEGEND_ENTRY_PX)
 
 
 def _legend(name: str, at: int, y_px: float) -> str:

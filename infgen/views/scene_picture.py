@@ -174,7 +174,7 @@ def _agents(moment: _Moment) -> str:
     )
 
 
-def _legend(y_px: float) -> str:
+def _legend(y_px: int) -> str:
     parts = []
     for at, (look, words) in enumerate(_LEGEND.items()):
         x_px = 4 + 170 * at

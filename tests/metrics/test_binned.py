@@ -79,8 +79,8 @@ def test_the_papers_boxes_replace_those_of_simulated_agents_only(parked):
     assert not (bins(crashed, "collision_indication", PAPER) == 1).any()
 
 
-def _longer(tracks: Tracks, by_m: float) -> Tracks:
-    return replace(tracks, size_lwh_m=tracks.size_lwh_m + np.float32([by_m, 0, 0]))
+def _longer(tracks: Tracks, by_m: float, wider_m: float = 0.0) -> Tracks:
+    return replace(tracks, size_lwh_m=tracks.size_lwh_m + np.float32([by_m, wider_m, 0]))
 
 
 def test_a_scene_without_road_edges_has_no_map_values(drive, build_map):
@@ -132,7 +132,8 @@ def test_a_row_has_every_number_by_name(crossing, against):
     for protocol in PROTOCOLS:
         for name in ("composite", "kinematic", "placement", "entry_distance"):
             assert 0 < row.numbers[f"{protocol.name}/{name}"] <= 1
-        assert row.numbers[f"{protocol.name}/collision_rate"] == 0
+        # Ego and pedestrian meet on the crosswalk, the cyclist passes close by.
+        assert 0 < row.numbers[f"{protocol.name}/collision_rate"] < 1
     assert row.numbers["ace/own_near"] == 0
     assert row.numbers["agents/all"] == pytest.approx(1 + (61 + 50) / 80)
     assert row.numbers["ace/split_all"] == pytest.approx(3 - 1 - 111 / 80)
@@ -161,6 +162,8 @@ def test_a_rollout_whose_log_is_not_known_has_no_count_error(crossing, against):
 
 def test_turning_and_moving_the_scene_changes_no_score(crossing, against):
     scene = crossing(speed_mps=9.3)
+    # Boxes of 2 m, 3 m from the edge, stand on the edge of a bin.
+    scene = replace(scene, tracks=_longer(scene.tracks, 0.0, wider_m=0.3))
     turned = _turned(scene, 0.6, (40.0, -30.0))
 
     one, two = (

@@ -106,7 +106,8 @@ def test_newcomers_take_turns_from_near_to_far(record, limits):
 def test_all_others_have_no_turn_and_those_outside_the_grid_an_endless_one(record, limits):
     scene = record(8, tokens=4, lives=[(0, 3), (2, 3)], spread_m=20.0)
     far = replace(
-        scene, entry_cell=np.where(scene.entry_agent == 2, -1, scene.entry_cell).astype("i2")
+        scene,
+        entry_cell=np.where(scene.entry_agent == 2, -1, scene.entry_cell).astype("i2"),
     )
 
     turn = collate([far], limits, 0).agents.turn[0]
@@ -128,7 +129,9 @@ def test_details_decode_to_where_the_agent_is(record, limits, grid_settings):
         in_grid_m = decode_cell(np.asarray(cell), grid) + details.offset_m[0, row].numpy()
         pose = agents.pose[0, token, agent].numpy()
         np.testing.assert_allclose(from_grid(in_grid_m, ego_pose), pose[:2], atol=1e-3)
-        turned_rad = pose[2] - ego_pose[2] - grid.heading_centre_rad[details.heading[0, row]]
+        turned_rad = (
+            pose[2] - ego_pose[2] - grid.heading_centre_rad[details.heading[0, row]]
+        )
         assert abs((turned_rad + np.pi) % (2 * np.pi) - np.pi) < np.radians(5.001)
 
 
@@ -150,7 +153,9 @@ def test_equal_draws_make_equal_batches_and_others_others(record, limits):
     scenes = [record(3, agents=12, tokens=9), record(4)]
 
     same = zip(
-        tensors(collate(scenes, limits, 7)), tensors(collate(scenes, limits, 7)), strict=True
+        tensors(collate(scenes, limits, 7)),
+        tensors(collate(scenes, limits, 7)),
+        strict=True,
     )
     other = collate(scenes, limits, 8)
 

@@ -130,9 +130,7 @@ def test_newcomers_outside_the_grid_are_not_asked_for(network, record, limits, s
     assert float(terms["cell"].count) == 0
 
 
-def test_the_first_move_of_a_newcomer_counts_three_times(
-    network, record, limits, settings
-):
+def test_the_first_move_of_a_newcomer_counts_three_times(network, record, limits, settings):
     scene = record(8, tokens=4, lives=[(2, 3)])
 
     with torch.no_grad():
@@ -206,9 +204,7 @@ def test_figures_name_every_term_with_its_count(network, record, limits, setting
     )
 
 
-def test_the_total_weighs_every_term_as_the_settings_say(
-    network, record, limits, settings
-):
+def test_the_total_weighs_every_term_as_the_settings_say(network, record, limits, settings):
     _, _, terms = terms_of(network, [record(3)], limits, settings)
 
     weights = {name: getattr(settings, f"{name}_weight") for name in terms}

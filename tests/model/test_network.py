@@ -195,8 +195,9 @@ def test_hidden_road_tokens_are_not_seen(network, record, limits):
     token = torch.where(roads.picked, (roads.token + 1) % 12, roads.token)
     pose = torch.where(roads.picked[..., None], roads.pose + 0.5, roads.pose)
 
+    hidden = replace(roads, token=token, pose=pose)
     with torch.no_grad():
-        logits, _ = network.roads.predict_hidden(replace(roads, token=token, pose=pose))
+        logits, _ = network.roads.predict_hidden(hidden, network.roads.look(roads))
 
     assert len(logits) > 3
     assert torch.equal(logits, before.roads.logits)

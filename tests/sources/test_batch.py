@@ -129,14 +129,6 @@ def test_runs_are_spelled_out_in_order():
     assert rows.size.tolist() == [5, 5, 5, 200, 0, 0]
 
 
-def test_more_messages_than_any_record_holds_are_refused():
-    spans = wire.Spans()
-    spans.add(2, 0, batch.MAX_MESSAGES + 1)
-
-    with pytest.raises(wire.WireError, match="more than 4000000"):
-        messages(spans)
-
-
 def test_no_messages_are_no_rows():
     rows = messages(wire.Spans())
 

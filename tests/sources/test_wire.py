@@ -162,3 +162,19 @@ def test_unknown_enum_values_do_not_count():
 
     assert wire.last_enum(walk(data), 8, largest=8) == 5
     assert wire.last_enum(walk(b"\x08\x63"), 8, largest=8) == 0
+
+
+def test_more_messages_than_any_record_holds_are_refused():
+    with pytest.raises(wire.WireError, match="more than 4000000 points or states"):
+        wire.Spans().add(2, 0, wire.MAX_MESSAGES + 1)
+
+
+def test_more_fields_than_any_message_holds_are_refused(monkeypatch):
+    monkeypatch.setattr(wire, "MAX_FIELDS", 10)
+    walk(b"\x08\x01" * 10)
+
+    with pytest.raises(wire.WireError, match="holds more than 10 fields"):
+        walk(b"\x08\x01" * 11)
+    packed = field_bytes(9, BYTES, b"\x01" * 11)
+    with pytest.raises(wire.WireError, match="field 9 has more than 10 values"):
+        wire.varints(packed, walk(packed), 9)

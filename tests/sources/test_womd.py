@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from infgen.scene import AgentKind, FeatureKind, LinkKind, Scene, Side, SignalState
+from infgen.sources import wire
 from infgen.sources.tfrecord import BadRecord, RecordError
 from infgen.sources.womd import decode_scene, iter_scenes, world_xyz_m
 from tests.sources.oracle import expected_scene
@@ -431,3 +432,16 @@ def test_any_sound_record_is_read_as_protobuf_reads_it(message):
     found = decode_scene(message.SerializeToString())
 
     assert differences(found, expected_scene(message)) == []
+
+
+def test_more_relations_than_any_map_holds_are_refused(monkeypatch):
+    monkeypatch.setattr(wire, "MAX_FIELDS", 60)
+
+    def change(message):
+        for i in range(12):
+            lane = message.map_features.add(id=1000 + i).lane
+            lane.polyline.add(x=1000.0 + i)
+            lane.entry_lanes.extend(range(5))
+
+    with pytest.raises(RecordError, match="map has more than 60 relations"):
+        scene_of(change)

@@ -1,0 +1,27 @@
+"""Real driving logs where they are at hand, else the built-in ones."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from infgen.scene import Scene
+from infgen.sources.womd import iter_scenes
+
+ROOT = Path(__file__).parents[1]
+SHARED = ROOT.parent / "shared" / "data" / "womd"
+BUILT_IN = ROOT / "infgen" / "sources" / "towns" / "records"
+
+
+def read_split(split: str) -> Iterator[Scene]:
+    """Stream the scenes of one split; records that are broken are passed over.
+
+    Raises:
+        FileNotFoundError: if neither place has the split.
+    """
+    folder = SHARED if SHARED.is_dir() else BUILT_IN
+    paths = sorted(folder.glob(f"{split}.tfrecord*"))
+    if not paths:
+        raise FileNotFoundError(f"no {split}.tfrecord* in {SHARED} or {BUILT_IN}")
+    for path in paths:
+        for found in iter_scenes(path):
+            if isinstance(found, Scene):
+                yield found

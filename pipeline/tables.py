@@ -1,0 +1,50 @@
+"""What is printed of stages: how they stand, what became of them, and their scores."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.root import KEY_DIGITS, Root, read_json
+from pipeline.runner import Result
+from pipeline.screen import console, show_table
+from pipeline.status import Standing
+
+SCORES = "table.json"
+"""In the report's folder: ``{"columns": [...], "rows": [[...]]}``."""
+
+
+def show_standings(found: Sequence[Standing]) -> None:
+    """Print how stages stand."""
+    rows = [
+        (each.stage, each.state, each.progress, each.key[:KEY_DIGITS], each.why)
+        for each in found
+    ]
+    show_table("stages", ("stage", "state", "units", "key", "why"), rows)
+
+
+def show_results(root: Root, results: Sequence[Result], log: Path) -> None:
+    """Print what became of stages, what failed and why, and the scores if there are any."""
+    rows = [
+        (each.stage, each.state, each.units, each.made, each.seconds, each.words)
+        for each in results
+    ]
+    columns = ("stage", "state", "units", "made now", "seconds", "figures")
+    show_table("run", columns, rows)
+    errors = [
+        f"{result.stage}: {unit}: {error}"
+        for result in results
+        for unit, error in result.errors.items()
+    ]
+    for line in errors:
+        console(stderr=True).print(line, markup=False, highlight=False, soft_wrap=True)
+    if errors:
+        console(stderr=True).print(f"tracebacks are in {log}", soft_wrap=True)
+    _show_scores(root, results)
+
+
+def _show_scores(root: Root, results: Sequence[Result]) -> None:
+    whole = [each for each in results if each.state in ("made", "cached")]
+    table = root.path / "report" / SCORES
+    if any(each.stage == "report" for each in whole) and table.is_file():
+        scores = read_json(table)
+        show_table("scores", scores["columns"], scores["rows"])
+        console().print(f"report: {root.path / 'report'}", soft_wrap=True)
