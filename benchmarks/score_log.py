@@ -161,7 +161,7 @@ def print_table(columns: Mapping[str, Mapping[str, float]], names: Sequence[str]
     print("|---|" + "---:|" * len(columns))
     for name in names:
         cells = (f"{column.get(name, np.nan):.4f}" for column in columns.values())
-        print(f"| {name} | " + " | ".join(cells).replace("nan", "–") + " |")
+        print(f"| {name} | " + " | ".join(cells).replace("nan", "-") + " |")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

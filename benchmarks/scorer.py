@@ -87,7 +87,7 @@ def time_features(log: LoggedScene, future: Rollouts) -> dict[str, float]:
 
 def fit(logs: Sequence[LoggedScene], seconds: np.ndarray) -> dict[str, float]:
     """Milliseconds per agent, evaluated agent and thousand map points, by least squares."""
-    columns = {
+    columns: dict[str, list[float]] = {
         "agent": [len(log.sim_rows) for log in logs],
         "evaluated agent": [len(log.evaluated) for log in logs],
         "1000 road-edge points": [len(log.edge_m) / 1000 for log in logs],

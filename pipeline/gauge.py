@@ -7,6 +7,8 @@ from typing import Any
 
 from pipeline.events import Event
 
+LONGEST_WORD = 36
+
 
 @dataclass
 class Gauge:
@@ -127,4 +129,5 @@ def figures(report: dict[str, Any], most: int = 6) -> str:
 
 
 def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    text = f"{value:.4g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= LONGEST_WORD else f"{text[: LONGEST_WORD - 3]}..."

@@ -101,7 +101,7 @@ def long_term_table(summary: Mapping[str, Any], *, motion_only: bool) -> Table:
         ace: list[Cell] = [None, None] if motion_only else [each.mean_ace, each.ace_slope]
         rows.append([f"{each.method}, published", *[found[name] for name in names], *ace])
     for protocol, part in summary["protocols"].items():
-        for words, field in (
+        for label, field in (
             (f"ours ({protocol})", "mean"),
             (f"the log ({protocol})", "log"),
         ):

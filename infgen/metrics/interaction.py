@@ -66,36 +66,34 @@ def quad_distance_m(
 ) -> Float32[np.ndarray, " pair"]:
     """Signed distance between convex quadrilaterals (corners counter-clockwise).
 
-    It is the distance from the origin to the octagon of all differences of their points;
-    each of its sides is a side of one, carried to the other's corner that reaches farthest.
+    Apart, some corner of one is nearest to some side of the other. Overlapping, it is
+    minus the way to part them: across the side that separates them best.
     """
-    to_a_m, outside_a = _side_distances_m(a_m, b_m)
-    to_b_m, outside_b = _side_distances_m(b_m, a_m)
-    distance_m = np.minimum(to_a_m, to_b_m)
-    return np.where(outside_a | outside_b, distance_m, -distance_m)
+    apart_a_m, between_a_m = _from_sides(a_m, b_m)
+    apart_b_m, between_b_m = _from_sides(b_m, a_m)
+    apart_m = np.maximum(apart_a_m, apart_b_m)
+    return np.where(apart_m > 0, np.minimum(between_a_m, between_b_m), apart_m)
 
 
-def _side_distances_m(
-    own_m: np.ndarray, other_m: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest octagon side that stems from ``own``, and whether any of them separates."""
+def _from_sides(own_m: np.ndarray, other_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far all of ``other`` is beyond a side of ``own``, and its corners from the sides.
+
+    Beyond the best side [pair], negative if none separates; and the nearest corner [pair].
+    """
+    beyond_m = np.full(own_m.shape[2], -np.inf, dtype=np.float32)
     nearest_m2 = np.full(own_m.shape[2], np.inf, dtype=np.float32)
-    outside = np.zeros(own_m.shape[2], dtype=bool)
     for side in range(4):
-        start_x, start_y = own_m[:, side]
+        x, y = own_m[:, side]
         along_x, along_y = own_m[:, (side + 1) % 4] - own_m[:, side]
-        to_x, to_y = other_m[0] - start_x, other_m[1] - start_y  # [corner, pair]
-        beyond = along_y * to_x - along_x * to_y  # along the outward normal
-        corner = beyond.argmin(axis=0)[None]
-        x = np.take_along_axis(to_x, corner, axis=0)[0]
-        y = np.take_along_axis(to_y, corner, axis=0)[0]
-        length_m2 = along_x**2 + along_y**2
-        share = (x * along_x + y * along_y) / np.where(length_m2 > 0, length_m2, 1)
-        share = np.clip(share, 0, 1)
+        length_m2 = along_x * along_x + along_y * along_y
+        length_m2 = np.where(length_m2 > 0, length_m2, np.float32(1))
+        x, y = other_m[0] - x, other_m[1] - y  # [corner, pair]
+        outward = (along_y * x - along_x * y).min(axis=0) / np.sqrt(length_m2)
+        beyond_m = np.maximum(beyond_m, outward)
+        share = np.clip((x * along_x + y * along_y) / length_m2, 0, 1)
         gap_m2 = (x - share * along_x) ** 2 + (y - share * along_y) ** 2
-        nearest_m2 = np.minimum(nearest_m2, gap_m2)
-        outside |= np.take_along_axis(beyond, corner, axis=0)[0] > 0
-    return np.sqrt(nearest_m2), outside
+        nearest_m2 = np.minimum(nearest_m2, gap_m2.min(axis=0))
+    return beyond_m, np.sqrt(nearest_m2)
 
 
 def time_to_collision_s(

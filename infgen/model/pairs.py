@@ -47,7 +47,8 @@ def look_at_pairs(
         hidden: Which neighbours there are not [N, Q, K].
         kept: Factor on each weight for dropout [N, Q, K], or None.
     """
-    return Looked(*_Pairs.apply(by_features, by_relation, features, relation, hidden, kept))
+    pairs = (by_features, by_relation, features, relation, hidden, kept)
+    return Looked(*_Pairs.apply(*pairs))  # type: ignore[no-untyped-call]
 
 
 class _Pairs(torch.autograd.Function):

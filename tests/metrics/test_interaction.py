@@ -152,6 +152,28 @@ def test_the_distance_of_squares_is_known_by_hand():
     assert quad_distance_m(square, inside)[0] == pytest.approx(-1.5)
 
 
+@pytest.mark.parametrize("turn_rad", [0.0, 1e-7, 8e-5, np.pi])
+@pytest.mark.parametrize(
+    "spot_m", [(0.12, 0.1), (1.5, 0.3), (2.9, 0.5), (2.0, 4.0), (6.0, 1.0)]
+)
+def test_sides_that_are_parallel_or_almost_hide_nothing(spot_m, turn_rad):
+    # Far from the world's zero, where a corner is rounded to half a millimetre.
+    along, aside = spot_m
+    cos, sin = np.cos(1.0), np.sin(1.0)
+    other = (-7798.0 + cos * along - sin * aside, -6676.0 + sin * along + cos * aside)
+    found = distance_m(
+        (-7798.0, -6676.0, 1.0, 0),
+        (*other, 1.0 + turn_rad, 0),
+        size_lwh_m=(4.3, 1.8, 1.5),
+    )
+
+    # Corners are rounded by 0.63 m, so the cores are 3.04 m by 0.54 m; of two parallel ones
+    # the differences fill a rectangle of twice that.
+    outside = np.array([along - 3.04, aside - 0.54])
+    gap = np.hypot(*np.maximum(outside, 0)) + min(outside.max(), 0.0)
+    np.testing.assert_allclose(found, gap - 2 * 0.63, atol=2e-3)
+
+
 def test_a_stopped_car_ahead_is_met_after_the_gap_over_the_speed():
     # At step k the gap is 34 - 4 - k metres, closing at 10 m/s.
     found = ttc_s((0, 0, 0, 10), (34, 0, 0, 0))

@@ -30,7 +30,7 @@ def play(network, batch, records):
     stepper = Stepper(network)
     scenes = len(records)
     rows = batch.agents.kind.shape[1]
-    memory = stepper.begin(collate_roads(records, 1000), torch.arange(scenes), rows)
+    memory = stepper.begin(collate_roads(records, 10_000), torch.arange(scenes), rows)
     motion, queries, details = [], {}, {}
     slots = batch.entries.agent.shape[2]
     for token in range(batch.agents.pose.shape[1]):

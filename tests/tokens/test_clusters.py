@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from infgen.config import VocabSettings
+from infgen.config import ConfigError, VocabSettings
 from infgen.scene import AgentKind
 from infgen.tokens.arcs import line_arcs
 from infgen.tokens.clusters import (
@@ -201,3 +201,24 @@ def test_arcs_of_lines_begin_straight_and_lie_along_x():
     lengths = np.linalg.norm(np.diff(curve, axis=1), axis=-1)
     assert (lengths.max(axis=1) - lengths.min(axis=1)).max() < 1e-5
     assert lengths.sum(axis=1).max() == pytest.approx(5.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("tolerance_m", 0.0), ("num_moves", 1), ("num_roads", 40_000), ("max_accel_mps2", -1.0)],
+)
+def test_settings_that_no_codebook_can_be_made_with_are_refused(name, value):
+    with pytest.raises(ConfigError, match=f"build-vocab.{name} is {value}; expected"):
+        dataclasses.replace(SETTINGS, **{name: value})
+
+
+def test_slow_kinds_still_get_whole_codebooks():
+    settings = dataclasses.replace(
+        SETTINGS,
+        pedestrian_max_speed_mps=1.0,
+        max_yaw_rate_rad_s=0.1,
+        max_accel_mps2=1.0,
+    )
+    codebook, _ = cluster_moves(NO_SEGMENTS, settings)
+    for kind in KINDS:
+        assert within(codebook.path[kind], kind, limits_of(settings)).all()
