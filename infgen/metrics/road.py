@@ -56,20 +56,18 @@ def build_edges(polylines_m: Sequence[Float32[np.ndarray, "_ 3"]]) -> RoadEdges:
     if not lines_m:
         raise RoadError("the map has no road edge of two or more points")
     longest = max(len(line_m) for line_m in lines_m)
-    starts, alongs, befores, afters, first = [], [], [], [], 0
+    starts, alongs, neighbours, first = [], [], [], 0
     for line_m in lines_m:
         stretched_m = line_m * np.array([1, 1, STRETCH_Z], dtype=np.float32)
         starts.append(stretched_m[:-1])
         alongs.append(stretched_m[1:] - stretched_m[:-1])
-        before, after = _neighbours(line_m, first, closable=len(line_m) == longest)
-        befores.append(before)
-        afters.append(after)
+        neighbours.append(_neighbours(line_m, first, closable=len(line_m) == longest))
         first += len(line_m) - 1
     return RoadEdges(
         start_m=np.concatenate(starts),
         along_m=np.concatenate(alongs),
-        before=np.concatenate(befores),
-        after=np.concatenate(afters),
+        before=np.concatenate([before for before, _ in neighbours]),
+        after=np.concatenate([after for _, after in neighbours]),
     )
 
 

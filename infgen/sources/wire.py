@@ -164,27 +164,24 @@ def split(data: bytes, start: int, end: int, repeated: int, spans: Spans) -> lis
     at = start
     try:
         while at < end and len(others) < MAX_FIELDS:
-            key, low, body = data[at], data[at + 1], at + 2
-            # Tags of one byte, with values and lengths of one or two, are read in place.
-            kind = key & 7 if 7 < key < 0x80 else GROUP
-            if key == repeated and low < 0x80:
-                at = _pass_run(data, at, end, low, spans)
-                continue
-            if low > 0x7F and (high := data[body]) < 0x80:
-                low, body = low & 0x7F | high << 7, body + 1
-            elif low > 0x7F:
-                kind = GROUP
+            key, low = data[at], data[at + 1]
+            # One-byte tags with one-byte values or lengths are read in place.
+            kind = key & 7 if 7 < key < 0x80 and low < 0x80 else GROUP
             if kind == VARINT:
-                field = _new_field((key, low, at + 1, body))
-            elif kind == BYTES:
-                field = _new_field((key, 0, body, body + low))
-            else:
+                others.append(_new_field((key, low, at + 1, at + 2)))
+                at += 2
+            elif kind != BYTES:
                 field = read_field(data, at, end)
-            at = field.end
-            if field.tag == repeated:
-                spans.add(field.start, at - field.start)
+                at = field.end
+                if field.tag == repeated:
+                    spans.add(field.start, field.end - field.start)
+                else:
+                    others.append(field)
+            elif key == repeated:
+                at = _pass_run(data, at, end, low, spans)
             else:
-                others.append(field)
+                others.append(_new_field((key, 0, at + 2, at + 2 + low)))
+                at += 2 + low
     except IndexError:
         at = end + 1
     if at < end:

@@ -205,7 +205,12 @@ def test_arcs_of_lines_begin_straight_and_lie_along_x():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("tolerance_m", 0.0), ("num_moves", 1), ("num_roads", 40_000), ("max_accel_mps2", -1.0)],
+    [
+        ("tolerance_m", 0.0),
+        ("num_moves", 1),
+        ("num_roads", 40_000),
+        ("max_accel_mps2", -1.0),
+    ],
 )
 def test_settings_that_no_codebook_can_be_made_with_are_refused(name, value):
     with pytest.raises(ConfigError, match=f"build-vocab.{name} is {value}; expected"):
