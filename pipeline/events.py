@@ -14,7 +14,8 @@ Event = Mapping[str, Any]
 
 ``run-started``, ``stage-cached``, ``stage-started`` (units, made), ``unit-done``,
 ``unit-failed`` (error, trace), ``finish-started``, ``progress`` (done, total, note; not
-logged), ``stage-done`` (report), ``stage-failed``, ``stage-skipped``, ``run-ended``.
+logged), ``stage-done`` (report), ``stage-failed``, ``stage-skipped``,
+``run-ended`` or ``run-stopped`` (why).
 """
 
 

@@ -21,7 +21,7 @@ from pipeline.events import Events
 from pipeline.folders import PARTIAL, publish, write_json
 from pipeline.gauge import figures
 from pipeline.inputs import FinishedInputs, units_of
-from pipeline.locks import locked
+from pipeline.locks import LockedError, locked
 from pipeline.manifest import (
     Run,
     code_hash,
@@ -101,6 +101,17 @@ def run(plan: Plan, orders: Orders, events: Events) -> list[Result]:
         StoreError: if what a stage should read is damaged.
     """
     events.emit("run-started", stages=list(plan.stages), workers=orders.workers)
+    try:
+        results = _make_all(plan, orders, events)
+    except (stopping.Stopped, LockedError) as error:
+        events.emit("run-stopped", why=str(error))
+        raise
+    failed = [result.stage for result in results if result.state == "failed"]
+    events.emit("run-ended", failed=failed)
+    return results
+
+
+def _make_all(plan: Plan, orders: Orders, events: Events) -> list[Result]:
     force = plan.after(orders.force | _made_by_other_code(plan, orders))
     results: list[Result] = []
     with Workers(orders.workers) as workers:
@@ -112,8 +123,6 @@ def run(plan: Plan, orders: Orders, events: Events) -> list[Result]:
                 continue
             making = _Making(plan, planned, orders, events, planned.name in force)
             results.append(making.ensure(workers))
-    failed = [result.stage for result in results if result.state == "failed"]
-    events.emit("run-ended", failed=failed)
     return results
 
 

@@ -24,7 +24,8 @@ class Gathered:
         rollouts: Scored rollouts.
         logs: Logs behind the reference.
         missing: Scenes that have rollouts but no log.
-        composite: By protocol, mean over scenes.
+        composite_paper: Mean over scenes.
+        composite_corrected: Mean over scenes.
         mean_ace: Against the scenes' own logs, within the count radius.
         wosac_metametric: Mean over the scenes that could be scored; None without any.
     """
@@ -33,7 +34,8 @@ class Gathered:
     rollouts: int
     logs: int
     missing: list[str]
-    composite: dict[str, float | None]
+    composite_paper: float | None
+    composite_corrected: float | None
     mean_ace: float | None
     wosac_metametric: float | None
 
@@ -145,15 +147,17 @@ class Summary:
         summary = self.build(missing, ())
         metametric = summary["wosac"]["scores"].get("metametric", {}).get("mean")
         ace = summary["numbers"].get("ace/own_near", {}).get("mean")
+        composite = {
+            name: protocol["scores"][COMPOSITE]["mean"]
+            for name, protocol in summary["protocols"].items()
+        }
         return Gathered(
             scenes=summary["scenes"],
             rollouts=summary["rollouts"],
             logs=summary["logs"],
             missing=list(missing),
-            composite={
-                name: protocol["scores"][COMPOSITE]["mean"]
-                for name, protocol in summary["protocols"].items()
-            },
+            composite_paper=composite["paper"],
+            composite_corrected=composite["corrected"],
             mean_ace=ace,
             wosac_metametric=metametric,
         )
@@ -175,11 +179,8 @@ class Summary:
 
     def _official(self) -> dict[str, Any]:
         scored = [entry["scores"] for entry in self.wosac.values() if "scores" in entry]
-        skipped = [
-            f"{scenario_id}: {entry['skipped']}"
-            for scenario_id, entry in self.wosac.items()
-            if "skipped" in entry
-        ]
+        reasons = {k: v["skipped"] for k, v in self.wosac.items() if "skipped" in v}
+        skipped = [text if k in text else f"{k}: {text}" for k, text in reasons.items()]
         names = list(scored[0]) if scored else []
         values = np.array([[s[name] for name in names] for s in scored], dtype=np.float64)
         values = values.reshape(len(scored), len(names))

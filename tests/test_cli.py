@@ -1,5 +1,6 @@
 """The command line as a user meets it: words, tables, exit codes."""
 
+import gzip
 import json
 import os
 import signal
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from cli import main
+from infgen.sources.towns import builtin_records
 from pipeline.settings import DEFAULT_FILE
 
 HERE = Path(__file__).parent
@@ -246,6 +248,33 @@ def test_every_verb_helps_with_an_example(infgen, verb):
 
     assert code == 0
     assert "Example: infgen" in out
+
+
+@pytest.fixture
+def one_bad(tmp_path):
+    """A file of the built-in records, one of them with a flipped bit."""
+    source = min(builtin_records(), key=lambda path: path.stat().st_size)
+    data = bytearray(gzip.decompress(source.read_bytes()))
+    data[500] ^= 1
+    path = tmp_path / source.name
+    path.write_bytes(gzip.compress(bytes(data)))
+    return path
+
+
+def test_bad_records_are_counted_located_and_too_many_are_exit_code_3(infgen, one_bad):
+    Path("stages.yaml").unlink()  # The real stages.
+
+    code, out, err = infgen("ingest", one_bad, "--root", "R", "--json")
+    assert code == 3
+    (stage,) = json.loads(out)["stages"]
+    assert (stage["state"], stage["report"]["quarantined"]) == ("made", 1)
+    assert "more than --max-bad 0.001" in err
+    table = next(Path("R/store/ingest").glob("*/quarantine.parquet")).resolve()
+    assert str(table) in err
+
+    code, _, err = infgen("ingest", "--root", "R", "--max-bad", "0.5")
+    assert code == 0
+    assert "are quarantined" in err
 
 
 def start(*words, **environ):

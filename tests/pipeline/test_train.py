@@ -339,7 +339,9 @@ def test_finish_gathers_what_the_unit_made(whole, tmp_path):
     folder, report = whole
     target = tmp_path / "stage"
 
-    found = finish(MadeInputs(), [Done("weights", "k", folder, report)], target, SETTINGS, quiet)
+    found = finish(
+        MadeInputs(), [Done("weights", "k", folder, report)], target, SETTINGS, quiet
+    )
 
     assert contents(target) == contents(folder)
     assert found == {name: value for name, value in report.items() if name != "run"}
