@@ -4,6 +4,7 @@ Workers write their results themselves and send back a few figures. At most two 
 worker thread are on their way at once, so that the scheduler never holds many.
 """
 
+import logging
 import os
 import re
 import traceback
@@ -95,6 +96,7 @@ def _local(count: int) -> Any:
         threads_per_worker=1,
         host=LOOPBACK,
         dashboard_address=None,
+        silence_logs=logging.ERROR,
         env=WORKER_ENVIRONMENT,
     )
 
