@@ -122,6 +122,7 @@ STAGE = Stage(
         "infgen.model.losses",
         "infgen.model.network",
         "infgen.model.outputs",
+        "infgen.model.pairs",
         "infgen.model.relations",
         "infgen.model.roads",
         "infgen.model.sight",

@@ -50,6 +50,7 @@ class Readable(Protocol):
 
     def read(self, size: int, /) -> bytes:
         """Read up to so many bytes."""
+        ...
 
 
 class Refused(NamedTuple):

@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +19,14 @@ from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
 from pipeline.checkpoint import POINTER, load_checkpoint, save_checkpoint
 from pipeline.folders import StoreError
-from pipeline.loader import TokenScenes, held_out_batches, scenes_of_step, train_batches
+from pipeline.loader import TokenScenes, held_out_batches, train_batches
 from pipeline.stage import Done, Unit
 from pipeline.stopping import Stopped
 from pipeline.store import write_records
 from pipeline.tokenize import SCHEMA
 from pipeline.train import OUTPUTS, STAGE, finish, load_network, plan, work
-from pipeline.train_log import TrainLog, read_log
-from pipeline.training import Course, TrainingError, begin, learning_rate, train
+from pipeline.train_log import read_log
+from pipeline.training import Course, TrainingError, begin, train
 from pipeline.weights import read_about, state_of
 
 SETTINGS = {
@@ -44,6 +44,9 @@ SETTINGS = {
         learning_rate=1e-3,
     ),
 }
+
+
+TERMS = ("motion", "stay", "add", "cell", "kind", "size", "heading", "offset", "map")
 
 
 def quiet(done, total, note=""):
@@ -139,7 +142,7 @@ def test_the_log_has_every_term_of_every_step(whole):
 
     assert [line["step"] for line in lines] == [1, 2, 3, 4, 4, 5, 6, 6]
     steps = [line for line in lines if "motion" in line]
-    for name in "motion stay add cell kind size heading offset map".split():
+    for name in TERMS:
         assert all(f"{name}_count" in line for line in steps)
     assert [line["step"] for line in lines if "validation" in line] == [4, 6]
     assert steps[0]["learning_rate"] == pytest.approx(5e-4)
@@ -191,8 +194,6 @@ work(Unit("weights", {}, json.loads(sys.argv[1])), Path(sys.argv[2]), settings, 
 
 
 def start(unit, folder):
-    from dataclasses import asdict  # noqa: PLC0415
-
     settings = {name: asdict(value) for name, value in SETTINGS.items()}
     words = [json.dumps(dict(unit.task)), str(folder), json.dumps(settings)]
     return subprocess.Popen(
@@ -380,19 +381,6 @@ def test_the_plan_is_one_unit_of_the_two_splits():
     assert STAGE.in_driver
 
 
-def test_every_epoch_visits_every_scene_once_in_another_order():
-    visits = [scenes_of_step(step, batch=3, count=7, seed=5) for step in range(7)]
-
-    flat = [row for batch in visits for row in batch]
-    epochs = [flat[at : at + 7] for at in (0, 7, 14)]
-    assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
-    assert epochs[0] != epochs[1]
-
-
-def test_batches_larger_than_the_data_wrap_around():
-    assert sorted(scenes_of_step(0, batch=5, count=2, seed=0)[:4]) == [0, 0, 1, 1]
-
-
 def test_the_batch_of_a_step_does_not_depend_on_where_training_began(course):
     limits: Limits = course.limits
 
@@ -423,27 +411,3 @@ def test_scenes_of_several_groups_are_one_sequence(shards):
     assert [scene.scenario_id for scene in scenes[4:]] == ["validation-1", "validation-2"]
     with pytest.raises(IndexError):
         scenes[6]
-
-
-def test_the_rate_rises_then_falls_as_half_a_cosine():
-    how = TrainSettings(steps=110, warmup_steps=10, learning_rate=1.0)
-
-    rates = [learning_rate(how, step) for step in range(110)]
-
-    assert rates[0] == pytest.approx(0.1)
-    assert rates[9] == rates[10] == pytest.approx(1.0)
-    assert rates[60] == pytest.approx(0.5)
-    assert 0 <= rates[-1] < 0.001
-    assert learning_rate(replace(how, warmup_steps=0), 0) == 1.0
-
-
-def test_a_log_forgets_what_lies_beyond_the_checkpoint(tmp_path):
-    path = tmp_path / "train.jsonl"
-    path.write_text('{"step": 1}\n{"step": 2}\n{"step": 3}\n{"ste')
-
-    log = TrainLog(path, first=2)
-    log.add({"step": 3, "motion": 1.0})
-    assert [line["step"] for line in read_log(path)] == [1, 2]
-    log.flush()
-
-    assert read_log(path)[-1] == {"step": 3, "motion": 1.0}
