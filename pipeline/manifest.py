@@ -127,9 +127,17 @@ def _damage(
             yield f"{path} is not in the manifest"
 
 
-@cache
 def code_hash(modules: Sequence[str]) -> str:
-    """Hash the source of modules (packages: all their files), without importing them."""
+    """Hash the source of modules (packages: all their files), without importing them.
+
+    Raises:
+        StoreError: if one of them has no source.
+    """
+    return _code_hash(tuple(modules))
+
+
+@cache
+def _code_hash(modules: tuple[str, ...]) -> str:
     digest = hashlib.sha256()
     for module in sorted(modules):
         for name, source in _sources(module):

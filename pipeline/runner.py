@@ -8,7 +8,6 @@ else lies about is cleared, or gone on with, by the next run.
 import shutil
 import time
 import traceback
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -24,20 +23,17 @@ from pipeline.inputs import FinishedInputs, units_of
 from pipeline.locks import LockedError, locked
 from pipeline.manifest import (
     Run,
-    code_hash,
-    package_versions,
     read_manifest,
     seal,
     split_report,
 )
-from pipeline.plan import Plan, PlanError, Planned, placeless
+from pipeline.plan import Plan, Planned
 from pipeline.root import KEY_DIGITS, MANIFEST, Root
-from pipeline.stage import Done, Progress, Report, Unit
+from pipeline.stage import Done, Progress, Report
 from pipeline.status import has_other_code
+from pipeline.tasks import about_stage, cut_tasks
 from pipeline.work import Outcome, Task, failure
 
-UNIT_SCHEMA = "infgen.unit/1"
-STAGE_SCHEMA = "infgen.stage/1"
 FINISH = "finish"
 """Stands for a stage's own last step among its failed units."""
 
@@ -182,7 +178,8 @@ class _Making:
 
     def _make(self, workers: Workers) -> Result:
         inputs = FinishedInputs(self.root, self.planned)
-        tasks = self._tasks(self.planned.stage.plan(inputs, self.planned.settings))
+        units = self.planned.stage.plan(inputs, self.planned.settings)
+        tasks = cut_tasks(self.root, self.planned, units)
         if self.forced:
             self._forget(tasks)
         self._clear()
@@ -213,41 +210,6 @@ class _Making:
         return Result(
             self.name, state, self.planned.key, len(tasks), made, 0.0, report, errors
         )
-
-    def _tasks(self, units: Sequence[Unit]) -> list[Task]:
-        """Name the folder of every unit.
-
-        Raises:
-            PlanError: if two units have one name, or a name is no file name.
-        """
-        for name, count in Counter(unit.name for unit in units).items():
-            if count > 1 or "/" in name or not name:
-                raise PlanError(f"stage {self.name!r} cuts a bad or double unit {name!r}")
-        return [self._task(unit) for unit in units]
-
-    def _task(self, unit: Unit) -> Task:
-        key = self.planned.unit_key(unit)
-        about = {
-            "schema": UNIT_SCHEMA,
-            **self._about(),
-            "name": unit.name,
-            "key": key,
-            "inputs": dict(unit.inputs),
-            "task": placeless(unit.task),
-        }
-        target = self.root.unit(self.name, key)
-        return Task(self.planned.module, unit, target, self.planned.settings, about)
-
-    def _about(self) -> dict[str, Any]:
-        """What the manifests of a stage and of its units have in common."""
-        stage = self.planned.stage
-        return {
-            "stage": stage.name,
-            "version": stage.version,
-            "settings": self.planned.values,
-            "code": code_hash(stage.modules),
-            "packages": package_versions(),
-        }
 
     def _do(self, todo: Sequence[Task], workers: Workers) -> list[Outcome]:
         outcomes: list[Outcome] = []
@@ -294,15 +256,7 @@ class _Making:
 
     def _gather(self, inputs: FinishedInputs, tasks: Sequence[Task]) -> Report:
         started, begun = datetime.now(UTC).isoformat(timespec="seconds"), time.monotonic()
-        ordered = sorted(tasks, key=lambda task: task.unit.name)
-        about = {
-            "schema": STAGE_SCHEMA,
-            **self._about(),
-            "key": self.planned.key,
-            "inputs": dict(self.planned.inputs),
-            "sources": {source.name: source.fingerprint for source in self.planned.sources},
-            "units": [_unit_line(task) for task in ordered],
-        }
+        about = about_stage(self.planned, tasks)
         dones: list[Done] = units_of(self.root, self.name, about)
         settings = self.planned.settings
         with publish(self.folder) as partial:
@@ -347,8 +301,3 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink()
-
-
-def _unit_line(task: Task) -> dict[str, Any]:
-    report = read_manifest(task.target)["report"]
-    return {"name": task.unit.name, "key": task.about["key"], "report": report}

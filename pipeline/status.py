@@ -8,7 +8,7 @@ from pipeline.folders import StoreError
 from pipeline.inputs import FinishedInputs, are_made
 from pipeline.locks import holder, is_locked
 from pipeline.manifest import code_hash, read_manifest
-from pipeline.plan import Plan, Planned
+from pipeline.plan import Plan, Planned, PlanError
 from pipeline.root import MANIFEST, read_json
 
 State = Literal["cached", "stale", "missing", "running", "failed"]

@@ -1,7 +1,11 @@
+from dataclasses import replace
+
 import pytest
 
 from pipeline.locks import locked
+from pipeline.plan import PlanError
 from pipeline.runner import Orders
+from pipeline.stages import load_stage
 from pipeline.status import OTHER_CODE, standings
 
 
@@ -133,6 +137,16 @@ def test_the_comparison_is_with_the_last_run_under_the_same_profile(workshop, st
     found = told(status("total.times=8"))
 
     assert found["total"] == ("stale", "total.times 7.0 -> 8.0")
+
+
+def test_a_stage_that_cannot_be_cut_says_why(workshop, status, monkeypatch):
+    def refuse(inputs, settings):
+        raise PlanError("there is nothing to count")
+
+    stage = replace(load_stage("toy_count"), plan=refuse)
+    monkeypatch.setattr("toy_count.STAGE", stage)
+
+    assert told(status())["count"] == ("missing", "there is nothing to count")
 
 
 def test_an_input_that_is_gone_is_said_to_differ(workshop, status):

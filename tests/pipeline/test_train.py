@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
-from infgen.model.batch import Limits
 from infgen.tokens.codebook import MotionCodebook, RoadCodebook
 from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
@@ -79,17 +78,14 @@ def shards(tmp_path_factory, crossing, metre_moves, bent_roads):
     return folder
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def unit(shards):
-    return Unit(
-        name="weights",
-        inputs={},
-        task={
-            "scenes": [str(shards / "training")],
-            "held_out": [str(shards / "validation")],
-            "codebooks": str(shards / "vocab"),
-        },
-    )
+    task = {
+        "scenes": [str(shards / "training")],
+        "held_out": [str(shards / "validation")],
+        "codebooks": str(shards / "vocab"),
+    }
+    return Unit("weights", {}, task)
 
 
 @pytest.fixture
@@ -114,16 +110,10 @@ def contents(folder):
 
 
 @pytest.fixture(scope="module")
-def whole(shards, tmp_path_factory):
+def whole(unit, tmp_path_factory):
     """What an uninterrupted run leaves."""
     folder = tmp_path_factory.mktemp("whole")
-    task = {
-        "scenes": [str(shards / "training")],
-        "held_out": [str(shards / "validation")],
-        "codebooks": str(shards / "vocab"),
-    }
-    report = work(Unit("weights", {}, task), folder, SETTINGS, quiet)
-    return folder, report
+    return folder, work(unit, folder, SETTINGS, quiet)
 
 
 def test_a_run_leaves_weights_their_page_and_their_log(whole):
@@ -382,10 +372,8 @@ def test_the_plan_is_one_unit_of_the_two_splits():
 
 
 def test_the_batch_of_a_step_does_not_depend_on_where_training_began(course):
-    limits: Limits = course.limits
-
-    from_start = list(train_batches(course.scenes, limits, 2, 0, range(5)))
-    from_three = list(train_batches(course.scenes, limits, 2, 0, range(3, 5)))
+    from_start = list(train_batches(course.scenes, course.limits, 2, 0, range(5)))
+    from_three = list(train_batches(course.scenes, course.limits, 2, 0, range(3, 5)))
 
     for one, two in zip(from_start[3:], from_three, strict=True):
         assert one.scenario_ids == two.scenario_ids
