@@ -8,7 +8,7 @@ from pipeline.folders import StoreError
 from pipeline.inputs import FinishedInputs, are_made
 from pipeline.locks import holder, is_locked
 from pipeline.manifest import code_hash, read_manifest
-from pipeline.plan import Plan, Planned, PlanError
+from pipeline.plan import Plan, PlanError, Planned
 from pipeline.root import MANIFEST, read_json
 
 State = Literal["cached", "stale", "missing", "running", "failed"]
@@ -66,7 +66,10 @@ def _standing(
         units = len(read_manifest(root.folder(name, planned.key))["units"])
         why = OTHER_CODE if other_code else ""
         return Standing(name, "cached", why, planned.key, units, units)
-    total, done = count_units(plan, planned)
+    try:
+        total, done = count_units(plan, planned)
+    except PlanError as error:  # It cannot be cut as asked: the user must know, not stop.
+        return Standing(name, "missing", str(error), planned.key, None, None)
     reasons = (
         [OTHER_CODE] if other_code else why_remade(plan, name, _last(plan, name, made))
     )
