@@ -31,5 +31,5 @@ clean:
 
 $(INSTALLED): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --editable '.[dev,viz]'
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	touch $@

@@ -21,11 +21,13 @@ class Gauge:
         stage: Its name.
         units: Units of its work.
         before: Units that were made before this run.
+        what: What the steps of an only unit are.
     """
 
     stage: str
     units: int
     before: int
+    what: str = "steps"
     clock: Callable[[], float] = time.monotonic
     note: str = ""
     finishing: bool = False
@@ -95,7 +97,7 @@ class Gauge:
         """Say it in one line: ``12 of 27 units, 0.8/s, 0:19 left, note``."""
         if self.finishing:
             return ", ".join([f"gathering {self._fraction:.0%}", *self._notes])
-        what = "steps" if self.in_steps else "units"
+        what = self.what if self.in_steps else "units"
         parts = [f"{self.done:.4g} of {self.total:g} {what}"]
         if self.per_s is not None and self.left_s is not None:
             parts += [_rate(self.per_s), f"{clock_time(self.left_s)} left"]

@@ -44,7 +44,9 @@ class Asked:
             file=self.file,
             profile=self.profile,
             records=[
-                part for word in (*(self.records or ()), *records) for part in _split(word)
+                part
+                for word in (*(self.records or ()), *records)
+                for part in split_names(word)
             ],
             overrides=self.set or (),
             environ=os.environ,
@@ -96,7 +98,8 @@ class Running:
         )
 
 
-def _split(word: str) -> list[str]:
+def split_names(word: str) -> list[str]:
+    """Split at commas, unless the whole is the name of a file."""
     return [word] if Path(word).exists() else [part for part in word.split(",") if part]
 
 

@@ -74,7 +74,7 @@ class Screen:
     def __call__(self, event: Event) -> None:
         """Show one event."""
         kind = event["event"]
-        if kind == "stage-started":
+        if kind in ("stage-started", "work-started"):
             self._start(event)
         elif kind in _STEPS and self._gauge is not None:
             self._gauge.take(event)
@@ -83,7 +83,8 @@ class Screen:
             self._say(_LINES[kind].format_map(_Words(event)))
 
     def _start(self, event: Event) -> None:
-        self._gauge = Gauge(event["stage"], event["units"], event["made"])
+        what = event.get("what", "steps")
+        self._gauge = Gauge(event["stage"], event["units"], event["made"], what)
         self._said_at = time.monotonic()
         if self._bars is not None:
             self._bar = self._bars.add_task(event["stage"], total=None, words="")

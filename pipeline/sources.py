@@ -18,6 +18,7 @@ from typing import Any
 import google_crc32c
 
 from infgen.config import ConfigError
+from infgen.sources.remote import file_system
 from pipeline.folders import StoreError, write_json
 from pipeline.root import Root, read_json
 from pipeline.stage import Source
@@ -43,12 +44,21 @@ def find_sources(patterns: Sequence[str], root: Root) -> tuple[Source, ...]:
     """
     if not patterns:
         raise ConfigError("no records are named; --records 'DIR/*.tfrecord*' names them")
-    urls = sorted({url for pattern in patterns for url in _matches(pattern)})
+    urls = find_urls(patterns)
     _refuse_twins(urls)
     memory = _Memory(root)
     found = [Source(url, _name(url), memory.fingerprint(url)) for url in urls]
     memory.save()
     return tuple(sorted(found, key=lambda source: source.name))
+
+
+def find_urls(patterns: Sequence[str]) -> list[str]:
+    """Find files by path, folder, pattern or URL, each once, in order.
+
+    Raises:
+        ConfigError: if a pattern matches nothing.
+    """
+    return sorted({url for pattern in patterns for url in _matches(pattern)})
 
 
 def absolute(pattern: str) -> str:
@@ -81,9 +91,7 @@ def _local(pattern: str) -> list[str]:
 
 
 def _remote(pattern: str) -> list[str]:
-    import fsspec  # noqa: PLC0415
-
-    system, path = fsspec.core.url_to_fs(pattern)
+    system, path = file_system(pattern)
     if glob.has_magic(path):
         paths = system.glob(path)
     else:
@@ -177,9 +185,7 @@ def _masked(crc: int) -> int:
 
 def _fingerprint_remote(url: str) -> str:
     """Identity of a remote file: what its store says of it, or else all its bytes."""
-    import fsspec  # noqa: PLC0415
-
-    system, path = fsspec.core.url_to_fs(url)
+    system, path = file_system(url)
     said = sorted(_said(system.info(path)))
     digest = hashlib.sha256(repr(said).encode())
     if not any(name != "size" for name, _ in said):

@@ -2,12 +2,17 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.root import KEY_DIGITS, Root, read_json
 from pipeline.runner import Result
 from pipeline.screen import console, show_table
 from pipeline.status import Standing
 
+if TYPE_CHECKING:
+    from pipeline.wosac import Official
+
+SCENES_PER_TABLE = 5
 SCORES = "table.json"
 """In the report's folder: ``{"columns": [...], "rows": [[...]]}``."""
 
@@ -48,3 +53,22 @@ def _show_scores(root: Root, results: Sequence[Result]) -> None:
         scores = read_json(table)
         show_table("scores", scores["columns"], scores["rows"])
         console().print(f"report: {root.path / 'report'}", soft_wrap=True)
+
+
+def show_official(found: "Official", *, per_scene: bool) -> None:
+    """Print the official scores' means, each scene if asked, and what was refused."""
+    if found.scores:
+        title = f"{found.metric}, mean over {len(found.scores)} scenes"
+        rows = [(name, f"{value:.5f}") for name, value in found.mean().items()]
+        show_table(title, ("score", "mean"), rows)
+    scenes = list(found.scores.values()) if per_scene else []
+    for first in range(0, len(scenes), SCENES_PER_TABLE):
+        some = scenes[first : first + SCENES_PER_TABLE]
+        numbers = [one.numbers() for one in some]
+        columns = ("score", *(one.scenario_id for one in some))
+        cells = [(name, *(f"{n[name]:.5f}" for n in numbers)) for name in numbers[0]]
+        title = f"scenes {first + 1} to {first + len(some)} of {len(scenes)}"
+        show_table(title, columns, cells)
+    for name, reason in found.refused:
+        line = f"refused: {name}: {reason}"
+        console(stderr=True).print(line, markup=False, highlight=False, soft_wrap=True)

@@ -12,9 +12,9 @@ center_y = 3, center_z = 4, heading = 5, object_id = 6.
 
 import tarfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import BinaryIO, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -70,26 +70,39 @@ class _SceneError(ValueError):
 
 
 def read_submission(
-    path: Path, num_rollouts: int = NUM_ROLLOUTS
+    path: Path,
+    num_rollouts: int = NUM_ROLLOUTS,
+    tell_bytes: Callable[[int], None] = lambda _: None,
 ) -> Iterator[Rollouts | Refused]:
     """Stream the scenes of a submission; a wrong one comes with the reason.
 
     Args:
         path: A binary message, or a tar archive of such, compressed or not.
         num_rollouts: How many rollouts every scene must have; 0 for any.
+        tell_bytes: Is told before each scene how many bytes of the file are read.
 
     Raises:
         OSError: if the file cannot be read.
     """
-    if not tarfile.is_tarfile(path):
-        with path.open("rb") as file:
-            yield from _read_file(path.name, file, path.stat().st_size, num_rollouts)
-        return
+    is_archive = tarfile.is_tarfile(path)
+    with path.open("rb") as file:
+        if is_archive:
+            scenes = _read_archive(path.name, file, num_rollouts)
+        else:
+            scenes = _read_file(path.name, file, path.stat().st_size, num_rollouts)
+        for scene in scenes:
+            tell_bytes(file.tell())
+            yield scene
+
+
+def _read_archive(
+    name: str, file: BinaryIO, num_rollouts: int
+) -> Iterator[Rollouts | Refused]:
     try:
-        with tarfile.open(path, "r|*") as archive:
+        with tarfile.open(fileobj=file, mode="r|*") as archive:
             yield from _read_members(archive, num_rollouts)
     except (tarfile.TarError, EOFError, zlib.error) as error:
-        yield Refused(path.name, f"the archive is damaged: {error}")
+        yield Refused(name, f"the archive is damaged: {error}")
 
 
 def _read_members(

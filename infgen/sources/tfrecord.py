@@ -15,6 +15,8 @@ from typing import Protocol, runtime_checkable
 
 import google_crc32c
 
+from infgen.sources.remote import file_system
+
 MAX_RECORD_BYTES = 64 << 20
 """Longer records are refused; the largest real scenario is about 5 MB."""
 
@@ -100,9 +102,8 @@ def open_bytes(url: str | Path) -> AbstractContextManager[ByteSource]:
     """Open a local path or any fsspec URL for reading."""
     if "://" not in str(url):
         return Path(url).open("rb")
-    import fsspec  # noqa: PLC0415
-
-    opened: AbstractContextManager[ByteSource] = fsspec.open(str(url), "rb")
+    system, path = file_system(str(url))
+    opened: AbstractContextManager[ByteSource] = system.open(path, "rb")
     return opened
 
 
@@ -127,6 +128,24 @@ def iter_records(
     """
     with open_bytes(url) as file:
         yield from _records(_Reader(_unpacked(file)), max_bytes)
+
+
+def read_record(url: str | Path, offset: int) -> Record | BadRecord:
+    """Read one record again, by the offset that ``iter_records`` gave it.
+
+    Its number is not known and given as 1.
+
+    Raises:
+        OSError: if the file cannot be opened or read.
+    """
+    with open_bytes(url) as file:
+        reader = _Reader(_unpacked(file))
+        try:
+            reader.skip(offset)
+            record, _, _ = _next(reader, 1, offset, MAX_RECORD_BYTES)
+        except _StreamError as error:
+            record = BadRecord(1, offset, str(error))
+    return record or BadRecord(1, offset, "the file ends before the record")
 
 
 def _records(reader: "_Reader", max_bytes: int) -> Iterator[Record | BadRecord]:

@@ -60,6 +60,18 @@ def decode_scene(data: bytes) -> Scene:
         raise RecordError(f"not a usable Scenario message: {error}") from error
 
 
+def read_scenario_id(data: bytes) -> str:
+    """Read only the id of a ``Scenario`` record.
+
+    Raises:
+        RecordError: if it is no sound message, or has no id.
+    """
+    try:
+        return _scenario_id(data, _by_number(data))
+    except WireError as error:
+        raise RecordError(f"not a usable Scenario message: {error}") from error
+
+
 def world_xyz_m(
     scene: Scene, xyz_m: Float32[np.ndarray, "*shape 3"]
 ) -> Float32[np.ndarray, "*shape 3"]:

@@ -98,3 +98,10 @@ def test_only_plain_figures_are_shown():
 
     assert figures(report) == "scenes 3, share 0.1235, split training"
     assert figures({f"n{i}": i for i in range(9)}, most=2) == "n0 0, n1 1"
+
+
+def test_the_steps_of_an_only_unit_have_a_name_of_their_own():
+    gauge = Gauge("s", units=1, before=0, what="scenes", clock=lambda: 0.0)
+    gauge.take({"event": "progress", "done": 3, "total": 12, "note": ""})
+
+    assert gauge.words() == "3 of 12 scenes"
