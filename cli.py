@@ -100,6 +100,7 @@ _stage_verb("build-vocab", "Cluster the vocabularies of moves and road pieces.")
 _stage_verb("tokenize", "Write scenes as tokens.")
 _stage_verb("train", "Train the network; goes on where a killed run stopped.")
 _stage_verb("rollout", "Play futures of the held-out scenes.")
+_stage_verb("reference", "Count what the logs of the scored split do.")
 _stage_verb("score", "Score the futures against the logs.")
 _stage_verb("report", "Gather tables and figures in one page.")
 

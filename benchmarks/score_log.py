@@ -24,7 +24,7 @@ from futures import (
 )
 from records import read_split
 
-from infgen.config import ScoreSettings, TokenSettings
+from infgen.config import ReferenceSettings, TokenSettings
 from infgen.metrics import wosac
 from infgen.metrics.binned import Binned, bin_traffic, edges_of
 from infgen.metrics.counts import mean_counts
@@ -70,7 +70,7 @@ class LongTerm:
             traffic = from_log(scene, TokenSettings())
         except ValueError:
             return
-        edges, radius_m = edges_of(scene), ScoreSettings().count_radius_m
+        edges, radius_m = edges_of(scene), ReferenceSettings().count_radius_m
         log = bin_traffic(traffic, edges, radius_m, as_logged=True)
         if not _windows(log).count:
             return
@@ -94,8 +94,8 @@ class LongTerm:
             split_near=float(near),
             split_all=float(everyone),
             logs=self.logs,
-            window_s=ScoreSettings().window_s,
-            stride_s=ScoreSettings().stride_s,
+            window_s=ReferenceSettings().window_s,
+            stride_s=ReferenceSettings().stride_s,
         )
 
     def columns(self) -> dict[str, dict[str, float]]:
@@ -112,7 +112,9 @@ def _windows(binned: Binned) -> Windows:
 
 
 def _cut(num_steps: int) -> Windows:
-    return cut_windows(num_steps, ScoreSettings().window_s, ScoreSettings().stride_s)
+    return cut_windows(
+        num_steps, ReferenceSettings().window_s, ReferenceSettings().stride_s
+    )
 
 
 def _mean(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:

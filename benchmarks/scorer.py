@@ -21,7 +21,7 @@ import numpy as np
 from futures import kept_velocity, noisy_future
 from records import read_split
 
-from infgen.config import ScoreSettings, TokenSettings
+from infgen.config import ReferenceSettings, TokenSettings
 from infgen.metrics import wosac
 from infgen.metrics.binned import Binned, bin_traffic, edges_of
 from infgen.metrics.interaction import nearest_object_m, time_to_collision_s
@@ -123,7 +123,7 @@ def time_long(limit: int) -> float:
 
 
 def _bin(traffic: Traffic, edges: RoadEdges | None) -> Binned:
-    radius_m = ScoreSettings().count_radius_m
+    radius_m = ReferenceSettings().count_radius_m
     return bin_traffic(traffic, edges, radius_m, as_logged=False)
 
 

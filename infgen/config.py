@@ -278,14 +278,28 @@ class RolloutSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class ScoreSettings:
-    """How rollouts are scored (METRICS.md).
+class ReferenceSettings:
+    """How logs are measured, and with them the rollouts that are scored against them.
 
     Attributes:
+        split: Whose logs; that of the rollouts.
         window_s: Length of a window.
         stride_s: From one window to the next.
         count_radius_m: Agents within it of the ego are counted; ACE is given for it and for
             no limit.
+    """
+
+    split: str = "validation"
+    window_s: float = 8.0
+    stride_s: float = 0.5
+    count_radius_m: float = 75.0
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreSettings:
+    """How rollouts are scored (METRICS.md).
+
+    Attributes:
         enter_radius_m: For models that neither insert nor remove: who crosses this distance
             to the ego enters or leaves, and who is beyond it is not there; 0 for never.
         wosac: Version of the Waymo metric, for the first eight seconds.
@@ -293,9 +307,6 @@ class ScoreSettings:
         seed: Of the bootstrap.
     """
 
-    window_s: float = 8.0
-    stride_s: float = 0.5
-    count_radius_m: float = 75.0
     enter_radius_m: float = 0.0
     wosac: str = "wosac-2025"
     resamples: int = 1000

@@ -5,7 +5,7 @@ in groups of bounded size as they come. A record that cannot be used is a named 
 ``quarantine.parquet``; it never stops the file, and the file never stops the stage.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from infgen.config import IngestSettings
 from infgen.scene import Scene
 from infgen.sources.tfrecord import BadRecord, Record, iter_records
 from infgen.sources.womd import scene_or_fault
+from pipeline.parquet import joined, table
 from pipeline.splits import split_of
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
@@ -95,14 +96,14 @@ def finish(
 
     target.mkdir(parents=True, exist_ok=True)
     paths = [unit.path for unit in units]
-    index = _joined(paths, "index.parquet", _INDEX)
+    index = joined(paths, "index.parquet", _INDEX)
     first = pl.struct("source", "record").first().over("scenario_id").alias("first")
     index = index.with_columns(duplicate=~pl.col("scenario_id").is_first_distinct())
     twice = index.with_columns(first).filter("duplicate")
-    quarantine = _joined(paths, "quarantine.parquet", _QUARANTINE)
+    quarantine = joined(paths, "quarantine.parquet", _QUARANTINE)
     duplicates = _duplicates(twice)
-    for table, name in ((index, "index"), (quarantine, "quarantine")):
-        table.write_parquet(target / f"{name}.parquet")
+    index.write_parquet(target / "index.parquet")
+    quarantine.write_parquet(target / "quarantine.parquet")
     duplicates.write_parquet(target / "duplicates.parquet")
     return {
         "scenes": len(index),
@@ -140,8 +141,8 @@ class _Shard:
     def close(self) -> None:
         """Write what is left, and the tables."""
         self._flush()
-        _table(self.index, _INDEX).write_parquet(self._target / "index.parquet")
-        _table(self._bad, _QUARANTINE).write_parquet(self._target / "quarantine.parquet")
+        table(self.index, _INDEX).write_parquet(self._target / "index.parquet")
+        table(self._bad, _QUARANTINE).write_parquet(self._target / "quarantine.parquet")
 
     def report(self) -> Report:
         """Sum up the unit."""
@@ -221,24 +222,6 @@ def _duplicates(twice: "pl.DataFrame") -> "pl.DataFrame":
     )
 
 
-def _table(
-    rows: Sequence[Mapping[str, Any]], columns: Mapping[str, type]
-) -> "pl.DataFrame":
-    import polars as pl  # noqa: PLC0415
-
-    types = {name: pl.String if kind is str else pl.Int64 for name, kind in columns.items()}
-    return pl.DataFrame(list(rows), schema=types)
-
-
-def _joined(
-    folders: Sequence[Path], name: str, columns: Mapping[str, type]
-) -> "pl.DataFrame":
-    import polars as pl  # noqa: PLC0415
-
-    tables = [pl.read_parquet(folder / name) for folder in folders]
-    return pl.concat([_table([], columns), *tables])
-
-
 STAGE = Stage(
     name="ingest",
     version=1,
@@ -257,6 +240,7 @@ STAGE = Stage(
         "infgen.sources.womd_tracks",
         "pipeline.columns",
         "pipeline.ingest",
+        "pipeline.parquet",
         "pipeline.splits",
         "pipeline.store",
     ),

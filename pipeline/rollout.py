@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from infgen.clock import CLOCK
 from infgen.config import RolloutSettings
+from pipeline.parquet import Fields, joined, table
 from pipeline.splits import in_split
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
@@ -23,6 +24,17 @@ if TYPE_CHECKING:
     from infgen.rollout.trace import Start
 
 SCHEMA = "infgen.rollouts/1"
+INDEX: Fields = {
+    "scenario_id": str,
+    "rollout": int,
+    "unit": str,
+    "group": int,
+    "row": int,
+    "agents": int,
+    "inserted": int,
+    "left": int,
+    "steps": int,
+}
 
 
 def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
@@ -74,7 +86,7 @@ def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
         path = target / f"rollouts-{group:03d}.zarr"
         write_records(path, rollouts, Rollout, SCHEMA, compress=True)
         rows += [_row(unit.name, group, at, played) for at, played in enumerate(rollouts)]
-    _write_index(target, rows)
+    table(rows, INDEX).write_parquet(target / "index.parquet")
     return _report(rows, refused)
 
 
@@ -95,11 +107,8 @@ def finish(
     progress: Progress,
 ) -> Report:
     """Write one index of all rollouts, and what they add up to."""
-    import polars as pl  # noqa: PLC0415
-
-    parts = [pl.scan_parquet(done.path / "index.parquet") for done in units]
-    if parts:
-        pl.concat(parts).sink_parquet(target / "index.parquet")
+    index = joined([done.path for done in units], "index.parquet", INDEX)
+    index.write_parquet(target / "index.parquet")
     count = sum(done.report["rollouts"] for done in units)
     totals = {
         name: sum(done.report[name] for done in units)
@@ -179,15 +188,6 @@ def _row(unit: str, group: int, at: int, rollout: "Rollout") -> dict[str, Any]:
         "left": int((rollout.exit_step >= 0).sum()),
         "steps": rollout.num_steps,
     }
-
-
-def _write_index(target: Path, rows: list[dict[str, Any]]) -> None:
-    import polars as pl  # noqa: PLC0415
-
-    columns = {name: pl.Int32 for name in ("rollout", "group", "row", "agents", "inserted")}
-    schema = {"scenario_id": pl.String, "unit": pl.String, **columns}
-    schema |= {"left": pl.Int32, "steps": pl.Int32}
-    pl.DataFrame(rows, schema=schema).write_parquet(target / "index.parquet")
 
 
 def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:

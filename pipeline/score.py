@@ -1,9 +1,7 @@
-"""Stage ``score``: rollouts and the logs of their split to a table of scores.
+"""Stage ``score``: rollouts to a table of scores, against the reference of their split.
 
-Two kinds of unit, neither of which needs another: a *reference* unit measures the logs of
-one ingested file, a rollout unit measures rollouts and scores the official metric. Both
-keep bins (``infgen.metrics.binned``); ``finish`` adds up the logged counts of the split and
-scores the bins under them.
+A unit scores the rollouts of one rollout unit, window by window and by the official metric;
+``finish`` only joins what the units wrote.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,143 +10,140 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from infgen.config import ScoreSettings, TokenSettings
-from pipeline.splits import split_of
+from infgen.config import ConfigError, ReferenceSettings, ScoreSettings
+from pipeline.splits import in_split, split_of
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
 if TYPE_CHECKING:
-    from infgen.metrics.binned import Binned
     from infgen.metrics.reference import Counts
-    from infgen.metrics.windows import Windows
+    from infgen.metrics.table import Against
     from infgen.rollout.rollout import Rollout
     from infgen.scene import Scene
-
-BINNED_SCHEMA, COUNTS_SCHEMA = "infgen.binned/1", "infgen.counts/1"
-SCENES_PER_GROUP = 64
-REFERENCE = "reference"
+    from pipeline.score_summary import Tally
+    from pipeline.score_write import ScoreRow
 
 
 def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
-    """One unit per log file of the rollouts' split, and one per rollout unit."""
-    rollouts = inputs.units("rollout")
-    logs = {done.name: done for done in inputs.units("ingest")}
-    splits = {split_of(done.name) for done in rollouts}
-    units = [
-        Unit(f"{REFERENCE}-{name}", {"scenes": done.key}, {"scenes": str(done.path)})
-        for name, done in logs.items()
-        if split_of(name) in splits
-    ]
-    for done in rollouts:
-        log = logs.get(done.name.rsplit("-", 1)[0])
+    """One unit per rollout unit.
+
+    Raises:
+        ConfigError: if the rollouts are not of the reference's split.
+    """
+    _check_split(inputs.units("rollout"), settings["reference"].split)
+    scenes = {done.name: done for done in inputs.units("ingest")}
+    logs = {done.name: done for done in inputs.units("reference")}
+    identity = inputs.content("reference", "counts.zarr", "means.json")
+    folder = str(inputs.folder("reference"))
+    units = []
+    for done in inputs.units("rollout"):
+        source = done.name.rsplit("-", 1)[0]
+        reads = {"rollouts": done, "scenes": scenes.get(source), "logs": logs.get(source)}
+        keys = {name: one.key if one else "" for name, one in reads.items()}
+        paths = {name: str(one.path) if one else "" for name, one in reads.items()}
         units.append(
             Unit(
                 done.name,
-                {"rollouts": done.key, "scenes": log.key if log else ""},
-                {"rollouts": str(done.path), "scenes": str(log.path) if log else ""},
+                {**keys, "reference": identity},
+                {**paths, "reference": folder},
             )
         )
     return units
 
 
+def _check_split(rollouts: Sequence[Done], split: str) -> None:
+    for done in rollouts:
+        if not in_split(done.name, split):
+            found = split_of(done.name)
+            raise ConfigError(
+                f"the rollouts are of split {found!r}, the reference of {split!r}; set "
+                f"reference.split={found}"
+            )
+
+
 def work(
     unit: Unit, target: Path, settings: Mapping[str, Any], progress: Progress
 ) -> Report:
-    """Measure the logs of one file, or the rollouts of one unit."""
-    target.mkdir(parents=True, exist_ok=True)
-    if "rollouts" in unit.task:
-        return _measure_rollouts(unit, target, settings["score"], progress)
-    return _measure_logs(unit, target, settings, progress)
-
-
-def _measure_logs(
-    unit: Unit, target: Path, settings: Mapping[str, Any], progress: Progress
-) -> Report:
-    """Count the logs for the reference, and bin them as if they were rollouts."""
-    from infgen.metrics.reference import no_counts  # noqa: PLC0415
-    from pipeline.ingest import read_scenes  # noqa: PLC0415
-
-    score: ScoreSettings = settings["score"]
-    counts = no_counts()
-    group: list[Binned] = []
-    skipped: dict[str, str] = {}
-    scenes = groups = 0
-    for scene in read_scenes(Path(unit.task["scenes"])):
-        measured = _measure_log(scene, settings["tokenize"], score)
-        if isinstance(measured, str):
-            skipped[scene.scenario_id] = measured
-            continue
-        counts += measured[0]
-        group.append(measured[1])
-        scenes += 1
-        progress(scenes, scenes, "logs")
-        if len(group) == SCENES_PER_GROUP:
-            _write_binned(target, groups, group)
-            group, groups = [], groups + 1
-    _write_binned(target, groups, group)
-    _write_counts(target, counts)
-    return {"kind": REFERENCE, "scenes": scenes, "skipped": skipped}
-
-
-def _measure_log(
-    scene: "Scene", tokens: TokenSettings, settings: ScoreSettings
-) -> "tuple[Counts, Binned] | str":
-    """Count one log, and bin it; or say why it cannot be."""
-    from infgen.metrics.binned import bin_traffic, edges_of  # noqa: PLC0415
-    from infgen.metrics.reference import count_log  # noqa: PLC0415
-    from infgen.metrics.traffic import from_log  # noqa: PLC0415
-
-    windows = _windows(scene.tracks.num_steps - scene.now - 1, settings)
-    if not windows.count:
-        return f"{scene.tracks.num_steps} steps hold no window of {settings.window_s:g} s"
-    try:
-        traffic = from_log(scene, tokens)
-    except ValueError as error:
-        return str(error)
-    edges, radius_m = edges_of(scene), settings.count_radius_m
-    logged = bin_traffic(traffic, edges, radius_m, as_logged=True)
-    played = bin_traffic(traffic, edges, radius_m, as_logged=False)
-    return count_log(logged, windows), played
-
-
-def _measure_rollouts(
-    unit: Unit, target: Path, settings: ScoreSettings, progress: Progress
-) -> Report:
-    """Bin all rollouts of some scenes, and score each scene by the official metric."""
-    from infgen.metrics.binned import bin_traffic, edges_of  # noqa: PLC0415
-    from infgen.metrics.radius import live_within  # noqa: PLC0415
-    from infgen.metrics.reference import count_simulated, no_counts  # noqa: PLC0415
-    from infgen.metrics.traffic import from_rollout  # noqa: PLC0415
+    """Score all rollouts of some scenes."""
     from pipeline.folders import write_json  # noqa: PLC0415
+    from pipeline.reference_files import (  # noqa: PLC0415
+        read_against,
+        read_logged,
+        write_counts,
+    )
     from pipeline.rollout import read_rollouts  # noqa: PLC0415
+    from pipeline.score_tables import WOSAC  # noqa: PLC0415
+    from pipeline.score_write import ROWS, write_part, write_tally  # noqa: PLC0415
 
-    folder = Path(unit.task["rollouts"])
+    target.mkdir(parents=True, exist_ok=True)
+    folder, logs = Path(unit.task["rollouts"]), unit.task["logs"]
+    logged = read_logged(Path(logs)) if logs else {}
+    against = read_against(Path(unit.task["reference"]), logged, settings["reference"])
     wanted = _scenario_ids(folder)
     scenes = dict(_scenes(unit.task["scenes"], wanted))
-    counts, wosac = no_counts(), []
-    number = 0
+    scorer = _Scorer(against, settings["reference"], settings["score"])
     grouped = groupby(read_rollouts(folder), key=lambda rollout: rollout.scenario_id)
     for scenario_id, group in grouped:
-        if scenario_id not in scenes:
-            continue
-        scene, rollouts = scenes[scenario_id], list(group)
-        edges = edges_of(scene)
-        wosac.append(_score_wosac(scene, rollouts, settings.wosac))
-        binned = []
-        for rollout in rollouts:
-            lived = rollout
-            if settings.enter_radius_m:
-                lived = live_within(rollout, settings.enter_radius_m)
-            traffic = from_rollout(lived)
-            one = bin_traffic(traffic, edges, settings.count_radius_m, as_logged=False)
-            counts += count_simulated(one, _windows(one.bins.shape[-1], settings))
-            binned.append(one)
-        _write_binned(target, number, binned)
-        number += 1
-        progress(number, len(wanted), "scenes")
-    _write_counts(target, counts)
-    write_json(target / "wosac.json", wosac)
+        if scenario_id in scenes:
+            scorer.take(scenes[scenario_id], list(group))
+            progress(len(scorer.official), len(wanted), "scenes")
+    scorer.tally.close_unit()
+    write_part(target / ROWS, scorer.rows())
+    write_tally(target, scorer.tally)
+    write_counts(target, scorer.counts)
+    write_json(target / WOSAC, scorer.official)
     missing = [scenario_id for scenario_id in wanted if scenario_id not in scenes]
-    return {"kind": "rollouts", "scenes": number, "missing": missing}
+    return {
+        "scenes": len(scorer.official),
+        "rollouts": scorer.tally.rollouts,
+        "missing": missing,
+    }
+
+
+class _Scorer:
+    """The scores of one unit, taken scene by scene."""
+
+    def __init__(
+        self, against: "Against", reference: ReferenceSettings, settings: ScoreSettings
+    ) -> None:
+        from infgen.metrics.reference import no_counts  # noqa: PLC0415
+        from pipeline.score_summary import Tally  # noqa: PLC0415
+
+        self.tally: Tally = Tally()
+        self.counts: Counts = no_counts()
+        self.official: list[dict[str, Any]] = []
+        self._against, self._reference, self._settings = against, reference, settings
+        self._rows: list[ScoreRow] = []
+
+    def take(self, scene: "Scene", rollouts: "Sequence[Rollout]") -> None:
+        """Score the rollouts of one scene."""
+        from infgen.metrics.binned import bin_traffic, edges_of  # noqa: PLC0415
+        from infgen.metrics.radius import live_within  # noqa: PLC0415
+        from infgen.metrics.reference import count_simulated  # noqa: PLC0415
+        from infgen.metrics.table import make_row  # noqa: PLC0415
+        from infgen.metrics.traffic import from_rollout  # noqa: PLC0415
+        from pipeline.score_write import rows_of  # noqa: PLC0415
+
+        edges, radius_m = edges_of(scene), self._settings.enter_radius_m
+        self.official.append(_score_wosac(scene, rollouts, self._settings.wosac))
+        for rollout in rollouts:
+            lived = live_within(rollout, radius_m) if radius_m else rollout
+            near_m = self._reference.count_radius_m
+            binned = bin_traffic(from_rollout(lived), edges, near_m, as_logged=False)
+            windows = self._against.windows(binned.bins.shape[-1])
+            self.counts += count_simulated(binned, windows)
+            row = make_row(binned, self._against)
+            self.tally.add(scene.scenario_id, row)
+            self._rows += rows_of(scene.scenario_id, rollout.index, row.numbers, "")
+
+    def rows(self) -> "list[ScoreRow]":
+        """Rows of the rollouts, and then of the official metric."""
+        from pipeline.score_write import rows_of  # noqa: PLC0415
+
+        found = list(self._rows)
+        for one in self.official:
+            prefix = f"{self._settings.wosac}/"
+            found += rows_of(one["scenario_id"], None, one.get("scores", {}), prefix)
+        return found
 
 
 def _score_wosac(
@@ -187,46 +182,6 @@ def _scenes(folder: str, wanted: Sequence[str]) -> "Iterator[tuple[str, Scene]]"
             return
 
 
-def _windows(num_steps: int, settings: ScoreSettings) -> "Windows":
-    from infgen.metrics.windows import cut_windows  # noqa: PLC0415
-
-    return cut_windows(num_steps, settings.window_s, settings.stride_s)
-
-
-def _write_binned(target: Path, number: int, binned: "Sequence[Binned]") -> None:
-    from infgen.metrics.binned import Binned  # noqa: PLC0415
-    from pipeline.store import write_records  # noqa: PLC0415
-
-    if binned:
-        path = target / f"binned-{number:03d}.zarr"
-        write_records(path, binned, Binned, BINNED_SCHEMA, compress=True)
-
-
-def _write_counts(target: Path, counts: "Counts") -> None:
-    from infgen.metrics.reference import Counts  # noqa: PLC0415
-    from pipeline.store import write_records  # noqa: PLC0415
-
-    path = target / "counts.zarr"
-    write_records(path, [counts], Counts, COUNTS_SCHEMA, compress=True)
-
-
-def read_binned(folder: Path) -> "Iterator[Binned]":
-    """Read the bins of one unit, a group in memory at a time."""
-    from infgen.metrics.binned import Binned  # noqa: PLC0415
-    from pipeline.store import read_records  # noqa: PLC0415
-
-    for path in sorted(folder.glob("binned-*.zarr")):
-        yield from read_records(path, Binned, BINNED_SCHEMA, mapped=False)
-
-
-def read_counts(folder: Path) -> "Counts":
-    """Read the counts of one unit."""
-    from infgen.metrics.reference import Counts  # noqa: PLC0415
-    from pipeline.store import read_records  # noqa: PLC0415
-
-    return read_records(folder / "counts.zarr", Counts, COUNTS_SCHEMA, mapped=False)[0]
-
-
 def finish(
     inputs: Inputs,
     units: Sequence[Done],
@@ -234,19 +189,26 @@ def finish(
     settings: Mapping[str, Any],
     progress: Progress,
 ) -> Report:
-    """Score all bins under the split's counts; write tables, curves and the summary."""
+    """Join the units' scores; write tables, curves and the summary."""
     from pipeline.score_tables import gather  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
-    return asdict(gather(units, target, settings["score"], progress))
+    return asdict(gather(inputs, units, target, settings, progress))
 
 
 STAGE = Stage(
     name="score",
-    version=1,
-    settings={"tokenize": TokenSettings, "score": ScoreSettings},
+    version=2,
+    settings={"reference": ReferenceSettings, "score": ScoreSettings},
     plan=plan,
     work=work,
     finish=finish,
-    modules=("infgen.metrics", "pipeline.score", "pipeline.score_tables"),
+    modules=(
+        "infgen.metrics",
+        "pipeline.reference_files",
+        "pipeline.score",
+        "pipeline.score_summary",
+        "pipeline.score_tables",
+        "pipeline.score_write",
+    ),
 )

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from infgen.config import ScoreSettings
+from infgen.config import ReferenceSettings, ScoreSettings
 from infgen.metrics.intervals import Interval, bootstrap, scene_mean
 from infgen.metrics.protocols import FEATURES, PROTOCOLS
 from infgen.metrics.table import COMPOSITE, Row, named
@@ -54,12 +54,14 @@ class Tally:
     Attributes:
         means: Mean over a scene's rollouts of each metric, by scenario id.
         rollouts: Rollouts seen.
+        sums: Sum of each metric that has a value in every window, and how many rollouts
+            have one, [value or count, window].
     """
 
     means: dict[str, dict[str, float]] = field(default_factory=dict)
     rollouts: int = 0
+    sums: dict[str, np.ndarray] = field(default_factory=dict)
     _open: dict[str, list[Mapping[str, float]]] = field(default_factory=dict)
-    _sums: dict[str, np.ndarray] = field(default_factory=dict)  # [value or count, window]
 
     def add(self, scenario_id: str, row: Row) -> None:
         """Take one rollout."""
@@ -68,7 +70,7 @@ class Tally:
         for name, values in row.curves.items():
             known = ~np.isnan(values)
             add = np.stack([np.where(known, values, 0.0), known.astype(np.float64)])
-            self._sums[name] = _add(self._sums.get(name, add[:, :0]), add)
+            self.sums[name] = _add(self.sums.get(name, add[:, :0]), add)
 
     def close_unit(self) -> None:
         """Average the rollouts of each scene; all of a scene's rollouts are in one unit."""
@@ -77,6 +79,13 @@ class Tally:
             mean = scene_mean(values, np.ones((1, len(rows))))[0]
             self.means[scenario_id] = dict(zip(rows[0], mean.tolist(), strict=True))
         self._open.clear()
+
+    def merge(self, other: "Tally") -> None:
+        """Take what another unit has tallied."""
+        self.means |= other.means
+        self.rollouts += other.rollouts
+        for name, sums in other.sums.items():
+            self.sums[name] = _add(self.sums.get(name, sums[:, :0]), sums)
 
     def names(self) -> list[str]:
         """All metrics."""
@@ -90,7 +99,7 @@ class Tally:
     def curves(self) -> dict[str, Curve]:
         """Mean curves; buckets and composites follow from the features' curves."""
         found = {}
-        for name, (total, count) in self._sums.items():
+        for name, (total, count) in self.sums.items():
             mean = np.where(count > 0, total / np.where(count > 0, count, 1), np.nan)
             found[name] = Curve(mean, count)
         for protocol in PROTOCOLS if found else ():
@@ -110,6 +119,7 @@ class Summary:
 
     Attributes:
         settings: Of the stage.
+        reference: How logs and rollouts were measured.
         tally: Of the rollouts.
         log_tally: Of the logs, scored as if they were rollouts.
         divergence: Jensen-Shannon, [protocol, feature].
@@ -117,6 +127,7 @@ class Summary:
     """
 
     settings: ScoreSettings
+    reference: ReferenceSettings
     tally: Tally
     log_tally: Tally
     divergence: np.ndarray
@@ -132,9 +143,9 @@ class Summary:
             "logs": len(self.log_tally.means),
             "missing_scenes": _some(missing),
             "skipped_logs": _some(skipped),
-            "window_s": self.settings.window_s,
-            "stride_s": self.settings.stride_s,
-            "count_radius_m": self.settings.count_radius_m,
+            "window_s": self.reference.window_s,
+            "stride_s": self.reference.stride_s,
+            "count_radius_m": self.reference.count_radius_m,
             "protocols": {
                 protocol.name: self._protocol(at) for at, protocol in enumerate(PROTOCOLS)
             },

@@ -1,7 +1,6 @@
-"""Tables of the ``score`` stage: written part by part, joined without reading all."""
+"""Tables of scores: written unit by unit, joined without reading all."""
 
-import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +21,8 @@ CURVE_SCHEMA = {
     "value": pl.Float64,
     "rollouts": pl.Int64,
 }
+SUM_SCHEMA = {**CURVE_SCHEMA, "rollouts": pl.Float64}
+ROWS, SCENES, SUMS = "rows.parquet", "scenes.parquet", "sums.parquet"
 
 
 class ScoreRow(NamedTuple):
@@ -33,18 +34,59 @@ class ScoreRow(NamedTuple):
     value: float
 
 
+def rows_of(
+    scenario_id: str, rollout: int | None, numbers: Mapping[str, float], prefix: str
+) -> list[ScoreRow]:
+    """One row per number."""
+    return [
+        ScoreRow(scenario_id, rollout, f"{prefix}{name}", value)
+        for name, value in numbers.items()
+    ]
+
+
 def write_part(path: Path, rows: Sequence[ScoreRow]) -> None:
     """Write the rows of one unit; a metric without a value has no row."""
     known = [row for row in rows if not np.isnan(row.value)]
     pl.DataFrame(known, schema=SCHEMA, orient="row").write_parquet(path)
 
 
-def join_parts(parts: Path, target: Path) -> None:
-    """Join the parts in order, and remove them."""
+def join_parts(parts: Sequence[Path], target: Path) -> None:
+    """Join parts in their order."""
     empty = pl.LazyFrame(schema=SCHEMA)
-    frames = [pl.scan_parquet(path) for path in sorted(parts.glob("*.parquet"))]
+    frames = [pl.scan_parquet(path) for path in parts]
     pl.concat([empty, *frames]).sink_parquet(target, maintain_order=True)
-    shutil.rmtree(parts)
+
+
+def write_tally(folder: Path, tally: Tally) -> None:
+    """Write the means of each scene (a column per metric) and the sums of each window."""
+    names = tally.names()
+    schema = {"scenario_id": pl.String, **dict.fromkeys(names, pl.Float64)}
+    scenes = [
+        (scene, *(means[name] for name in names)) for scene, means in tally.means.items()
+    ]
+    pl.DataFrame(scenes, schema=schema, orient="row").write_parquet(folder / SCENES)
+    sums = [
+        (metric, window, float(total), float(count))
+        for metric, values in tally.sums.items()
+        for window, (total, count) in enumerate(values.T)
+    ]
+    pl.DataFrame(sums, schema=SUM_SCHEMA, orient="row").write_parquet(folder / SUMS)
+
+
+def read_tally(folder: Path, rollouts: int) -> Tally:
+    """Read what one unit has tallied of so many rollouts."""
+    scenes = pl.read_parquet(folder / SCENES)
+    sums = pl.read_parquet(folder / SUMS).partition_by(
+        "metric", maintain_order=True, as_dict=True
+    )
+    return Tally(
+        means={row.pop("scenario_id"): row for row in scenes.iter_rows(named=True)},
+        rollouts=rollouts,
+        sums={
+            str(metric): part.select("value", "rollouts").to_numpy().T
+            for (metric,), part in sums.items()
+        },
+    )
 
 
 def write_curves(target: Path, tally: Tally) -> None:

@@ -10,6 +10,7 @@ MODULES = {
     "tokenize": "pipeline.tokenize",
     "train": "pipeline.train",
     "rollout": "pipeline.rollout",
+    "reference": "pipeline.reference",
     "score": "pipeline.score",
     "report": "pipeline.report",
 }

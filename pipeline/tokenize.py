@@ -5,7 +5,7 @@ scene that cannot be written as tokens is a named row of ``refused.parquet``.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,12 +19,11 @@ from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
 from infgen.tokens.tracks import TokensError
 from pipeline.folders import write_json
+from pipeline.parquet import joined, table
 from pipeline.splits import split_of
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
 if TYPE_CHECKING:
-    import polars as pl
-
     from pipeline.columns import Unpacked
 
 SCHEMA = "infgen.tokens/1"
@@ -102,7 +101,7 @@ def finish(
     target.mkdir(parents=True, exist_ok=True)
     paths = [done.path for done in units]
     for name, columns in (("index", _INDEX), ("refused", _REFUSED)):
-        _joined(paths, f"{name}.parquet", columns).write_parquet(target / f"{name}.parquet")
+        joined(paths, f"{name}.parquet", columns).write_parquet(target / f"{name}.parquet")
     splits = {split_of(done.name): no_figures() for done in units}
     for done in units:
         splits[split_of(done.name)] += _read_figures(done.path)
@@ -157,8 +156,8 @@ class _Shard:
     def close(self) -> None:
         """Write what is left, the tables and the figures."""
         self._flush()
-        _table(self._index, _INDEX).write_parquet(self._target / "index.parquet")
-        _table(self._refused, _REFUSED).write_parquet(self._target / "refused.parquet")
+        table(self._index, _INDEX).write_parquet(self._target / "index.parquet")
+        table(self._refused, _REFUSED).write_parquet(self._target / "refused.parquet")
         figures = {
             name: value.tolist() if isinstance(value, np.ndarray) else value
             for name, value in asdict(self._figures).items()
@@ -196,24 +195,6 @@ def _read_figures(unit_folder: Path) -> Figures:
         if isinstance(value, list):
             values[name] = np.array(value, np.int64)
     return Figures(**values)
-
-
-def _table(
-    rows: Sequence[Mapping[str, Any]], columns: Mapping[str, type]
-) -> "pl.DataFrame":
-    import polars as pl  # noqa: PLC0415
-
-    types = {name: pl.String if kind is str else pl.Int64 for name, kind in columns.items()}
-    return pl.DataFrame(list(rows), schema=types)
-
-
-def _joined(
-    folders: Sequence[Path], name: str, columns: Mapping[str, type]
-) -> "pl.DataFrame":
-    import polars as pl  # noqa: PLC0415
-
-    tables = [pl.read_parquet(folder / name) for folder in folders]
-    return pl.concat([_table([], columns), *tables])
 
 
 STAGE = Stage(

@@ -1,5 +1,7 @@
 """From a scene to its tokens: the one function that puts this room together."""
 
+from typing import Any
+
 import numpy as np
 
 from infgen.clock import CLOCK, Clock
@@ -50,11 +52,7 @@ def tokenize_scene(
     )
     words = write_words(agents, entries, paths.ego)
 
-    pieces = road_pieces(scene.road_map)
-    line, lane_id = signal_lines(scene.signals, pieces.line, pieces.feature_id, last)
-    ends = clock.steps_per_token * np.arange(1, agents.move.shape[1] + 1)
-    now = np.array([scene.now])
-    lanes, lane_of = np.unique(pieces.feature_id, return_inverse=True)
+    road_fields = _roads(scene, roads, last, agents.move.shape[1], clock)
     return SceneTokens(
         scenario_id=scene.scenario_id,
         origin_xyz_m=scene.origin_xyz_m,
@@ -76,15 +74,6 @@ def tokenize_scene(
         entry_offset_m=entries.offset_m,
         entry_heading=entries.heading,
         entry_residual_rad=entries.residual_rad,
-        road_pose=pieces.pose,
-        road_z_m=pieces.z_m,
-        road_token=match_roads(pieces, roads),
-        road_point_kind=pieces.point_kind,
-        road_line_kind=pieces.line_kind,
-        road_line=pieces.line,
-        road_signal=signals_at(scene.signals, lanes, now)[lane_of, 0],
-        signal_line=line,
-        signal_state=signals_at(scene.signals, lane_id, ends),
         word=words.word,
         word_value=words.value,
         word_agent=words.agent,
@@ -92,7 +81,30 @@ def tokenize_scene(
         anchor_agent=anchors.agent,
         anchor_token=anchors.token,
         anchor_pose=anchors.pose,
+        **road_fields,
     )
+
+
+def _roads(
+    scene: Scene, roads: RoadCodebook, last: int, tokens: int, clock: Clock
+) -> dict[str, Any]:
+    """Return the fields of ``SceneTokens`` that tell of the map and its signals."""
+    pieces = road_pieces(scene.road_map)
+    line, lane_id = signal_lines(scene.signals, pieces.line, pieces.feature_id, last)
+    ends = clock.steps_per_token * np.arange(1, tokens + 1)
+    lanes, lane_of = np.unique(pieces.feature_id, return_inverse=True)
+    now = np.array([scene.now])
+    return {
+        "road_pose": pieces.pose,
+        "road_z_m": pieces.z_m,
+        "road_token": match_roads(pieces, roads),
+        "road_point_kind": pieces.point_kind,
+        "road_line_kind": pieces.line_kind,
+        "road_line": pieces.line,
+        "road_signal": signals_at(scene.signals, lanes, now)[lane_of, 0],
+        "signal_line": line,
+        "signal_state": signals_at(scene.signals, lane_id, ends),
+    }
 
 
 def _kept(paths: Paths, *, whole_log: bool) -> np.ndarray:
