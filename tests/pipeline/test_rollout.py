@@ -1,0 +1,186 @@
+import dataclasses
+
+import numpy as np
+import polars as pl
+import pytest
+import torch
+
+from infgen.config import ModelSettings, RolloutSettings, TokenSettings
+from infgen.model.network import Network
+from infgen.scene import Scene
+from pipeline import ingest
+from pipeline import rollout as stage
+from pipeline.stage import Done
+from pipeline.store import write_records
+from pipeline.weights import save_network, state_of
+
+TINY = ModelSettings(
+    width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4
+)
+SETTINGS = RolloutSettings(seconds=2.0, count=2, scenes_per_task=2, batch=3, max_agents=16)
+
+
+class Finished:
+    """Inputs of the stage: what earlier stages left on disk."""
+
+    sources = ()
+
+    def __init__(self, scenes, weights):
+        self.scenes, self.weights = scenes, weights
+
+    def units(self, name):
+        return {"ingest": self.scenes}[name]
+
+    def folder(self, name):
+        return {"train": self.weights}[name]
+
+    def content(self, name, *names):
+        return f"content of {name}"
+
+    def key(self, name):
+        raise AssertionError("a key changes more often than what the stage reads")
+
+
+def no_progress(done, total, note=""):
+    pass
+
+
+@pytest.fixture
+def weights(tmp_path, metre_moves, bent_roads):
+    torch.manual_seed(0)
+    network = Network(TINY, metre_moves, bent_roads, TokenSettings())
+    folder = tmp_path / "train"
+    folder.mkdir()
+    save_network(folder, network, state_of(network), step=7)
+    return folder
+
+
+@pytest.fixture
+def inputs(tmp_path, weights, drive, crossing, parked):
+    """One file of training, one of validation with five scenes; one cannot be played."""
+    scenes = [drive(), crossing(), drive(now=13), parked(), crossing()]
+    named = [
+        dataclasses.replace(scene, scenario_id=f"scene {at}")
+        for at, scene in enumerate(scenes)
+    ]
+    done = []
+    for name, part in (
+        ("training.tfrecord-0", named[:1]),
+        ("validation.tfrecord-0", named),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        write_records(folder / "scenes-000.zarr", part, Scene, ingest.SCHEMA, compress=True)
+        done.append(Done(name, f"key of {name}", folder, {"scenes": len(part)}))
+    return Finished(done, weights)
+
+
+def play(unit, folder, settings=SETTINGS):
+    folder.mkdir()
+    report = stage.STAGE.work(unit, folder, settings, no_progress)
+    return report, list(stage.read_rollouts(folder))
+
+
+def test_the_split_is_cut_into_units_of_a_few_scenes(inputs):
+    units = stage.STAGE.plan(inputs, SETTINGS)
+
+    assert [unit.name for unit in units] == [
+        f"validation.tfrecord-0-0000{first}" for first in (0, 2, 4)
+    ]
+    assert [unit.task["count"] for unit in units] == [2, 2, 1]
+    assert units[0].inputs == {
+        "scenes": "key of validation.tfrecord-0",
+        "weights": "content of train",
+    }
+
+
+def test_scenes_may_be_limited(inputs):
+    units = stage.STAGE.plan(inputs, dataclasses.replace(SETTINGS, scenes=3))
+
+    assert [unit.task["count"] for unit in units] == [2, 1]
+
+
+def test_every_scene_of_a_unit_is_played_as_often_as_asked(inputs, tmp_path):
+    unit = stage.STAGE.plan(inputs, SETTINGS)[0]
+
+    report, rollouts = play(unit, tmp_path / "out")
+
+    assert [(r.scenario_id, r.index) for r in rollouts] == [
+        ("scene 0", 0),
+        ("scene 0", 1),
+        ("scene 1", 0),
+        ("scene 1", 1),
+    ]
+    assert report["rollouts"] == 4
+    assert all(rollout.num_steps == 11 + 20 for rollout in rollouts)
+    index = pl.read_parquet(tmp_path / "out" / "index.parquet")
+    assert index["agents"].to_list() == [len(rollout.id) for rollout in rollouts]
+
+
+def test_a_scene_that_cannot_be_played_is_named_with_the_reason(inputs, tmp_path):
+    unit = stage.STAGE.plan(inputs, SETTINGS)[1]
+
+    report, rollouts = play(unit, tmp_path / "out")
+
+    assert {rollout.scenario_id for rollout in rollouts} == {"scene 3"}
+    assert len(report["refused"]) == 1
+    assert report["refused"][0].startswith("scene 2: the history ends at step 13")
+
+
+def test_a_unit_is_the_same_bytes_each_time(inputs, tmp_path):
+    unit = stage.STAGE.plan(inputs, SETTINGS)[0]
+
+    play(unit, tmp_path / "one")
+    play(unit, tmp_path / "two")
+
+    one, two = (
+        {
+            p.relative_to(root): p.read_bytes()
+            for p in sorted(root.rglob("*"))
+            if p.is_file()
+        }
+        for root in (tmp_path / "one", tmp_path / "two")
+    )
+    assert one == two
+
+
+def test_the_weights_fingerprint_is_in_every_rollout(inputs, tmp_path):
+    unit = stage.STAGE.plan(inputs, SETTINGS)[0]
+
+    _, rollouts = play(unit, tmp_path / "out")
+
+    assert len({rollout.weights for rollout in rollouts}) == 1
+    assert len(rollouts[0].weights) == 64
+
+
+@pytest.mark.parametrize(("everyone", "agents"), [(False, 1), (True, 2)])
+def test_agents_far_away_are_played_where_everyone_is_asked_for(
+    tmp_path, weights, build_scene, everyone, agents
+):
+    path = np.zeros((2, 91, 3))
+    path[1, :, 0] = 400.0
+    folder = tmp_path / "validation.tfrecord-0"
+    folder.mkdir()
+    scene = build_scene(path, [0, 0])
+    write_records(folder / "scenes-000.zarr", [scene], Scene, ingest.SCHEMA, compress=True)
+    inputs = Finished([Done(folder.name, "key", folder, {"scenes": 1})], weights)
+    settings = dataclasses.replace(SETTINGS, everyone=everyone, insert=False, remove=False)
+
+    _, rollouts = play(stage.STAGE.plan(inputs, settings)[0], tmp_path / "out", settings)
+
+    assert len(rollouts[0].id) == agents
+
+
+def test_the_stage_sums_up_its_units(inputs, tmp_path):
+    done = []
+    for unit in stage.STAGE.plan(inputs, SETTINGS):
+        report, _ = play(unit, tmp_path / unit.name)
+        done.append(Done(unit.name, "key", tmp_path / unit.name, report))
+    target = tmp_path / "stage"
+    target.mkdir()
+
+    report = stage.STAGE.finish(inputs, done, target, SETTINGS, no_progress)
+
+    assert report["rollouts"] == 8
+    assert len(report["refused"]) == 1
+    assert len(pl.read_parquet(target / "index.parquet")) == 8
