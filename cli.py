@@ -24,7 +24,7 @@ from pipeline.events import Events
 from pipeline.folders import StoreError
 from pipeline.locks import LockedError
 from pipeline.manifest import verify as find_damage
-from pipeline.options import Asked, Running, gathers, split_names
+from pipeline.options import Asked, Running, Scoring, gathers
 from pipeline.plan import PlanError
 from pipeline.request import Request
 from pipeline.root import Root
@@ -285,34 +285,18 @@ def towns(
 
 
 @app.command()
-def wosac(
-    records: Annotated[
-        str, typer.Argument(help="TFRecords, several by comma, or an ingested folder.")
-    ],
-    rollouts: Annotated[
-        Path, typer.Argument(help="A submission (binproto or tar.gz), or our rollouts.")
-    ],
-    metric: Annotated[
-        str, typer.Option(help="wosac-2023, -2024, -2025 or -2025-scenario-gen.")
-    ] = "wosac-2025",
-    count: Annotated[
-        int, typer.Option(help="Rollouts of each scene of a submission; 0 for any.")
-    ] = 32,
-    per_scene: Annotated[bool, typer.Option("--per-scene", help="Each scene too.")] = False,
-    json_: Json = False,
-) -> None:
+@gathers(scoring=Scoring)
+def wosac(json_: Json = False, *, scoring: Scoring) -> None:
     """Score rollouts by the metric of the Waymo Open Sim Agents Challenge.
 
     Example: infgen wosac 'validation.tfrecord-*' submission.tar.gz --per-scene
     """
-    from pipeline.wosac import score_files  # noqa: PLC0415
-
     with stopping.listening(), Screen() as screen:
-        found = score_files(split_names(records), rollouts, metric, count, screen)
+        found = scoring.official(screen)
     if json_:
         _print_json(found.to_json())
     else:
-        show_official(found, per_scene=per_scene)
+        show_official(found, per_scene=scoring.per_scene)
     if found.refused:
         raise typer.Exit(FAILED)
 

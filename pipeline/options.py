@@ -3,17 +3,21 @@
 import inspect
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from pipeline.events import Event
 from pipeline.plan import Plan, PlanError
 from pipeline.request import Request, complete
 from pipeline.root import Root
 from pipeline.runner import Orders
+
+if TYPE_CHECKING:
+    from pipeline.wosac import Official
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +102,32 @@ class Running:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Scoring:
+    """What is scored by the official metric, and how."""
+
+    records: Annotated[
+        str, typer.Argument(help="TFRecords, several by comma, or an ingested folder.")
+    ]
+    rollouts: Annotated[
+        Path, typer.Argument(help="A submission (binproto or tar.gz), or our rollouts.")
+    ]
+    metric: Annotated[
+        str, typer.Option(help="wosac-2023, -2024, -2025 or -2025-scenario-gen.")
+    ] = "wosac-2025"
+    count: Annotated[
+        int, typer.Option(help="Rollouts of each scene of a submission; 0 for any.")
+    ] = 32
+    per_scene: Annotated[bool, typer.Option("--per-scene", help="Each scene too.")] = False
+
+    def official(self, tell: Callable[[Event], None]) -> "Official":
+        """Score; tells how far it is."""
+        from pipeline.wosac import score_files  # noqa: PLC0415
+
+        names = split_names(self.records)
+        return score_files(names, self.rollouts, self.metric, self.count, tell)
+
+
 def split_names(word: str) -> list[str]:
     """Split at commas, unless the whole is the name of a file."""
     return [word] if Path(word).exists() else [part for part in word.split(",") if part]
@@ -129,6 +159,11 @@ def _options(kind: type) -> list[inspect.Parameter]:
     hints = get_type_hints(kind, include_extras=True)
     only_by_name = inspect.Parameter.KEYWORD_ONLY
     return [
-        inspect.Parameter(f.name, only_by_name, default=f.default, annotation=hints[f.name])
+        inspect.Parameter(
+            f.name,
+            only_by_name,
+            default=inspect.Parameter.empty if f.default is MISSING else f.default,
+            annotation=hints[f.name],
+        )
         for f in fields(kind)
     ]

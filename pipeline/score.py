@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from infgen.metrics.table import Against
     from infgen.rollout.rollout import Rollout
     from infgen.scene import Scene
-    from pipeline.score_summary import Tally
     from pipeline.score_write import ScoreRow
 
 

@@ -26,7 +26,8 @@ def gather(
     reference = inputs.folder("reference")
     parts = [folder / ROWS for folder in (reference, *(done.path for done in units))]
     join_parts(parts, target / "scores.parquet")
-    tally, wosac = Tally(), {}
+    tally = Tally()
+    wosac: dict[str, dict[str, Any]] = {}
     for at, done in enumerate(units):
         progress(at, len(units), "units gathered")
         tally.merge(read_tally(done.path, done.report["rollouts"]))

@@ -8,19 +8,26 @@ import numpy as np
 import polars as pl
 import pytest
 
-from infgen.config import ReportSettings, RolloutSettings, ScoreSettings, TokenSettings
+from infgen.config import (
+    ReferenceSettings,
+    ReportSettings,
+    RolloutSettings,
+    ScoreSettings,
+    TokenSettings,
+)
 from infgen.rollout.rollout import NEVER, Rollout
 from infgen.scene import Scene
 from infgen.sources.towns import builtin_records
 from infgen.sources.womd import iter_scenes
-from pipeline import ingest, report, rollout, score
+from pipeline import ingest, reference, report, rollout, score
 from pipeline.folders import write_json
 from pipeline.stage import Done, Stage
 from pipeline.store import write_records
 
 SECONDS, SCENES = 12, 2
 SOURCE = "validation.tfrecord-00000-of-00001.gz"
-SETTINGS = {"tokenize": TokenSettings(), "score": ScoreSettings(resamples=20)}
+REFERENCE = {"tokenize": TokenSettings(), "reference": ReferenceSettings()}
+SETTINGS = {"reference": ReferenceSettings(), "score": ScoreSettings(resamples=20)}
 
 
 def silent(done, total, note=""):
@@ -34,6 +41,9 @@ class Inputs:
 
     def __init__(self, root: Path, units):
         self._root, self._units = root, units
+
+    def add(self, stage, units):
+        self._units[stage] = units
 
     def units(self, stage):
         return self._units[stage]
@@ -149,15 +159,23 @@ def finished(root: Path) -> Inputs:
 
 
 def _score(root: Path, inputs: Inputs) -> None:
-    done = []
-    for unit in score.plan(inputs, SETTINGS):
-        told = score.work(unit, root / "units" / unit.name, SETTINGS, silent)
-        told = json.loads(json.dumps(told))
-        done.append(Done(unit.name, unit.name, root / "units" / unit.name, told))
+    done = _do(reference, root, inputs, REFERENCE)
+    inputs.add("reference", done)
+    reference.finish(inputs, done, root / "reference", REFERENCE, silent)
+    done = _do(score, root, inputs, SETTINGS)
     (root / "score").mkdir()
     told = score.finish(inputs, done, root / "score", SETTINGS, silent)
     settings = {name: asdict(value) for name, value in SETTINGS.items()}
     manifest(root, "score", settings, told, done)
+
+
+def _do(stage, root: Path, inputs: Inputs, settings) -> list[Done]:
+    done = []
+    for unit in stage.plan(inputs, settings):
+        target = root / "units" / f"{stage.STAGE.name}-{unit.name}"
+        told = json.loads(json.dumps(stage.work(unit, target, settings, silent)))
+        done.append(Done(unit.name, unit.name, target, told))
+    return done
 
 
 @pytest.fixture(scope="module")

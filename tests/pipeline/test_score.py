@@ -6,38 +6,62 @@ import numpy as np
 import polars as pl
 import pytest
 
-from infgen.config import ScoreSettings, TokenSettings
+from infgen.config import ConfigError, ReferenceSettings, ScoreSettings, TokenSettings
 from infgen.metrics.protocols import FEATURES, PROTOCOLS
 from infgen.rollout.rollout import NEVER, Rollout
 from infgen.scene import Scene
-from pipeline import ingest, rollout, score
+from pipeline import ingest, reference, rollout, score
 from pipeline.stage import Done
 from pipeline.store import write_records
 
 STEPS = 91
-SETTINGS = {"tokenize": TokenSettings(), "score": ScoreSettings(resamples=50)}
+SETTINGS = {"reference": ReferenceSettings(), "score": ScoreSettings(resamples=50)}
+REFERENCE = {"tokenize": TokenSettings(), "reference": ReferenceSettings()}
 SOURCE = "validation.tfrecord-00000-of-00001"
 
 
 class Inputs:
-    """Finished units of the two stages that ``score`` reads."""
+    """Finished units of the stages that ``score`` and ``reference`` read."""
 
     sources = ()
 
     def __init__(self, ingested, played):
         self._units = {"ingest": ingested, "rollout": played}
+        self.reference = None
 
     def units(self, stage):
         return self._units[stage]
 
     def folder(self, stage):
-        raise AssertionError("score reads units only")
+        assert stage == "reference"
+        return self.reference
 
     def key(self, stage):
         raise AssertionError("a key changes more often than what the stage reads")
 
     def content(self, stage, *names):
-        raise AssertionError("score reads units only")
+        assert all((self.folder(stage) / name).exists() for name in names)
+        return f"content of {stage}"
+
+    def refer(self, folder, settings=REFERENCE):
+        """Make the reference, and read it from now on."""
+        self._units["reference"] = do_units(reference, folder, self, settings)
+        self.reference = folder / "out"
+        return finish(reference, folder, self, self.units("reference"), settings)
+
+
+def do_units(stage, folder: Path, inputs: Inputs, settings) -> list[Done]:
+    """Do all units of a stage."""
+    done = []
+    for unit in stage.plan(inputs, settings):
+        target = folder / unit.name
+        told = json.loads(json.dumps(stage.work(unit, target, settings, silent)))
+        done.append(Done(unit.name, unit.name, target, told))
+    return done
+
+
+def finish(stage, folder: Path, inputs: Inputs, done, settings):
+    return stage.finish(inputs, done, folder / "out", settings, silent)
 
 
 def as_rollout(scene: Scene, index: int = 0, shift_m: float = 0.0, steps=None) -> Rollout:
@@ -89,13 +113,10 @@ def silent(done, total, note=""):
 
 
 def run(folder: Path, inputs: Inputs, settings=SETTINGS):
-    """Do the whole stage; returns the summary, the scores and the report."""
-    done = []
-    for unit in score.plan(inputs, settings):
-        target = folder / unit.name
-        report = score.work(unit, target, settings, silent)
-        done.append(Done(unit.name, unit.name, target, json.loads(json.dumps(report))))
-    report = score.finish(inputs, done, folder / "out", settings, silent)
+    """Do both stages; returns the summary, the scores and the report."""
+    inputs.refer(folder / "reference")
+    done = do_units(score, folder, inputs, settings)
+    report = finish(score, folder, inputs, done, settings)
     summary = json.loads((folder / "out" / "summary.json").read_text())
     return summary, pl.read_parquet(folder / "out" / "scores.parquet"), report
 
@@ -122,16 +143,50 @@ def result(tmp_path, inputs):
     return run(tmp_path / "score", inputs)
 
 
-def test_the_reference_is_made_of_the_logs_of_the_rollouts_split_only(tmp_path, scenes):
-    logs = [
-        ingested(tmp_path / name, scenes[:1], f"{name}.tfrecord-00000-of-00001")
-        for name in ("training", "validation")
+def test_a_unit_is_made_again_only_if_its_rollouts_or_logs_or_the_reference_change(
+    tmp_path, inputs
+):
+    inputs.refer(tmp_path / "reference")
+    (unit,) = score.plan(inputs, SETTINGS)
+
+    assert unit.name == f"{SOURCE}-00000"
+    assert unit.inputs == {
+        "rollouts": f"key of {SOURCE}-00000",
+        "scenes": f"key of {SOURCE}",
+        "logs": SOURCE,
+        "reference": "content of reference",
+    }
+
+
+def test_rollouts_of_another_split_than_the_reference_are_a_wrong_setting(tmp_path, scenes):
+    other = played(tmp_path / "p", [as_rollout(scenes[0])], "testing.tfrecord-0-of-1-00000")
+    inputs = Inputs([ingested(tmp_path / "l", scenes)], [other])
+    inputs.refer(tmp_path / "reference")
+
+    with pytest.raises(ConfigError, match=r"set reference\.split=testing"):
+        score.plan(inputs, SETTINGS)
+
+
+def test_how_rollouts_are_cut_into_units_changes_no_number(tmp_path, scenes, result):
+    rollouts = [as_rollout(scene, at, 0.5 * at) for scene in scenes for at in range(2)]
+    units = [
+        played(tmp_path / f"p{at}", rollouts[at : at + 2], f"{SOURCE}-0000{at}")
+        for at in (0, 2, 4)
     ]
-    played_unit = played(tmp_path / "played", [as_rollout(scenes[0])])
+    inputs = Inputs([ingested(tmp_path / "l", scenes)], units)
 
-    units = score.plan(Inputs(logs, [played_unit]), SETTINGS)
+    summary, scores, report = run(tmp_path / "cut", inputs)
 
-    assert [unit.name for unit in units] == [f"reference-{SOURCE}", f"{SOURCE}-00000"]
+    assert summary == result[0]
+    assert report == result[2]
+    keys = ["metric", "scenario_id", "rollout"]
+    assert scores.sort(keys).equals(result[1].sort(keys))
+    one, cut = (
+        pl.read_parquet(tmp_path / name / "out" / "curves.parquet")
+        for name in ("score", "cut")
+    )
+    assert one.drop("value").equals(cut.drop("value"))
+    np.testing.assert_allclose(one["value"], cut["value"], rtol=1e-12)
 
 
 def test_every_rollout_gets_a_row_for_every_number_that_it_has(result):
