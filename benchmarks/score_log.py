@@ -3,7 +3,7 @@
 All shared validation records (or the built-in ones), both long-term protocols and the Waymo
 metric; prints the tables of ``docs/`` as Markdown::
 
-    python benchmarks/score_log.py [--scenes N] [--rollouts N]
+    python benchmarks/score_log.py [--scenes N] [--rollouts N] [--splits training ...]
 
 The last line is one JSON object with the composites and metametrics.
 """
@@ -12,7 +12,7 @@ import argparse
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 from futures import (
@@ -171,8 +171,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--scenes", type=int, default=0, help="at most so many; 0 for all")
     parser.add_argument("--rollouts", type=int, default=32, help="of the Waymo metric")
+    parser.add_argument(
+        "--splits", nargs="+", default=["validation"], help="starts of file names, or *"
+    )
     options = parser.parse_args(arguments)
-    scenes = list(islice(read_split("validation"), options.scenes or None))
+    found = chain.from_iterable(read_split(split) for split in options.splits)
+    scenes = list(islice(found, options.scenes or None))
     long_term = LongTerm()
     for scene in scenes:
         long_term.take(scene)
