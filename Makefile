@@ -10,6 +10,8 @@ CODE := cli.py infgen pipeline benchmarks tests
 demo: $(INSTALLED)
 	$(BIN)/infgen demo
 
+# Two workers share the cores; more threads would only wait for each other.
+test: export OMP_NUM_THREADS = 1
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n 2
 
