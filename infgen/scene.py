@@ -269,3 +269,14 @@ class Scene:
                 raise SceneError(
                     f"track to predict {row} is not one of the {agents} tracks"
                 )
+
+
+def world_xyz_m(
+    scene: Scene, xyz_m: Float32[np.ndarray, "*shape 3"]
+) -> Float32[np.ndarray, "*shape 3"]:
+    """Return world positions as the official metric has them: in float32.
+
+    They equal the record's doubles rounded to float32, but for the last bit of the float32
+    around the origin. The record's zeros are exact zeros.
+    """
+    return (xyz_m + scene.origin_xyz_m).astype(np.float32)

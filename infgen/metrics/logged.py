@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int32, Int64
 
 from infgen.metrics.motion import Motion
-from infgen.scene import FeatureKind, LaneType, Scene
+from infgen.scene import FeatureKind, LaneType, Scene, world_xyz_m
 
 HISTORY_STEPS = 11
 """Steps up to and with now."""
@@ -130,7 +130,7 @@ def from_scene(scene: Scene) -> LoggedScene:
             f"scene {scene.scenario_id} has {tracks.num_steps} steps with now at "
             f"{scene.now}; expected at least {LOG_STEPS} with now at {NOW}"
         )
-    xyz_m = _to_world(tracks.xyz_m[:, :LOG_STEPS], scene)
+    xyz_m = world_xyz_m(scene, tracks.xyz_m[:, :LOG_STEPS])
     edges = _features(scene, scene.road_map.rows(FeatureKind.ROAD_EDGE))
     lanes = scene.road_map.rows(FeatureKind.LANE)
     lanes = lanes[scene.road_map.feature_type[lanes] == LaneType.SURFACE_STREET]
@@ -166,8 +166,8 @@ def _features(
     """World points of some map features, end to end, and where each starts."""
     points = [scene.road_map.points(row) for row in rows.tolist()]
     offsets = np.cumsum([0, *map(len, points)]).astype(np.int64)
-    return _to_world(
-        np.concatenate([np.zeros((0, 3), np.float32), *points]), scene
+    return world_xyz_m(
+        scene, np.concatenate([np.zeros((0, 3), np.float32), *points])
     ), offsets
 
 
@@ -185,12 +185,5 @@ def _signals(
     state = np.zeros((len(lane_id), LOG_STEPS), dtype=np.int8)
     stop_m = np.zeros((len(lane_id), LOG_STEPS, 2), dtype=np.float32)
     state[signal, step] = scene.signals.state[rows]
-    stop_m[signal, step] = _to_world(scene.signals.stop_xyz_m[rows], scene)[:, :2]
+    stop_m[signal, step] = world_xyz_m(scene, scene.signals.stop_xyz_m[rows])[:, :2]
     return lane_id, state, stop_m
-
-
-def _to_world(
-    xyz_m: Float32[np.ndarray, "... 3"], scene: Scene
-) -> Float32[np.ndarray, "... 3"]:
-    """World coordinates, rounded once."""
-    return (xyz_m.astype(np.float64) + scene.origin_xyz_m).astype(np.float32)

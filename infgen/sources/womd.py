@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 
 from infgen.scene import Scene, SceneError
 from infgen.sources import wire
@@ -70,17 +70,6 @@ def read_scenario_id(data: bytes) -> str:
         return _scenario_id(data, _by_number(data))
     except WireError as error:
         raise RecordError(f"not a usable Scenario message: {error}") from error
-
-
-def world_xyz_m(
-    scene: Scene, xyz_m: Float32[np.ndarray, "*shape 3"]
-) -> Float32[np.ndarray, "*shape 3"]:
-    """Return world positions as the official metric has them: in float32.
-
-    They equal the record's doubles rounded to float32, but for the last bit of the float32
-    around the origin. The record's zeros are exact zeros.
-    """
-    return (xyz_m + scene.origin_xyz_m).astype(np.float32)
 
 
 def _decode_scene(data: bytes) -> Scene:

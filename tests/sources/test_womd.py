@@ -6,10 +6,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infgen.scene import AgentKind, FeatureKind, LinkKind, Scene, Side, SignalState
+from infgen.scene import (
+    AgentKind,
+    FeatureKind,
+    LinkKind,
+    Scene,
+    Side,
+    SignalState,
+    world_xyz_m,
+)
 from infgen.sources import wire
 from infgen.sources.tfrecord import BadRecord, RecordError
-from infgen.sources.womd import decode_scene, iter_scenes, world_xyz_m
+from infgen.sources.womd import decode_scene, iter_scenes
 from tests.sources.oracle import expected_scene
 from tests.sources.records import NOW, STEPS, changed, small_scenario, write_tfrecord
 from tests.sources.scenario_proto import Scenario

@@ -8,8 +8,9 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from infgen.scene import world_xyz_m
 from infgen.sources.tfrecord import iter_records
-from infgen.sources.womd import decode_scene, iter_scenes, world_xyz_m
+from infgen.sources.womd import decode_scene, iter_scenes
 from tests.sources.oracle import expected_scene
 from tests.sources.records import SHARED
 from tests.sources.scenario_proto import Scenario
