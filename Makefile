@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
-CODE := cli.py infgen pipeline benchmarks tests
+CODE := cli.py infgen pipeline benchmarks examples tests
 
 .PHONY: demo test check format bench clean
 

@@ -18,24 +18,23 @@ from typing import Annotated, Any
 import typer
 
 from infgen.config import ConfigError
-from pipeline import lookup, stopping
+from pipeline import lookup, ranks, stopping, tables
 from pipeline.doctor import examine
 from pipeline.events import Events
 from pipeline.folders import StoreError
 from pipeline.locks import LockedError
 from pipeline.manifest import verify as find_damage
-from pipeline.options import Asked, Running, Scoring, gathers
+from pipeline.options import Asked, Building, Exporting, Running, Scoring, gathers
 from pipeline.plan import PlanError
 from pipeline.request import Request
 from pipeline.root import Root
 from pipeline.runner import Result
 from pipeline.runner import run as make
-from pipeline.screen import Screen, gibibytes, show_table
+from pipeline.screen import Screen, show_table
 from pipeline.settings import DEFAULT_FILE
 from pipeline.status import Standing, standings
 from pipeline.sweep import find_garbage
 from pipeline.sweep import sweep as remove_garbage
-from pipeline.tables import show_official, show_results, show_standings
 
 FAILED, WRONG, STALE, LOCKED = 1, 2, 3, 75
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -154,13 +153,7 @@ def dag(
     Example: infgen dag --mermaid
     """
     stages = asked.request().stages(os.environ).stages
-    if mermaid:
-        typer.echo("flowchart LR")
-    for entry in stages.values():
-        if mermaid:
-            typer.echo("\n".join(f"  {dep} --> {entry.name}" for dep in entry.deps))
-        else:
-            typer.echo(f"{entry.name:<12} <- {', '.join(entry.deps)}")
+    typer.echo(tables.graph_text(stages.values(), mermaid=mermaid))
 
 
 @app.command()
@@ -177,10 +170,7 @@ def gc(
     if json_:
         _print_json({"removed": yes, "garbage": [asdict(each) for each in garbage]})
         return
-    rows = [(each.path, gibibytes(each.bytes), each.why) for each in garbage]
-    total = gibibytes(sum(each.bytes for each in garbage))
-    done = "removed" if yes else "to remove with --yes"
-    show_table(f"{total} {done}", ("folder", "size", "what"), rows)
+    tables.show_garbage(garbage, removed=yes)
 
 
 @app.command()
@@ -249,8 +239,7 @@ def doctor(root: RootFolder = WORK, json_: Json = False) -> None:
     if json_:
         _print_json({"checks": [asdict(check) for check in checks]})
     else:
-        rows = [(check.what, check.state, check.note) for check in checks]
-        show_table("doctor", ("what", "state", "note"), rows)
+        tables.show_checks(checks)
     if any(check.state == "bad" for check in checks):
         raise typer.Exit(FAILED)
 
@@ -265,22 +254,13 @@ def demo(root: RootFolder = WORK / "demo", json_: Json = False) -> None:
 
 
 @app.command()
-def towns(
-    out: Annotated[Path, typer.Option(help="Folder to write to.")],
-    scenes: Annotated[int, typer.Option(help="How many scenes.")] = 8,
-    seed: Annotated[int, typer.Option(help="Other towns for another seed.")] = 0,
-    split: Annotated[str, typer.Option(help="Start of the file names.")] = "training",
-    scenes_per_file: Annotated[int, typer.Option(help="Most scenes of a file.")] = 20,
-) -> None:
+@gathers(building=Building)
+def towns(*, building: Building) -> None:
     """Write synthetic driving logs as WOMD records.
 
     Example: infgen towns --out towns --scenes 20
     """
-    from infgen.sources.towns import write_towns  # noqa: PLC0415
-
-    for path in write_towns(
-        out, scenes, seed, split=split, scenes_per_file=scenes_per_file
-    ):
+    for path in building.write():
         typer.echo(path)
 
 
@@ -296,9 +276,29 @@ def wosac(json_: Json = False, *, scoring: Scoring) -> None:
     if json_:
         _print_json(found.to_json())
     else:
-        show_official(found, per_scene=scoring.per_scene)
+        tables.show_official(found, per_scene=scoring.per_scene)
     if found.refused:
         raise typer.Exit(FAILED)
+
+
+@app.command()
+@gathers(exporting=Exporting)
+def export(json_: Json = False, *, exporting: Exporting) -> None:
+    """Write rollouts in the format of others.
+
+    Example: infgen export --to wosac --about about.yaml --out submission.tar.gz --root R
+
+    Example: infgen export --to parquet --out table --root R
+
+    A submission (wosac) needs a file --about with account_name, unique_method_name, authors
+    and acknowledge_complies_with_closed_loop_requirement.
+    """
+    with stopping.listening(), Screen() as screen:
+        found = exporting.write(screen)
+    if json_:
+        _print_json(found.to_json())
+    else:
+        tables.show_exported(found)
 
 
 def _run(
@@ -318,7 +318,7 @@ def _run(
         log = str(events.log)
         _print_json({"stages": [asdict(each) for each in results], "log": log})
     else:
-        show_results(request.root, results, events.log)
+        tables.show_results(request.root, results, events.log)
     if any(result.errors for result in results):
         raise typer.Exit(FAILED)
     _check_quarantine(request, results, running.max_bad)
@@ -335,7 +335,7 @@ def _tell_standings(found: Sequence[Standing], *, as_json: bool) -> None:
     if as_json:
         _print_json({"stages": [asdict(standing) for standing in found]})
     else:
-        show_standings(found)
+        tables.show_standings(found)
 
 
 def _standings(
@@ -386,7 +386,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in THREADS:  # One thread each: results then do not depend on who does a unit.
         os.environ.setdefault(name, "1")
     try:
-        app(args=arguments)
+        ranks.run(lambda: app(args=arguments), os.environ)
     except (ValueError, OSError, stopping.Stopped) as error:
         code = _exit_code(error)
         typer.echo(f"infgen: {error}", err=True)

@@ -4,17 +4,15 @@
 runs. A value that follows from others is a property, not a setting.
 """
 
-import types
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from difflib import get_close_matches
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from dataclasses import dataclass
 
-T = TypeVar("T")
-
-
-class ConfigError(ValueError):
-    """A setting that does not exist or cannot have that value."""
+from infgen.coerce import ConfigError as ConfigError
+from infgen.coerce import build as build
+from infgen.coerce import decisive as decisive
+from infgen.coerce import free
+from infgen.coerce import settle as settle
+from infgen.config_rollout import RolloutSettings as RolloutSettings
+from infgen.config_vocab import VocabSettings as VocabSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,71 +26,6 @@ class IngestSettings:
 
     max_scenes_per_shard: int = 500
     limit: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class VocabSettings:
-    """How the two codebooks are clustered (SPEC 2.1, 1.3).
-
-    Attributes:
-        split: Split whose scenes the codebooks are made from (start of the file name).
-        held_out: Split that the reports measure coverage on.
-        num_moves: Moves per kind of agent.
-        num_roads: Five-metre pieces of map lines.
-        tolerance_m: Radius of a disk: mean distance of corners between two moves.
-        road_tolerance_m: Radius of a disk of map pieces; 0 to search the one that fills
-            ``num_roads``.
-        segments_per_shard: Most segments of a kind taken from one shard.
-        segments_per_kind: Most segments of a kind clustered.
-        mirror: Add left/right mirrored segments where a kind would not fill its codebook.
-        vehicle_max_speed_mps: No move is faster.
-        cyclist_max_speed_mps: No move is faster.
-        pedestrian_max_speed_mps: No move is faster.
-        max_accel_mps2: No segment changes its speed faster.
-        max_yaw_rate_rad_s: No moving segment of a vehicle or cyclist turns faster.
-        seed: Of the order in which disks are laid.
-    """
-
-    split: str = "training"
-    held_out: str = "validation"
-    num_moves: int = 2048
-    num_roads: int = 1024
-    tolerance_m: float = 0.05
-    road_tolerance_m: float = 0.0
-    segments_per_shard: int = 16384
-    segments_per_kind: int = 204800
-    mirror: bool = True
-    vehicle_max_speed_mps: float = 45.0
-    cyclist_max_speed_mps: float = 15.0
-    pedestrian_max_speed_mps: float = 6.0
-    max_accel_mps2: float = 12.0
-    max_yaw_rate_rad_s: float = 2.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Refuse what no codebook can be made with.
-
-        Raises:
-            ConfigError: naming the setting.
-        """
-        for name, least, most in (
-            ("num_moves", 2, 2**15 - 1),
-            ("num_roads", 1, 2**15 - 1),
-            ("tolerance_m", 0.001, 2.0),
-            ("road_tolerance_m", 0.0, 2.0),
-            ("segments_per_shard", 1, float("inf")),
-            ("segments_per_kind", 1, float("inf")),
-            ("vehicle_max_speed_mps", 1.0, 100.0),
-            ("cyclist_max_speed_mps", 1.0, 100.0),
-            ("pedestrian_max_speed_mps", 1.0, 100.0),
-            ("max_accel_mps2", 1.0, 1000.0),
-            ("max_yaw_rate_rad_s", 0.1, 30.0),
-        ):
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise ConfigError(
-                    f"build-vocab.{name} is {value}; expected {least:g} to {most:g}"
-                )
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +92,13 @@ class ModelSettings:
         heading_map_neighbours: Nearest map tokens that a query for a heading sees.
         heading_agent_neighbours: Nearest agents that a query for a heading sees.
         max_entries: Newcomers per half second that are supervised (L').
+        life_cycle: Whether agents enter and leave. Without it nothing is left but motion:
+            SMART (SPEC 7.1). The next three switches are the ablations of SPEC 7.2.
+        leave_token: Whether the network says who leaves.
+        cell_token: Whether newcomers are placed by cell and offset, not by regression.
+        heading_token: Whether newcomers' headings are bins, not regressed.
+        pattern_tokens: Whether the network says at which steps of the next half second a
+            log would show the agent: detections flicker.
     """
 
     width: int = 128
@@ -181,6 +121,11 @@ class ModelSettings:
     heading_map_neighbours: int = 32
     heading_agent_neighbours: int = 16
     max_entries: int = 10
+    life_cycle: bool = True
+    leave_token: bool = True
+    cell_token: bool = True
+    heading_token: bool = True
+    pattern_tokens: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,13 +146,38 @@ class TrainSettings:
         first_move_weight: Weight of a newcomer's first move in the motion loss.
         motion_weight, cell_weight, heading_weight, stay_weight, add_weight, size_weight,
         kind_weight, offset_weight, map_weight: Weights of the loss terms.
+        place_weight, turn_weight: The same, where places and headings are regressed.
+        pattern_weight: The same, of validity patterns.
         max_agents: Agents per scene that a batch holds (nearest to the ego first).
         max_roads: Road tokens per scene that a batch holds (nearest to the ego first).
         max_tokens: Half seconds per scene that a batch holds; a part of longer logs.
-        checkpoint_every: Steps between checkpoints.
+        noise_moves: Moves nearest to the true one that each agent's next one is drawn from,
+            while it is learned to come back (SMART: 5; SPEC 2.3); 0 for moves as logged.
+        noise_share: Of moves, how many are drawn; the others lead back as well as can be.
+        noise_roads: Shapes nearest to the true one that a road token is drawn from (SPEC
+            1.3); 0 for the true ones.
+        accumulate: Parts that a batch is cut into, one after the other, to save memory; the
+            gradient is that of the whole batch. Each process has so many.
+        bucket_batches: So many batches are drawn at a time and scenes of about one size put
+            together; 1 for scenes as they are drawn.
+        precision: ``float32``; ``bf16`` for matrix products of half the bits (geometry and
+            losses stay as they are); or ``auto``, bf16 on a GPU that has it.
+        compile: Whether to compile the network: ``true``, ``false``, or ``auto``, on a GPU.
+        start: Folder or key of a stage ``train`` whose weights are gone on from; empty for
+            fresh ones.
+        closed_loop_top: Most likely moves from which the one nearest to the log is taken to
+            play scenes before they are learned from (CatK, SPEC 7.1); 0 for scenes as
+            logged.
+        loader_workers: Processes that prepare batches; 0 for a thread.
+        tensorboard: Whether to write event files for TensorBoard.
+        peer_timeout_s: Longest wait for another process of the same training run.
+        checkpoint_every: Steps between checkpoints; 0 for none by steps.
+        checkpoint_minutes: Time between checkpoints; 0 for none by time.
         validate_every: Steps between validation losses; 0 for only at the end.
         validation_scenes: Scenes of the validation loss.
         seed: Of initial weights, order of scenes and dropout.
+
+    Settings that ``free`` marks change nothing of what is learned.
     """
 
     split: str = "training"
@@ -230,51 +200,69 @@ class TrainSettings:
     kind_weight: float = 5.0
     offset_weight: float = 5.0
     map_weight: float = 1.0
+    place_weight: float = 10.0
+    turn_weight: float = 10.0
+    pattern_weight: float = 1.0
     max_agents: int = 128
     max_roads: int = 4096
     max_tokens: int = 18
-    checkpoint_every: int = 500
+    noise_moves: int = 0
+    noise_share: float = 1.0
+    noise_roads: int = 0
+    accumulate: int = 1
+    bucket_batches: int = 64
+    precision: str = "auto"
+    compile: str = "auto"
+    start: str = free("")  # What it names is among the stage's sources.
+    closed_loop_top: int = 0
+    loader_workers: int = free(0)
+    tensorboard: bool = free(False)
+    peer_timeout_s: float = free(600.0)
+    checkpoint_every: int = free(500)
+    checkpoint_minutes: float = free(10.0)
     validate_every: int = 0
     validation_scenes: int = 64
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Refuse what nothing can be trained with.
 
-@dataclass(frozen=True, slots=True)
-class RolloutSettings:
-    """How futures are played (SPEC 6).
-
-    Attributes:
-        split: Split whose scenes are played (start of the file name).
-        seconds: Length of a rollout after the history.
-        count: Rollouts per scene.
-        scenes: Scenes to play; 0 for all of the split.
-        scenes_per_task: Scenes of one unit of work.
-        batch: Rollouts that are played at once.
-        everyone: Whether to play every agent of the log that is there at now, however far
-            from the ego (the WOSAC protocol), or those within ``tokenize.max_distance_m``.
-        insert: Whether agents may enter.
-        remove: Whether agents may leave.
-        top_moves: Most likely moves that are sampled from.
-        top_cells: Most likely cells that are sampled from.
-        max_entries: Newcomers per half second.
-        max_agents: Agents at any one time.
-        seed: Of all random streams.
-    """
-
-    split: str = "validation"
-    seconds: float = 30.0
-    count: int = 32
-    scenes: int = 0
-    scenes_per_task: int = 8
-    batch: int = 32
-    everyone: bool = False
-    insert: bool = True
-    remove: bool = True
-    top_moves: int = 5
-    top_cells: int = 10
-    max_entries: int = 16
-    max_agents: int = 128
-    seed: int = 0
+        Raises:
+            ConfigError: naming the setting.
+        """
+        for name, words in (
+            ("precision", ("auto", "float32", "bf16")),
+            ("compile", ("auto", "true", "false")),
+        ):
+            value = getattr(self, name)
+            if value not in words:
+                expected = " or ".join(words)
+                raise ConfigError(f"train.{name} is {value!r}; expected {expected}")
+        for name, least in (
+            ("steps", 0),
+            ("batch_scenes", 1),
+            ("noise_moves", 0),
+            ("noise_roads", 0),
+            ("accumulate", 1),
+            ("bucket_batches", 1),
+            ("loader_workers", 0),
+            ("closed_loop_top", 0),
+        ):
+            value = getattr(self, name)
+            if value < least:
+                raise ConfigError(f"train.{name} is {value}; expected {least} or more")
+        if self.closed_loop_top and self.noise_moves:
+            raise ConfigError(
+                "train.closed_loop_top and train.noise_moves both lead agents off their "
+                "ways; set one of them to 0"
+            )
+        if not 0 <= self.noise_share <= 1:
+            raise ConfigError(f"train.noise_share is {self.noise_share}; expected 0 to 1")
+        if self.accumulate > self.batch_scenes:
+            raise ConfigError(
+                f"train.accumulate is {self.accumulate}, more than the "
+                f"{self.batch_scenes} scenes of a batch"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,65 +310,3 @@ class ReportSettings:
     """
 
     title: str = "InfGen"
-
-
-def build(kind: type[T], values: Mapping[str, Any], where: str) -> T:
-    """Make settings from plain values. A key that is not a field is an error.
-
-    Args:
-        kind: The settings' dataclass.
-        values: Field names to values, as YAML or the command line gave them.
-        where: What to call the place in messages (``stages.yaml:12: train``).
-
-    Raises:
-        ConfigError: naming the key, where it stands, and the nearest real one; or the value
-            and the type expected.
-    """
-    return kind(**{key: settle(kind, key, value, where) for key, value in values.items()})
-
-
-def settle(kind: type, key: str, value: Any, where: str) -> Any:
-    """Check one setting and give its value the type of its field.
-
-    Raises:
-        ConfigError: as ``build`` does.
-    """
-    names = [field.name for field in fields(kind)]
-    if key not in names:
-        near = get_close_matches(key, names, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"there is {', '.join(names)}"
-        raise ConfigError(f"{where}: no setting {key!r}; {hint}")
-    return coerce(value, get_type_hints(kind)[key], f"{where}.{key}")
-
-
-def coerce(value: Any, kind: Any, where: str) -> Any:
-    """Give a plain value the type of its field.
-
-    A YAML ``5e-4`` arrives as a string and becomes a float; a float is never cut to an int.
-
-    Raises:
-        ConfigError: naming the place, the value and the type expected.
-    """
-    if get_origin(kind) in (Union, types.UnionType):
-        if value is None:
-            return None
-        kind = next(k for k in get_args(kind) if k is not type(None))
-    wrong = ConfigError(f"{where} is {value!r}; expected {getattr(kind, '__name__', kind)}")
-    if kind is bool:
-        words = {"true": True, "false": False}
-        if isinstance(value, bool):
-            return value
-        if str(value).lower() not in words:
-            raise wrong
-        return words[str(value).lower()]
-    if isinstance(value, bool) or value is None:
-        raise wrong
-    if kind is str:
-        return str(value)
-    try:
-        number = float(value)
-        if kind is int and number != int(number):
-            raise wrong
-        return kind(number)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise wrong from error

@@ -4,7 +4,7 @@ A pose is [..., 3]: x and y in metres, heading in radians counter-clockwise from
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 
 def wrap_angle(angle_rad: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -51,3 +51,34 @@ def box_corners(
     local_m = size_lw_m[..., None, :] * signs  # [..., corner, 2]
     turned_m = rotate(local_m, pose[..., None, 2])
     return turned_m + pose[..., None, :2]
+
+
+def boxes_overlap(
+    pose: Float[np.ndarray, "... 3"],
+    size_lw_m: Float[np.ndarray, "... 2"],
+    other: Float[np.ndarray, "... 3"],
+    other_size_lw_m: Float[np.ndarray, "... 2"],
+) -> Bool[np.ndarray, "..."]:
+    """Tell which boxes overlap; boxes that only touch do not.
+
+    Two rectangles are apart if and only if one's own length or width tells them apart.
+    """
+    return ~(
+        _tells_apart(pose, size_lw_m, other, other_size_lw_m)
+        | _tells_apart(other, other_size_lw_m, pose, size_lw_m)
+    )
+
+
+def _tells_apart(
+    pose: np.ndarray, size_lw_m: np.ndarray, other: np.ndarray, other_size_lw_m: np.ndarray
+) -> np.ndarray:
+    """Whether the other box lies wholly beyond an end or a side of the first."""
+    away_m = np.abs(rotate(other[..., :2] - pose[..., :2], -pose[..., 2]))
+    turned_rad = other[..., 2] - pose[..., 2]
+    cos, sin = np.abs(np.cos(turned_rad)), np.abs(np.sin(turned_rad))
+    length_m, width_m = other_size_lw_m[..., 0] / 2, other_size_lw_m[..., 1] / 2
+    reach_m = np.stack(
+        [cos * length_m + sin * width_m, sin * length_m + cos * width_m], axis=-1
+    )
+    apart: np.ndarray = (away_m >= reach_m + size_lw_m / 2).any(axis=-1)
+    return apart

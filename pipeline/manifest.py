@@ -18,7 +18,7 @@ from typing import Any
 import google_crc32c
 
 from pipeline.folders import StoreError, write_json
-from pipeline.root import MANIFEST, RUN, Root, read_json
+from pipeline.root import MANIFEST, RUN, RUN_FOLDER, Root, read_json
 from pipeline.stage import Report
 
 BLOCK_BYTES = 1 << 22
@@ -68,7 +68,7 @@ def list_files(folder: Path) -> dict[str, list[Any]]:
 def _files(folder: Path) -> Iterator[Path]:
     apart = {folder / MANIFEST, folder / RUN}
     for path in sorted(folder.rglob("*")):
-        if path.is_file() and path not in apart:
+        if path.is_file() and path not in apart and folder / RUN_FOLDER not in path.parents:
             yield path
 
 

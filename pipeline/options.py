@@ -17,6 +17,7 @@ from pipeline.root import Root
 from pipeline.runner import Orders
 
 if TYPE_CHECKING:
+    from pipeline.export import Exported
     from pipeline.wosac import Official
 
 
@@ -31,7 +32,11 @@ class Asked:
     ] = None
     profile: Annotated[
         str | None,
-        typer.Option("--profile", "--preset", help="Settings laid over, from stages.yaml."),
+        typer.Option(
+            "--profile",
+            "--preset",
+            help="Settings laid over, from stages.yaml; several by comma, the last on top.",
+        ),
     ] = None
     set: Annotated[
         list[str] | None,
@@ -126,6 +131,70 @@ class Scoring:
 
         names = split_names(self.records)
         return score_files(names, self.rollouts, self.metric, self.count, tell)
+
+
+@dataclass(frozen=True, slots=True)
+class Building:
+    """Which towns are built, and where to."""
+
+    out: Annotated[Path, typer.Option(help="Folder to write to.")]
+    scenes: Annotated[int, typer.Option(help="How many scenes.")] = 8
+    seed: Annotated[int, typer.Option(help="Other towns for another seed.")] = 0
+    split: Annotated[str, typer.Option(help="Start of the file names.")] = "training"
+    scenes_per_file: Annotated[int, typer.Option(help="Most scenes of a file.")] = 20
+
+    def write(self) -> Sequence[Path]:
+        """Write their records."""
+        from infgen.sources.towns import write_towns  # noqa: PLC0415
+
+        return write_towns(
+            self.out,
+            self.scenes,
+            self.seed,
+            split=self.split,
+            scenes_per_file=self.scenes_per_file,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Exporting:
+    """What is exported, in whose format and to where."""
+
+    to: Annotated[
+        str, typer.Option("--to", help="wosac, gpudrive, scenarionet or parquet.")
+    ]
+    out: Annotated[Path, typer.Option(help="Folder to write; of wosac a .tar.gz.")]
+    rollouts: Annotated[
+        Path | None, typer.Argument(help="Our rollouts; default: the root's latest.")
+    ] = None
+    root: Annotated[Path, typer.Option(help="Folder of the experiment.")] = Path("work")
+    records: Annotated[
+        str | None,
+        typer.Option(help="Their logs: TFRecords, or an ingested folder; default: root's."),
+    ] = None
+    about: Annotated[
+        Path | None, typer.Option(help="YAML file that tells who submits what (wosac).")
+    ] = None
+    scenes_per_shard: Annotated[int, typer.Option(help="Of wosac.", min=1)] = 300
+
+    def write(self, tell: Callable[[Event], None]) -> "Exported":
+        """Export; tells how far it is."""
+        from pipeline.export import Order, export  # noqa: PLC0415
+        from pipeline.export_wosac import read_about  # noqa: PLC0415
+        from pipeline.logs import open_logs  # noqa: PLC0415
+
+        root = Root(self.root.absolute())
+        logs = split_names(self.records) if self.records else [str(root.latest / "ingest")]
+        about = read_about(self.about, root) if self.about else None
+        order = Order(
+            to=self.to,
+            rollouts=self.rollouts or root.latest / "rollout",
+            logs=open_logs(logs),
+            out=self.out,
+            about=about,
+            scenes_per_shard=self.scenes_per_shard,
+        )
+        return export(order, tell)
 
 
 def split_names(word: str) -> list[str]:

@@ -7,11 +7,11 @@ its settings, the keys of the stages it reads, and the fingerprints of its sourc
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
 
-from infgen.config import settle
+from infgen.config import decisive, settle
 from pipeline.root import Root
 from pipeline.settings import SOURCES, Overlay, StageEntry, Value
 from pipeline.sources import find_sources
@@ -31,7 +31,7 @@ class Planned:
         stage: Its code.
         module: Where that is, for workers.
         settings: What its functions get.
-        values: The same as plain values, by section.
+        values: The same as plain values, by section; those that decide what comes out.
         inputs: Keys of the stages it reads.
         sources: Source files it reads.
         key: Its own key.
@@ -101,7 +101,7 @@ def make_plan(
     sources = find_sources(chosen.sources, root) if reads_sources else ()
     stages: dict[str, Planned] = {}
     for name in order:
-        stages[name] = _settle(entries[name], chosen, sources, stages)
+        stages[name] = _settle(entries[name], chosen, sources, stages, root)
     return Plan(root, stages)
 
 
@@ -144,14 +144,18 @@ def _settle(
     chosen: Overlay,
     sources: tuple[Source, ...],
     before: Mapping[str, Planned],
+    root: Root,
 ) -> Planned:
     stage = _load(entry)
     sections = {
         section: _build(kind, chosen.values.get(section, {}))
         for section, kind in stage.settings.items()
     }
-    values = {section: asdict(settings) for section, settings in sections.items()}
+    values = {section: decisive(settings) for section, settings in sections.items()}
+    only = next(iter(sections.values())) if len(sections) == 1 else sections
     read = sources if SOURCES in entry.deps else ()
+    if stage.reads is not None:
+        read = (*read, *stage.reads(root.path, only))
     inputs = {dep: before[dep].key for dep in entry.deps if dep != SOURCES}
     key = digest(
         {
@@ -162,7 +166,6 @@ def _settle(
             "sources": {source.name: source.fingerprint for source in read},
         }
     )
-    only = next(iter(sections.values())) if len(sections) == 1 else sections
     return Planned(stage, entry.module, only, values, inputs, read, key)
 
 

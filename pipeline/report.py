@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from infgen.config import ReportSettings
+from infgen.config import ReportSettings, RolloutSettings
 from pipeline.manifest import read_manifest
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
@@ -83,8 +83,8 @@ def _score_tables(
     from pipeline import report_tables as tables  # noqa: PLC0415
     from pipeline.report_figures import lowest  # noqa: PLC0415
 
-    rollout = _section(manifests["rollout"], "rollout")
-    motion_only = not (rollout.get("insert", True) or rollout.get("remove", True))
+    rollout = RolloutSettings(**_section(manifests["rollout"], "rollout"))
+    motion_only = not (rollout.inserts or rollout.removes)
     return [
         tables.score_table(summary),
         tables.long_term_table(summary, motion_only=motion_only),
@@ -167,9 +167,10 @@ def _page(
 ) -> list[str]:
     from infgen.views.page import figures, heading, paragraph  # noqa: PLC0415
     from pipeline import report_figures as drawings  # noqa: PLC0415
+    from pipeline.report_training import LOG, training_figures  # noqa: PLC0415
 
     curves = drawings.read_curves(inputs.folder("score") / "curves.parquet", summary)
-    training = drawings.training_chart(inputs.folder("train") / "train.jsonl")
+    training = training_figures(inputs.folder("train") / LOG, "this run")
     played = drawings.first_played(inputs)
     weights = manifests["train"]["report"].get("weights", "unknown")
     scores, long_term, short_term, *more = (table.to_html() for table in tables)
@@ -190,7 +191,7 @@ def _page(
         heading("Features and scenes"),
         *more,
         heading("Training"),
-        figures([training] if training else []),
+        figures(training),
         heading("Run passport"),
         *(table.to_html() for table in about),
     ]
@@ -211,19 +212,24 @@ def _section(manifest: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 STAGE = Stage(
     name="report",
-    version=1,
+    version=2,
     settings={"report": ReportSettings},
     plan=plan,
     work=work,
     finish=finish,
     modules=(
+        "infgen.views.axes",
+        "infgen.views.calibration",
         "infgen.views.figures",
         "infgen.views.page",
         "infgen.views.published",
         "infgen.views.scene_picture",
         "infgen.views.tables",
+        "infgen.views.training",
         "pipeline.report",
         "pipeline.report_figures",
         "pipeline.report_tables",
+        "pipeline.report_training",
+        "pipeline.train_log",
     ),
 )

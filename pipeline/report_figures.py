@@ -1,6 +1,5 @@
-"""The figures of the report, from curves, scores, the training log and a rollout."""
+"""The figures of the report, from curves, scores and a rollout."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -70,29 +69,6 @@ def score_charts(summary: Mapping[str, Any], curves: Curves) -> list[str]:
         drawn.append(_chart(words, curves, f"Scores by window ({protocol})", "likelihood"))
         drawn.append(_features(protocol, summary["protocols"][protocol]["scores"]))
     return [drawing for drawing in drawn if drawing]
-
-
-def training_chart(path: Path) -> str:
-    """Draw the terms of the loss; nothing without a log."""
-    if not path.is_file():
-        return ""
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    lines = [line for line in lines if "learning_rate" in line]
-    names = [
-        name
-        for name in ("motion", "cell", "heading", "stay", "add", "kind")
-        if any(name in line for line in lines)
-    ]
-    step = np.array([line["step"] for line in lines], np.float64)
-    series = [
-        Series(name, step, np.array([line.get(name, np.nan) for line in lines], np.float64))
-        for name in names
-    ]
-    if not series:
-        return ""
-    return line_chart(
-        series, title="Training: terms of the loss", x_label="step", y_label="loss"
-    )
 
 
 def first_played(inputs: Inputs) -> Played | None:

@@ -19,8 +19,8 @@ from pipeline.splits import in_split
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
 if TYPE_CHECKING:
+    from infgen.rollout.player import Player
     from infgen.rollout.rollout import Rollout
-    from infgen.rollout.simulate import Player
     from infgen.rollout.trace import Start
 
 SCHEMA = "infgen.rollouts/1"
@@ -80,14 +80,14 @@ def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
         frames: list[Frame] = []
         for frame in simulate(player, batch):
             frames.append(frame)
-            share = len(frames) * CLOCK.token_s / settings.seconds
+            share = len(frames) * CLOCK.token_s / settings.length_s
             progress(len(rows) + len(batch) * share, len(starts), "rollouts")
         rollouts = collect(batch, frames, weights)
         path = target / f"rollouts-{group:03d}.zarr"
         write_records(path, rollouts, Rollout, SCHEMA, compress=True)
         rows += [_row(unit.name, group, at, played) for at, played in enumerate(rollouts)]
     table(rows, INDEX).write_parquet(target / "index.parquet")
-    return _report(rows, refused)
+    return {**_report(rows, refused), "plays": player.plays}
 
 
 def read_rollouts(folder: Path) -> "Iterator[Rollout]":
@@ -119,7 +119,8 @@ def finish(
         for name in ("inserted", "left", "agents")
     }
     refused = [line for done in units for line in done.report["refused"]]
-    return {"rollouts": count, **means, "refused": refused}
+    plays = sorted({done.report["plays"] for done in units})
+    return {"rollouts": count, "plays": "; ".join(plays), **means, "refused": refused}
 
 
 @lru_cache(maxsize=2)
@@ -128,7 +129,7 @@ def _player(weights: Path, settings: RolloutSettings) -> "tuple[Player, str]":
     import torch  # noqa: PLC0415
 
     from infgen.model.steps import Stepper  # noqa: PLC0415
-    from infgen.rollout.simulate import Player  # noqa: PLC0415
+    from infgen.rollout.player import Player  # noqa: PLC0415
     from pipeline.weights import load_network, read_about  # noqa: PLC0415
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -154,7 +155,7 @@ def _starts(
 
     first, count = unit.task["first"], unit.task["count"]
     tokens = player.tokens
-    if settings.everyone:
+    if settings.plays_everyone:
         tokens = replace(tokens, max_distance_m=math.inf)
     starts, refused = [], []
     for scene in islice(read_scenes(Path(unit.task["scenes"])), first, first + count):
@@ -199,7 +200,7 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=1,
+    version=2,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=play,

@@ -27,7 +27,9 @@ from pipeline.folders import PARTIAL, StoreError, sync_folder
 MANIFEST = "manifest.json"
 """Written last; a folder that has one is whole."""
 RUN = "run.json"
-"""Beside it: what differs from run to run."""
+"""Beside it: what differs from run to run ..."""
+RUN_FOLDER = "run"
+"""... and, in this folder, more of that: no file in it is in the manifest."""
 KEY_DIGITS = 16
 
 

@@ -11,6 +11,7 @@
     profiles:
       small: {sources: builtin, train: {steps: 100}}
 
+Profiles may be stacked: ``--profile small,paper-loss`` lays the second over the first.
 A stage may name a ``module`` of its own that ends in ``STAGE = Stage(...)``.
 """
 
@@ -79,14 +80,16 @@ class StagesFile:
     profiles: Mapping[str, Overlay]
 
     def choose(self, profile: str | None, overrides: Sequence[str] = ()) -> Overlay:
-        """Lay a profile, and then ``section.key=value`` words, over the base.
+        """Lay profiles, and then ``section.key=value`` words, over the base.
+
+        Args:
+            profile: Names with commas between, each laid over those before it.
+            overrides: The words.
 
         Raises:
             ConfigError: for a profile or section that does not exist.
         """
-        layers = [self.base]
-        if profile is not None:
-            layers.append(_pick(self.profiles, profile, "profile", "--profile"))
+        layers = [self.base, *self._picked(profile)]
         layers.append(_overrides(overrides, self._sections()))
         values: dict[str, dict[str, Value]] = {}
         for layer in layers:
@@ -96,10 +99,14 @@ class StagesFile:
         return Overlay(sources[-1] if sources else (), values)
 
     def names_sources(self, profile: str | None) -> bool:
-        """Whether a profile says itself which source files it reads."""
-        return profile is not None and bool(
-            _pick(self.profiles, profile, "profile", "--profile").sources
-        )
+        """Whether one of the profiles says itself which source files it reads."""
+        return any(overlay.sources for overlay in self._picked(profile))
+
+    def _picked(self, profile: str | None) -> list[Overlay]:
+        names = [] if profile is None else profile.split(",")
+        return [
+            _pick(self.profiles, name.strip(), "profile", "--profile") for name in names
+        ]
 
     def _sections(self) -> list[str]:
         found = [section for entry in self.stages.values() for section in entry.params]

@@ -117,6 +117,8 @@ class Stage:
             whole; runs on any worker, several times if it must, and writes the same bytes
             each time. Errors in the data are reported, not raised.
         finish: Gathers the units into the stage's own folder ``target`` (index, tables).
+        reads: Finds what the stage's settings name that no other stage of the plan makes,
+            in the root folder of the experiment or elsewhere; it then counts as a source.
         modules: Modules whose code decides the bytes; their hash is recorded.
         resumes: ``work`` finds what a killed try left below ``target`` and goes on from it.
         in_driver: Units run in the driver's process, whatever the workers (training).
@@ -128,6 +130,7 @@ class Stage:
     plan: "Callable[[Inputs, Any], Sequence[Unit]]"
     work: "Callable[[Unit, Path, Any, Progress], Report]"
     finish: "Callable[[Inputs, Sequence[Done], Path, Any, Progress], Report]"
+    reads: "Callable[[Path, Any], Sequence[Source]] | None" = None
     modules: Sequence[str] = field(default=())
     resumes: bool = False
     in_driver: bool = False

@@ -74,6 +74,11 @@ def patient() -> Iterator[None]:
     check()
 
 
+def asked() -> int:
+    """Return the number of the signal that has come; 0 if none has."""
+    return _STATE.pending
+
+
 def check() -> None:
     """Stop here if a signal has come.
 

@@ -1,15 +1,19 @@
-"""What is printed of stages: how they stand, what became of them, and their scores."""
+"""What is printed of stages, their scores, exports, and the state of a root."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.doctor import Check
 from pipeline.root import KEY_DIGITS, Root, read_json
 from pipeline.runner import Result
-from pipeline.screen import console, show_table
+from pipeline.screen import console, gibibytes, show_table
+from pipeline.settings import StageEntry
 from pipeline.status import Standing
+from pipeline.sweep import Garbage
 
 if TYPE_CHECKING:
+    from pipeline.export import Exported
     from pipeline.wosac import Official
 
 SCENES_PER_TABLE = 5
@@ -26,6 +30,14 @@ def show_standings(found: Sequence[Standing]) -> None:
     show_table("stages", ("stage", "state", "units", "key", "why"), rows)
 
 
+def graph_text(stages: Iterable[StageEntry], *, mermaid: bool) -> str:
+    """Write which stage reads which, as lines or as a Mermaid chart."""
+    if mermaid:
+        arrows = [f"  {dep} --> {each.name}" for each in stages for dep in each.deps]
+        return "\n".join(["flowchart LR", *arrows])
+    return "\n".join(f"{each.name:<12} <- {', '.join(each.deps)}" for each in stages)
+
+
 def show_results(root: Root, results: Sequence[Result], log: Path) -> None:
     """Print what became of stages, what failed and why, and the scores if there are any."""
     rows = [
@@ -40,7 +52,7 @@ def show_results(root: Root, results: Sequence[Result], log: Path) -> None:
         for unit, error in result.errors.items()
     ]
     for line in errors:
-        console(stderr=True).print(line, markup=False, highlight=False, soft_wrap=True)
+        _warn(line)
     if errors:
         console(stderr=True).print(f"tracebacks are in {log}", soft_wrap=True)
     _show_scores(root, results)
@@ -53,6 +65,41 @@ def _show_scores(root: Root, results: Sequence[Result]) -> None:
         scores = read_json(table)
         show_table("scores", scores["columns"], scores["rows"])
         console().print(f"report: {root.path / 'report'}", soft_wrap=True)
+
+
+def show_garbage(found: Sequence[Garbage], *, removed: bool) -> None:
+    """Print what nothing needs any more, and whether it is gone."""
+    rows = [(each.path, gibibytes(each.bytes), each.why) for each in found]
+    total = gibibytes(sum(each.bytes for each in found))
+    done = "removed" if removed else "to remove with --yes"
+    show_table(f"{total} {done}", ("folder", "size", "what"), rows)
+
+
+def show_checks(checks: Sequence[Check]) -> None:
+    """Print what was looked at, and how it is."""
+    rows = [(check.what, check.state, check.note) for check in checks]
+    show_table("doctor", ("what", "state", "note"), rows)
+
+
+def show_exported(found: "Exported") -> None:
+    """Print what was written, and what a reader should know of it."""
+    rows = [
+        ("written", found.out),
+        ("scenes", found.scenes),
+        ("rollouts", found.rollouts),
+        ("files", found.files),
+        ("size", gibibytes(found.bytes)),
+    ]
+    if found.before:
+        rows.append(("scenes written before", found.before))
+    if found.unused:
+        rows.append(("rollouts left out", found.unused))
+    if found.filled:
+        agents = f"{sum(found.filled.values())} in {len(found.filled)} scenes"
+        rows.append(("agents that no model plays and that keep their velocity", agents))
+    show_table(f"export to {found.format}", ("what", "value"), rows)
+    for line in found.not_played:
+        _warn(f"not played, so not in it: {line}")
 
 
 def show_official(found: "Official", *, per_scene: bool) -> None:
@@ -70,5 +117,8 @@ def show_official(found: "Official", *, per_scene: bool) -> None:
         title = f"scenes {first + 1} to {first + len(some)} of {len(scenes)}"
         show_table(title, columns, cells)
     for name, reason in found.refused:
-        line = f"refused: {name}: {reason}"
-        console(stderr=True).print(line, markup=False, highlight=False, soft_wrap=True)
+        _warn(f"refused: {name}: {reason}")
+
+
+def _warn(line: str) -> None:
+    console(stderr=True).print(line, markup=False, highlight=False, soft_wrap=True)

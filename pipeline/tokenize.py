@@ -26,7 +26,7 @@ from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 if TYPE_CHECKING:
     from pipeline.columns import Unpacked
 
-SCHEMA = "infgen.tokens/1"
+SCHEMA = "infgen.tokens/2"
 SCENES_PER_GROUP = 500
 CODEBOOKS = ("motion.zarr", "roads.zarr")
 
@@ -199,7 +199,7 @@ def _read_figures(unit_folder: Path) -> Figures:
 
 STAGE = Stage(
     name="tokenize",
-    version=1,
+    version=2,
     settings={"tokenize": TokenSettings},
     plan=plan,
     work=work,
@@ -213,6 +213,7 @@ STAGE = Stage(
         "infgen.tokens.figures",
         "infgen.tokens.grid",
         "infgen.tokens.moves",
+        "infgen.tokens.patterns",
         "infgen.tokens.presence",
         "infgen.tokens.roads",
         "infgen.tokens.scene_tokens",

@@ -7,18 +7,25 @@ from the last one; a run that was killed ends with the same bytes as one that wa
 import shutil
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.config import ConfigError, ModelSettings, TokenSettings, TrainSettings, build
+from pipeline.root import KEY_DIGITS, Root, read_json
 from pipeline.splits import in_split
-from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
+from pipeline.stage import Done, Inputs, Progress, Report, Source, Stage, Unit
 
 if TYPE_CHECKING:
     from infgen.model.network import Network
+    from pipeline.checkpoint import Training
+    from pipeline.course import Course
+    from pipeline.distributed import Team
 
 CODEBOOKS = ("motion.zarr", "roads.zarr")
 OUTPUTS = ("model.safetensors", "model.json", "train.jsonl")
+START = "start"
+"""Name of the weights to begin with, among the sources."""
 
 
 def load_network(folder: Path) -> "Network":
@@ -32,20 +39,45 @@ def load_network(folder: Path) -> "Network":
     return weights.load_network(folder)
 
 
+def reads(root: Path, settings: Mapping[str, Any]) -> list[Source]:
+    """Find the weights to begin with, if any are named: a folder, or a key of this stage.
+
+    Raises:
+        ConfigError: if there are none, or the key is of several.
+    """
+    named: str = settings["train"].start
+    if not named:
+        return []
+    stage = Root(root).stage("train")
+    keyed = [path for path in stage.glob("*") if path.name.startswith(named[:KEY_DIGITS])]
+    places = [Path(named).absolute(), *sorted(keyed)]
+    found = [place for place in places if (place / OUTPUTS[1]).is_file()]
+    if len(found) != 1:
+        told = "several have it" if found else "there is no such folder or key"
+        raise ConfigError(
+            f"train.start is {named!r}, but {told}; expected a folder with "
+            f"{OUTPUTS[0]} and {OUTPUTS[1]}, or the start of a key below {stage}"
+        )
+    folder = found[0].resolve()
+    return [Source(str(folder), START, str(read_json(folder / OUTPUTS[1])["weights"]))]
+
+
 def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
     """One unit, of all shards of the two splits."""
-    train: TrainSettings = settings["train"]
+    how: TrainSettings = settings["train"]
     shards = {
-        "scenes": _shards(inputs, train.split),
-        "held_out": _shards(inputs, train.held_out),
+        "scenes": _shards(inputs, how.split),
+        "held_out": _shards(inputs, how.held_out),
     }
     keys = {f"{use}/{d.name}": d.key for use, dones in shards.items() for d in dones}
+    keys |= {source.name: source.fingerprint for source in inputs.sources}
     folders = {use: [str(d.path) for d in dones] for use, dones in shards.items()}
+    starts = {source.name: source.url for source in inputs.sources}
     return [
         Unit(
             name="weights",
             inputs={**keys, "codebooks": inputs.content("build-vocab", *CODEBOOKS)},
-            task={**folders, "codebooks": str(inputs.folder("build-vocab"))},
+            task={**folders, **starts, "codebooks": str(inputs.folder("build-vocab"))},
         )
     ]
 
@@ -61,35 +93,72 @@ def work(
     import torch  # noqa: PLC0415
 
     from pipeline.checkpoint import drop_checkpoints  # noqa: PLC0415
-    from pipeline.loader import TokenScenes  # noqa: PLC0415
-    from pipeline.training import Course, begin, final_state, train  # noqa: PLC0415
-    from pipeline.vocabulary import load_codebooks  # noqa: PLC0415
+    from pipeline.distributed import called_together  # noqa: PLC0415
+    from pipeline.pace import peak_memory_mib  # noqa: PLC0415
+    from pipeline.training import final_state, train  # noqa: PLC0415
     from pipeline.weights import save_network  # noqa: PLC0415
 
     begun = time.monotonic()
     target.mkdir(parents=True, exist_ok=True)
-    model: ModelSettings = settings["model"]
     how: TrainSettings = settings["train"]
-    grid: TokenSettings = settings["tokenize"]
-    scenes = TokenScenes([Path(path) for path in unit.task["scenes"]])
-    held_out = TokenScenes([Path(path) for path in unit.task["held_out"]])
-    course = Course(model, how, grid, scenes, held_out, target)
-    training = begin(course, *load_codebooks(Path(unit.task["codebooks"])))
-    found = train(course, training, progress)
+    plain = {name: asdict(section) for name, section in settings.items()}
+    call = {"task": dict(unit.task), "target": str(target), "settings": plain}
+    with called_together(call, how.peer_timeout_s) as team:
+        course, training = _prepare(unit.task, target, settings)
+        found = train(course, training, progress, team)
     weights = save_network(target, training.network, final_state(training), how.steps)
     drop_checkpoints(target)
     return {
         "steps": how.steps,
-        "scenes": len(scenes),
-        "held_out": len(held_out),
+        "scenes": len(course.scenes),
+        "held_out": len(course.held_out),
         "parameters": sum(p.numel() for p in training.network.parameters()),
         "weights": weights,
-        "validation": found,
+        "validation": found.validation,
         "run": {
+            **found.run,
             "seconds": round(time.monotonic() - begun, 1),
             "threads": torch.get_num_threads(),
+            "processes": team.size,
+            "device": team.device.type,
+            "peak_memory_mib": round(peak_memory_mib(), 1),
         },
     }
+
+
+def take_part(call: Mapping[str, Any], team: "Team") -> None:
+    """Do the steps of another process's ``work`` with it; write nothing."""
+    from pipeline.training import train  # noqa: PLC0415
+
+    settings: dict[str, Any] = {
+        name: build(kind, call["settings"][name], name)
+        for name, kind in STAGE.settings.items()
+    }
+    course, training = _prepare(call["task"], Path(call["target"]), settings)
+    train(course, training, _say_nothing, team)
+
+
+def _prepare(
+    task: Mapping[str, Any], target: Path, settings: Mapping[str, Any]
+) -> "tuple[Course, Training]":
+    from pipeline.course import Course, begin  # noqa: PLC0415
+    from pipeline.loader import TokenScenes  # noqa: PLC0415
+    from pipeline.vocabulary import load_codebooks  # noqa: PLC0415
+
+    course = Course(
+        model=settings["model"],
+        train=settings["train"],
+        grid=settings["tokenize"],
+        scenes=TokenScenes([Path(path) for path in task["scenes"]]),
+        held_out=TokenScenes([Path(path) for path in task["held_out"]]),
+        folder=target,
+        start=Path(task[START]) if START in task else None,
+    )
+    return course, begin(course, *load_codebooks(Path(task["codebooks"])))
+
+
+def _say_nothing(done: float, total: float, note: str = "") -> None:
+    """Only the first process tells progress."""
 
 
 def finish(
@@ -109,29 +178,44 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=1,
+    version=2,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,
     finish=finish,
+    reads=reads,
     modules=(
         "infgen.model.agents",
         "infgen.model.batch",
+        "infgen.model.closed_loop",
+        "infgen.model.columns",
         "infgen.model.entries",
         "infgen.model.layers",
         "infgen.model.losses",
+        "infgen.model.matching",
+        "infgen.model.measures",
         "infgen.model.network",
         "infgen.model.outputs",
         "infgen.model.pairs",
         "infgen.model.relations",
         "infgen.model.roads",
         "infgen.model.sight",
+        "infgen.model.steps",
+        "infgen.model.supervised",
         "infgen.model.window",
+        "infgen.tokens.moves",
+        "infgen.tokens.noise",
         "pipeline.checkpoint",
+        "pipeline.course",
+        "pipeline.descent",
+        "pipeline.journal",
         "pipeline.loader",
+        "pipeline.order",
+        "pipeline.precision",
         "pipeline.train",
         "pipeline.train_log",
         "pipeline.training",
+        "pipeline.validation",
         "pipeline.weights",
     ),
     resumes=True,

@@ -98,6 +98,41 @@ def load_network(folder: Path) -> Network:
     return network.eval()
 
 
+def take_weights(network: Network, folder: Path) -> None:
+    """Give a network the weights in a folder, made with the same vocabularies.
+
+    What the folder holds beyond the network's own parameters is left aside.
+
+    Raises:
+        StoreError: naming the parameters that are missing there or of another shape; or if
+            the weights were made with other vocabularies, or are not what they were.
+    """
+    about = read_about(folder)
+    own_books = vocabulary_fingerprint(network.motion_codebook(), network.road_codebook())
+    if about["vocabulary"] != own_books:
+        raise StoreError(
+            f"{folder} was trained with vocabulary {about['vocabulary'][:12]}, expected "
+            f"{own_books[:12]}; build-vocab must have the same settings and records"
+        )
+    found = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+    if found != about["weights"]:
+        raise StoreError(f"{folder / WEIGHTS} is not the one that {ABOUT} tells of")
+    tensors = read_tensors(folder / WEIGHTS)
+    parameters = dict(network.named_parameters())
+    unfit = [
+        name
+        for name, parameter in parameters.items()
+        if name not in tensors or tensors[name].shape != parameter.shape
+    ]
+    if unfit:
+        raise StoreError(
+            f"{folder} has no weights of the right shape for {', '.join(unfit)}"
+        )
+    with torch.no_grad():
+        for name, parameter in parameters.items():
+            parameter.copy_(tensors[name])
+
+
 def read_about(folder: Path) -> dict[str, Any]:
     """Read what is said about the weights in a folder.
 

@@ -1,6 +1,7 @@
 """Kill stages at random moments, run again, and compare every byte with a quiet run.
 
     python tests/kill_and_resume.py --kills 20 --records '../data/*.tfrecord*'
+    python tests/kill_and_resume.py --kills 20 --profile tiny --stages train --workers
 
 For each stage and kill: start the stage in a process group of its own, wait until it is at
 work, SIGKILL the group at a random (seeded) moment, check that all that looks whole is
@@ -30,7 +31,7 @@ from pipeline.root import Root  # noqa: E402
 
 STAGES = ("ingest", "build-vocab", "tokenize")
 WORKERS = ("local:1", "local:2", "local:4")
-PER_RUN = {"run.json", "lock", "attempt.json"}
+PER_RUN = {"run.json", "lock", "attempt.json", "pace.jsonl"}
 POLL_S = 0.005
 TRIES = 4
 """A kill that comes when all is done does not count; the next draws another moment."""
@@ -151,7 +152,7 @@ def main(arguments: list[str] | None = None) -> None:
         words = ("--records", asked.records, "--profile", asked.profile)
         trial = Trial(words, Path(folder))
         quiet = trial.folder / "quiet"
-        trial.make(STAGES[-1], quiet)
+        trial.make((asked.stages or STAGES)[-1], quiet)
         say(f"quiet run: {len(digest(quiet))} files")
         for stage in asked.stages:
             kill_stage(trial, stage, quiet, asked.kills, asked.seed)

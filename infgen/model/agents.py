@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from infgen.clock import CLOCK
 from infgen.config import ModelSettings
 from infgen.model.layers import (
     Attention,
@@ -18,13 +19,16 @@ from infgen.model.layers import (
     mlp,
     normed,
 )
-from infgen.model.relations import direction, relation_embedding
+from infgen.model.outputs import MotionOutputs
+from infgen.model.pairs import Shared
+from infgen.model.relations import Rows, direction, relation_embedding
 from infgen.model.sight import Around, Reach
 from infgen.scene import AgentKind
 from infgen.tokens.codebook import MotionCodebook
 from infgen.tokens.grid import Grid
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
 
+NUM_PATTERNS = 1 << CLOCK.steps_per_token
 KINDS = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST)
 MAX_SPEED_MPS = 50.0
 """Faster past displacements are not told apart."""
@@ -66,15 +70,18 @@ class AgentTables:
 
     Attributes:
         moves: Of every kind's moves, then ``FIRST_MOVE``, then ``NO_MOVE``.
-        cells: Of every cell, then ``NO_CELL``.
+        cells: Of every cell, then ``NO_CELL``; None without a life cycle.
     """
 
     moves: Tensor
-    cells: Tensor
+    cells: Tensor | None
 
 
 class AgentEmbedding(nn.Module):
-    """What an agent is and did last, by itself (SPEC 4.4)."""
+    """What an agent is and did last, by itself (SPEC 4.4).
+
+    Where it is in its life and in the ego's grid is left out where only motion is modelled.
+    """
 
     corners_m: Tensor
     centre_m: Tensor
@@ -83,7 +90,7 @@ class AgentEmbedding(nn.Module):
         self, settings: ModelSettings, codebook: MotionCodebook, grid: Grid
     ) -> None:
         super().__init__()
-        width = settings.width
+        width, life = settings.width, settings.life_cycle
         self.num_moves = codebook.num_moves
         self.num_cells = grid.num_cells
         corners_m = torch.from_numpy(codebook.end_corners_m.copy())
@@ -92,19 +99,21 @@ class AgentEmbedding(nn.Module):
         self.register_buffer("centre_m", centre_m, persistent=False)
         self.moves = nn.ModuleList(embedding_mlp(8, width) for _ in KINDS)
         self.special_moves = nn.Embedding(2, width)
-        self.cells = embedding_mlp(2, width)
-        self.no_cell = nn.Embedding(1, width)
+        self.cells = embedding_mlp(2, width) if life else None
+        self.no_cell = nn.Embedding(1, width) if life else None
         self.motion = FourierEmbedding(2, settings.fourier_bands, width)
         self.kind = nn.Embedding(len(KINDS), width)
         self.size = embedding_mlp(3, width)
-        self.presence = nn.Embedding(len(Presence), width)
-        self.fuse = embedding_mlp(4 * width, width)
+        self.presence = nn.Embedding(len(Presence), width) if life else None
+        self.fuse = embedding_mlp((4 if life else 2) * width, width)
 
     def tables(self) -> AgentTables:
         """Embed all moves and cells."""
         moves = [mlp(m) for mlp, m in zip(self.moves, self.corners_m, strict=True)]
-        cells = [self.cells(self.centre_m), self.no_cell.weight]
-        return AgentTables(torch.cat([*moves, self.special_moves.weight]), torch.cat(cells))
+        cells = None
+        if self.cells is not None and self.no_cell is not None:
+            cells = torch.cat([self.cells(self.centre_m), self.no_cell.weight])
+        return AgentTables(torch.cat([*moves, self.special_moves.weight]), cells)
 
     def forward(self, agents: AgentRows, tables: AgentTables) -> Tensor:
         """Embed agents: [N, D]."""
@@ -112,14 +121,11 @@ class AgentEmbedding(nn.Module):
         special = len(KINDS) * self.num_moves
         move = torch.where(agents.move == FIRST_MOVE, special, move)
         move = torch.where(agents.move == NO_MOVE, special + 1, move)
-        cell = torch.where(agents.cell == NO_CELL, self.num_cells, agents.cell)
         what = self.kind(agents.kind) + self.size(agents.size_lwh_m)
-        parts = [
-            gather(tables.moves, move),
-            self.motion(_last_motion(agents), what),
-            self.presence(agents.presence),
-            gather(tables.cells, cell),
-        ]
+        parts = [gather(tables.moves, move), self.motion(_last_motion(agents), what)]
+        if self.presence is not None and tables.cells is not None:
+            cell = torch.where(agents.cell == NO_CELL, self.num_cells, agents.cell)
+            parts += [self.presence(agents.presence), gather(tables.cells, cell)]
         embedded: Tensor = self.fuse(torch.cat(parts, dim=-1))
         return embedded
 
@@ -151,7 +157,7 @@ class Sight:
         agents: Rows of the agents around them.
     """
 
-    past_relation: Tensor
+    past_relation: Shared
     past_present: Tensor
     roads: Seen
     agents: Around
@@ -167,9 +173,9 @@ class MotionBlock(nn.Module):
         self.roads = Attention(width, heads, dropout, bipartite=True)
         self.agents = Attention(width, heads, dropout, bipartite=False)
 
-    def forward(self, x_ND: Tensor, past_NKD: Tensor, sight: Sight) -> Tensor:
-        """Update agents; ``past_NKD`` are their normed features of earlier tokens."""
-        x_ND = self.past(x_ND, Seen(past_NKD, sight.past_relation, sight.past_present))
+    def forward(self, x_ND: Tensor, past: Seen, sight: Sight) -> Tensor:
+        """Update agents; ``past`` are they themselves at earlier tokens."""
+        x_ND = self.past(x_ND, past)
         x_ND = self.roads(x_ND, sight.roads)
         updated: Tensor = self.agents(x_ND, sight.agents.seen(normed(x_ND)))
         return updated
@@ -193,7 +199,10 @@ class MotionStack(nn.Module):
             MotionBlock(settings) for _ in range(settings.motion_blocks)
         )
         self.move = mlp(width, width, num_moves)
-        self.leave = mlp(width, width, 1)
+        leaves = settings.life_cycle and settings.leave_token
+        self.leave = mlp(width, width, 1) if leaves else None
+        patterns = settings.pattern_tokens
+        self.pattern = mlp(width, width, NUM_PATTERNS) if patterns else None
 
     def roads_reach(self) -> Reach:
         """How agents see roads."""
@@ -210,5 +219,15 @@ class MotionStack(nn.Module):
     def forward(self, x_ND: Tensor, past_index: Tensor, sight: Sight) -> Tensor:
         """Update the agents of all tokens; ``past_index`` are rows of their own past."""
         for block in self.blocks:
-            x_ND = block(x_ND, gather(normed(x_ND), past_index), sight)
+            past = Seen(normed(x_ND), past_index, sight.past_relation, sight.past_present)
+            x_ND = block(x_ND, past, sight)
         return x_ND
+
+    def foretell(self, rows: Rows, x_ND: Tensor) -> MotionOutputs:
+        """Say of every row, by its updated features, what it does next."""
+        return MotionOutputs(
+            rows,
+            self.move(x_ND),
+            None if self.leave is None else self.leave(x_ND)[:, 0],
+            None if self.pattern is None else self.pattern(x_ND),
+        )

@@ -11,16 +11,17 @@ A batch is a function of its records, their draws and the limits: nothing is ran
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float32, Int16, Int64, Integer
 from torch import Tensor
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
-from infgen.model.window import SceneWindow, cut_window
-from infgen.tokens.grid import encode_heading, make_grid, to_grid
+from infgen.model.window import SceneWindow, cut_window, disturb
+from infgen.tokens.grid import Grid, encode_heading, make_grid, to_grid
+from infgen.tokens.noise import Noise, exchange_roads
 from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE, Presence, SceneTokens
 
 T = TypeVar("T")
@@ -29,8 +30,9 @@ NOBODY = -1
 """Agent of an empty slot."""
 OUTSIDE = 1 << 15
 """Turn of a newcomer that is in no cell: no query may see it yet."""
-PICKED_SHARE = 1 / 3
-"""Share of road tokens that are hidden to be predicted."""
+PICKED_SHARE = 0.15
+"""Share of road tokens that are hidden to be predicted: few, as everyone else does without
+them in the same pass."""
 PSEUDO_PER_TOKEN = 2
 """Agents per half second that play newcomers, to learn headings and offsets from."""
 
@@ -44,9 +46,12 @@ class Agents:
         size_lwh_m: Boxes.
         near: Whether the agent has a motion loss.
         pose: x, y, heading at each token's end.
-        move: Row of the kind's codebook, ``FIRST_MOVE`` or ``NO_MOVE``.
+        move: Row of the kind's codebook that led here, ``FIRST_MOVE`` or ``NO_MOVE``.
+        label: The move to learn for the same half second. It differs from ``move`` only
+            where agents are led off their ways, and then leads back.
         presence: ``Presence``.
         observed: Whether the log shows the agent throughout the token.
+        pattern: Bit i: whether the log itself shows it at step i + 1 of the token.
         cell: Cell of the ego's grid, or ``NO_CELL``.
         turn: Of an agent that enters at this token, its turn among those that do; -1 for
             all others, ``OUTSIDE`` for who enters outside the grid.
@@ -57,8 +62,10 @@ class Agents:
     near: Bool[Tensor, "scene agent"]
     pose: Float32[Tensor, "scene token agent 3"]
     move: Int64[Tensor, "scene token agent"]
+    label: Int64[Tensor, "scene token agent"]
     presence: Int64[Tensor, "scene token agent"]
     observed: Bool[Tensor, "scene token agent"]
+    pattern: Int64[Tensor, "scene token agent"]
     cell: Int64[Tensor, "scene token agent"]
     turn: Int64[Tensor, "scene token agent"]
 
@@ -178,16 +185,20 @@ class Limits:
         )
 
 
-def collate(records: Sequence[SceneTokens], limits: Limits, draw: int) -> Batch:
+def collate(
+    records: Sequence[SceneTokens], limits: Limits, draw: int, noise: Noise | None = None
+) -> Batch:
     """Put scenes side by side.
 
     Args:
         records: The scenes.
         limits: How much of each is taken.
         draw: Which of the many views of a scene to take: it decides the part of a long log,
-            the hidden road tokens and who plays newcomer. Equal draws, equal batches.
+            the hidden road tokens, who plays newcomer, and what noise does. Equal draws,
+            equal batches.
+        noise: How tokens are disturbed, to learn from; None for scenes as they are.
     """
-    scenes = [_scene(record, limits, draw) for record in records]
+    scenes = [_scene(record, limits, draw, noise) for record in records]
     return Batch(
         scenario_ids=tuple(record.scenario_id for record in records),
         agents=_pad([scene[0] for scene in scenes], Agents),
@@ -202,8 +213,20 @@ def collate_roads(records: Sequence[SceneTokens], max_roads: int) -> Roads:
     maps = []
     for record in records:
         window = cut_window(record, 0, record.num_tokens, record.num_agents, max_roads)
-        maps.append(_roads(window, np.zeros(len(window.roads), dtype=bool)))
+        token = record.road_token[window.roads]
+        maps.append(_roads(window, token, np.zeros(len(token), dtype=bool)))
     return _pad(maps, Roads)
+
+
+def describe(
+    pose: Float32[np.ndarray, "*batch 3"],
+    ego_pose: Float32[np.ndarray, "*batch 3"],
+    cell: Integer[np.ndarray, "*batch"],
+    grid: Grid,
+) -> tuple[Int16[np.ndarray, "*batch"], Float32[np.ndarray, "*batch 2"]]:
+    """Return heading bins and offsets within their cells of agents beside egos."""
+    heading = encode_heading(pose[..., 2] - ego_pose[..., 2], grid)
+    return heading, to_grid(pose[..., :2], ego_pose) - grid.centre_m[cell]
 
 
 def to_device(batch: T, device: torch.device) -> T:
@@ -220,19 +243,31 @@ _Arrays = dict[str, np.ndarray]
 
 
 def _scene(
-    record: SceneTokens, limits: Limits, draw: int
+    record: SceneTokens, limits: Limits, draw: int, noise: Noise | None
 ) -> tuple[_Arrays, _Arrays, _Arrays, _Arrays]:
     """Arrays of agents, roads, entries and details of one scene."""
-    digest = hashlib.sha256(f"{draw}/{record.scenario_id}".encode()).digest()
-    random = np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
+    random = _keyed(f"{draw}/{record.scenario_id}")
+    chance = _keyed(f"noise/{draw}/{record.scenario_id}")  # Noise moves no other draw.
+    grid = make_grid(limits.grid)
     spare = max(0, record.num_tokens - limits.tokens)
     start = int(random.integers(spare + 1))
     window = cut_window(record, start, limits.tokens, limits.agents, limits.roads)
+    if noise and noise.moves:
+        window = disturb(window, noise, grid, chance)
     turn = _turns(window)
     entries = _entries(window, turn, limits.entries)
-    details = _details(window, entries, make_grid(limits.grid), random)
+    details = _details(window, entries, grid, random)
     picked = random.random(len(window.roads)) < PICKED_SHARE
-    return _agents(window, turn), _roads(window, picked), entries, details
+    token = record.road_token[window.roads]
+    if noise:
+        token = exchange_roads(token, picked, noise, chance)
+    return _agents(window, turn), _roads(window, token, picked), entries, details
+
+
+def _keyed(key: str) -> np.random.Generator:
+    """Random numbers that a key decides."""
+    digest = hashlib.sha256(key.encode()).digest()
+    return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
 
 
 def _agents(window: SceneWindow, turn: np.ndarray) -> _Arrays:
@@ -242,14 +277,16 @@ def _agents(window: SceneWindow, turn: np.ndarray) -> _Arrays:
         "near": window.near,
         "pose": window.pose.swapaxes(0, 1),
         "move": window.move.T,
+        "label": window.label.T,
         "presence": window.presence.T,
         "observed": window.observed.T,
+        "pattern": window.pattern.T,
         "cell": window.cell.T,
         "turn": turn.T,
     }
 
 
-def _roads(window: SceneWindow, picked: np.ndarray) -> _Arrays:
+def _roads(window: SceneWindow, token: np.ndarray, picked: np.ndarray) -> _Arrays:
     record, rows = window.record, window.roads
     line = record.road_line[rows]
     follows = np.zeros(len(rows), dtype=bool)
@@ -257,7 +294,7 @@ def _roads(window: SceneWindow, picked: np.ndarray) -> _Arrays:
     return {
         "real": np.ones(len(rows), dtype=bool),
         "pose": record.road_pose[rows],
-        "token": record.road_token[rows],
+        "token": token,
         "point_kind": record.road_point_kind[rows],
         "line_kind": record.road_line_kind[rows],
         "signal": record.road_signal[rows],
@@ -292,7 +329,7 @@ def _entries(window: SceneWindow, turn: np.ndarray, limit: int) -> _Arrays:
 
 
 def _details(
-    window: SceneWindow, entries: _Arrays, grid: Any, random: np.random.Generator
+    window: SceneWindow, entries: _Arrays, grid: Grid, random: np.random.Generator
 ) -> _Arrays:
     """Newcomers in order, then agents that are there already and play the part."""
     token, turn = np.nonzero(entries["agent"] >= 0)
@@ -308,6 +345,7 @@ def _details(
     tokens = np.concatenate([token, players[:, 1]])
     pose, ego_pose = window.pose[rows, tokens], window.pose[0, tokens]
     cell = window.cell[rows, tokens]
+    heading, offset_m = describe(pose, ego_pose, cell, grid)
     return {
         "present": np.ones(len(rows), dtype=bool),
         "newcomer": np.arange(len(rows)) < len(row),
@@ -317,12 +355,18 @@ def _details(
         "cell": cell,
         "kind": window.kind[rows],
         "size_lwh_m": window.size_lwh_m[rows],
-        "heading": encode_heading(pose[:, 2] - ego_pose[:, 2], grid),
-        "offset_m": to_grid(pose[:, :2], ego_pose) - grid.centre_m[cell],
+        "heading": heading,
+        "offset_m": offset_m,
     }
 
 
-_PADDING = {"move": NO_MOVE, "cell": NO_CELL, "turn": -1, "agent": NOBODY}
+_PADDING = {
+    "move": NO_MOVE,
+    "label": NO_MOVE,
+    "cell": NO_CELL,
+    "turn": -1,
+    "agent": NOBODY,
+}
 
 
 def _pad(scenes: Sequence[_Arrays], kind: type[T]) -> T:

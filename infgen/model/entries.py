@@ -3,13 +3,16 @@
 Shape letters as in ``layers``; S are the turns of newcomers within one half second.
 """
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 from infgen.config import ModelSettings
 from infgen.model.agents import KINDS
 from infgen.model.layers import Attention, Seen, embedding_mlp, mlp
-from infgen.model.relations import relation_embedding
+from infgen.model.outputs import DetailOutputs, EntryOutputs
+from infgen.model.relations import Rows, relation_embedding
 from infgen.model.sight import Reach
 from infgen.tokens.grid import Grid
 
@@ -44,6 +47,7 @@ class CellStack(nn.Module):
         width, bands = settings.width, settings.fourier_bands
         self.settings = settings
         self.num_cells = grid.num_cells
+        self.radius_m = grid.radius_m
         self.query = nn.Embedding(1, width)
         self.occupancy = mlp(grid.num_cells, width, width)
         self.roads_relation = relation_embedding(settings.query_radius_m, bands, width)
@@ -52,7 +56,9 @@ class CellStack(nn.Module):
             QueryBlock(settings) for _ in range(settings.scene_blocks)
         )
         self.add = mlp(width, width, 1)
-        self.cell = mlp(width, width, grid.num_cells)
+        by_cell = settings.cell_token
+        self.cell = mlp(width, width, grid.num_cells) if by_cell else None
+        self.place = None if by_cell else mlp(width, width, 2)
 
     def roads_reach(self) -> Reach:
         """How the query sees roads."""
@@ -76,6 +82,16 @@ class CellStack(nn.Module):
             x = block(x, roads, agents)
         return x
 
+    def answer(self, rows: Rows, x: Tensor) -> EntryOutputs:
+        """Say of every row, by its updated features, whether an agent enters and where."""
+        return EntryOutputs(
+            rows,
+            self.add(x)[..., 0],
+            None if self.cell is None else self.cell(x),
+            None if self.place is None else self.radius_m * torch.tanh(self.place(x)),
+            self.radius_m,
+        )
+
     def occupied(self, cell: Tensor, seen: Tensor) -> Tensor:
         """Mark the cells [..., cell] that hold an agent that is seen.
 
@@ -89,7 +105,10 @@ class CellStack(nn.Module):
 
 
 class DetailStack(nn.Module):
-    """Ask, from the centre of a cell, who enters there and how it stands (SPEC 4.7)."""
+    """Ask, from the centre of a cell, who enters there and how it stands (SPEC 4.7).
+
+    Where places are regressed, it is asked from the place itself.
+    """
 
     centre_m: Tensor
 
@@ -110,8 +129,10 @@ class DetailStack(nn.Module):
         self.kind = mlp(width, width, len(KINDS))
         self.given_kind = nn.Embedding(len(KINDS), width)
         self.size = mlp(width, width, 3)
-        self.heading = mlp(width, width, grid.num_headings)
-        self.offset = mlp(width, width, 2)
+        by_bin = settings.heading_token
+        self.heading = mlp(width, width, grid.num_headings) if by_bin else None
+        self.turn = None if by_bin else mlp(width, width, 1)
+        self.offset = mlp(width, width, 2) if settings.cell_token else None
 
     def roads_reach(self) -> Reach:
         """How the query sees roads."""
@@ -132,12 +153,26 @@ class DetailStack(nn.Module):
             x = block(x, roads, agents)
         return x
 
-    def given(self, x: Tensor, kind: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Size (log of metres), heading logits and offset (metres), once the kind is known.
+    def asked_at(self, cell: Tensor, offset_m: Tensor) -> Tensor:
+        """Where in the ego's grid frame a known newcomer is asked for [N, 2]."""
+        centre_m = self.centre_m[cell]
+        return centre_m if self.offset is not None else centre_m + offset_m
+
+    def answer(self, rows: Rows, x: Tensor, kind: Tensor) -> DetailOutputs:
+        """Say who enters, and how it stands once its kind is known.
 
         Args:
-            x: Features [..., D].
-            kind: ``AgentKind`` [...].
+            rows: What the features are of.
+            x: Updated features [N, ..., D].
+            kind: ``AgentKind`` of each.
         """
-        x = x + self.given_kind(kind)
-        return self.size(x), self.heading(x), self.reach_m * torch.tanh(self.offset(x))
+        given = x + self.given_kind(kind)
+        turn, offset = self.turn, self.offset
+        return DetailOutputs(
+            rows,
+            self.kind(x),
+            self.size(given),
+            None if self.heading is None else self.heading(given),
+            None if turn is None else math.pi * torch.tanh(turn(given)[..., 0]),
+            None if offset is None else self.reach_m * torch.tanh(offset(given)),
+        )

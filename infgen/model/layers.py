@@ -5,14 +5,13 @@ C width of one head, F scalars, P nodes of a table.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from infgen.model.pairs import look_at_pairs
+from infgen.model.pairs import Shared, look_at_pairs
 
 FEED_FORWARD = 4
 """The feed-forward part is so many times as wide as the features."""
@@ -58,6 +57,32 @@ def initialise(module: nn.Module) -> None:
         nn.init.normal_(module.weight, std=0.02)
 
 
+def dropout_factors(like: Tensor, share: float) -> Tensor:
+    """Draw 0 for about a share of the places, else what makes up for the zeros.
+
+    One random byte decides a place, an eighth of the numbers that a draw for each would
+    take; so the share is rounded to 1/256.
+    """
+    cut = round(share * 256)
+    words = torch.empty(-(-like.numel() // 8), dtype=torch.int64, device=like.device)
+    drawn = words.random_(-(1 << 63), None).view(torch.uint8)[: like.numel()]
+    return (drawn.view(like.shape) >= cut).float().div_(1 - cut / 256)
+
+
+class Dropout(nn.Module):
+    """Forget some features while training, as ``dropout_factors`` draws them."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__()
+        self.share = share
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Drop features of any shape."""
+        if not (self.training and self.share):
+            return x
+        return x * dropout_factors(x, self.share)
+
+
 class FourierEmbedding(nn.Module):
     """A few scalars as one feature: each through learned waves and an MLP, then summed."""
 
@@ -85,80 +110,27 @@ class FourierEmbedding(nn.Module):
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
-    """Range of a scalar that a table covers; values beyond are taken as its ends.
-
-    Attributes:
-        first: Where the first node is.
-        last: Where the last node is.
-        nodes: Number of nodes, evenly spaced.
-        closed: Whether the two ends mean the same, as for angles of -pi and pi: rounding
-            must not tell them apart.
-    """
-
-    first: float
-    last: float
-    nodes: int
-    closed: bool = False
-
-
-class RelationEmbedding(FourierEmbedding):
-    """A Fourier embedding of relations, read from tables instead of computed per pair.
-
-    Every scalar's function is evaluated at evenly spaced nodes and is linear between them:
-    a few thousand evaluations instead of one per pair of neighbours. Training and
-    simulation use the same tables, so there is no difference between the two.
-    """
-
-    def __init__(self, spans: Sequence[Span], bands: int, width: int) -> None:
-        super().__init__(len(spans), bands, width)
-        self.spans = tuple(spans)
-
-    def table(self) -> Tensor:
-        """Evaluate all scalars at their nodes: [P, D], one scalar after the other."""
-        return torch.cat([self._nodes(i, span) for i, span in enumerate(self.spans)])
-
-    def _nodes(self, number: int, span: Span) -> Tensor:
-        device = self.frequency.weight.device
-        at = torch.linspace(span.first, span.last, span.nodes, device=device)
-        values = self.scalar(number, at)
-        if not span.closed:
-            return values
-        middle = (values[:1] + values[-1:]) / 2
-        return torch.cat([middle, values[1:-1], middle])
-
-    def look_up(self, values: Tensor, table_PD: Tensor) -> Tensor:
-        """Embed relations [N, K, F] by a table: normed features [N, K, D]."""
-        first = values.new_tensor([span.first for span in self.spans])
-        gaps = values.new_tensor([span.nodes - 1 for span in self.spans])
-        length = values.new_tensor([span.last - span.first for span in self.spans])
-        position = ((values - first) * (gaps / length)).clamp(min=0).minimum(gaps)
-        lower = position.floor().minimum(gaps - 1)
-        share = position - lower
-
-        starts = torch.tensor([0, *(span.nodes for span in self.spans[:-1])])
-        node = lower.long() + starts.cumsum(0).to(values.device)
-        bags = torch.cat([node, node + 1], dim=-1).flatten(0, -2)  # [pair, 2 F]
-        shares = torch.cat([1 - share, share], dim=-1).flatten(0, -2)
-        summed = functional.embedding_bag(
-            bags, table_PD, mode="sum", per_sample_weights=shares
-        )
-        return normed(self.out(summed)).view(*values.shape[:-1], table_PD.shape[1])
-
-
-@dataclass(frozen=True, slots=True)
 class Seen:
     """What every target sees.
 
     Attributes:
-        features: Normed features of its neighbours [N, K, D].
-        relation: Normed features of how they stand to it [N, K, D].
+        features: Normed features of all sources [M, D].
+        index: Row of each neighbour among them [N, K].
+        relation: Normed features of how neighbours stand to their target [N, K, D].
         present: Which neighbours there are: [N, K], or [N, S, K] if slots differ.
     """
 
     features: Tensor
-    relation: Tensor
+    index: Tensor
+    relation: Shared
     present: Tensor
+
+    @classmethod
+    def own(cls, features_NKD: Tensor, relation: Shared, present: Tensor) -> "Seen":
+        """Let every target see sources of its own [N, K, D]."""
+        count = features_NKD.shape[:2].numel()
+        index = torch.arange(count, device=present.device).view(features_NKD.shape[:2])
+        return cls(features_NKD.flatten(0, 1), index, relation, present)
 
 
 class Attention(nn.Module):
@@ -194,7 +166,7 @@ class Attention(nn.Module):
             nn.LayerNorm(width),
             nn.Linear(width, FEED_FORWARD * width),
             nn.ReLU(),
-            nn.Dropout(dropout),
+            Dropout(dropout),
             nn.Linear(FEED_FORWARD * width, width),
             nn.LayerNorm(width),
         )
@@ -204,7 +176,7 @@ class Attention(nn.Module):
         slots = target if target.dim() == 3 else target[:, None]
         present = seen.present if seen.present.dim() == 3 else seen.present[:, None]
         normal = self.norm_target(slots)
-        looked = self.look(normal, Seen(seen.features, seen.relation, present))
+        looked = self.look(normal, replace(seen, present=present))
         gate = torch.sigmoid(self.gate(torch.cat([looked, normal], dim=-1)))
         update = looked + gate * (self.itself(normal) - looked)
         slots = slots + self.norm_out(self.out(update))
@@ -223,6 +195,7 @@ class Attention(nn.Module):
             _per_head(query, source[0]),
             _per_head(query, relation[0]),
             seen.features,
+            seen.index,
             seen.relation,
             hidden,
             self._kept(hidden),
@@ -235,11 +208,10 @@ class Attention(nn.Module):
         return (value + looked.weight.view(*heads, 1) * bias).flatten(2)
 
     def _kept(self, like: Tensor) -> Tensor | None:
-        """Factors of dropout: 0, or what makes up for the zeros."""
+        """Factors of dropout on the weights of pairs, if there is any."""
         if not (self.training and self.dropout):
             return None
-        drawn = torch.rand(like.shape, device=like.device)
-        return (drawn >= self.dropout).to(drawn.dtype).div_(1 - self.dropout)
+        return dropout_factors(like, self.dropout)
 
     def source_norm(self) -> nn.LayerNorm:
         """Norm of the neighbours' features: the targets' own unless they differ."""

@@ -4,6 +4,7 @@ Control tokens (stay or leave, add or begin) carry no class weights: their proba
 to be sampled from, so they must be calibrated. Each is supervised once per decision.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -12,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from infgen.config import TrainSettings
-from infgen.model.batch import Agents, Batch, Details, Entries
+from infgen.model.batch import Agents, Batch
 from infgen.model.network import EGO
 from infgen.model.outputs import (
     DetailOutputs,
@@ -21,6 +22,8 @@ from infgen.model.outputs import (
     Outputs,
     RoadOutputs,
 )
+from infgen.model.relations import Rows, wrap_angle
+from infgen.model.sight import grid_place
 from infgen.tokens.scene_tokens import Presence
 
 
@@ -67,17 +70,22 @@ class Term:
 Terms = dict[str, Term]
 CONTROLS = ("stay", "add")
 """Terms whose token is a yes or no."""
+MEASURED = ("size", "offset", "place", "turn")
+"""Terms that are distances: nothing is right or wrong."""
 
 
 def losses(outputs: Outputs, batch: Batch, settings: TrainSettings) -> Terms:
-    """Compute every term, by name."""
-    smoothing = settings.label_smoothing
-    terms = {
-        "motion": _motion(outputs.motion, batch.agents, settings),
-        "stay": _stay(outputs.motion, batch.agents),
-        **_entries(outputs.entries, batch.entries, smoothing),
-        **_details(outputs.details, batch.details),
-    }
+    """Compute every term, by name; none of what the network has no head for."""
+    smoothing, motion = settings.label_smoothing, outputs.motion
+    terms = {"motion": _motion(motion, batch.agents, settings)}
+    if motion.leave_logit is not None:
+        terms["stay"] = _stay(motion.rows, motion.leave_logit, batch.agents)
+    if motion.pattern_logits is not None:
+        terms["pattern"] = _pattern(motion.rows, motion.pattern_logits, batch.agents)
+    if outputs.entries is not None:
+        terms |= _entries(outputs.entries, batch, smoothing)
+    if outputs.details is not None:
+        terms |= _details(outputs.details, batch)
     if outputs.roads is not None:
         terms["map"] = _roads(outputs.roads, smoothing)
     return terms
@@ -99,7 +107,7 @@ def figures(terms: Mapping[str, Term]) -> dict[str, float]:
         if name in CONTROLS:
             found[f"{name}_predicted"] = float(term.right.detach()) / count
             found[f"{name}_logged"] = float(term.event) / count
-        elif name not in ("size", "offset"):
+        elif name not in MEASURED:
             found[f"{name}_accuracy"] = float(term.right.detach()) / count
     return found
 
@@ -113,7 +121,7 @@ def motion_mask(agents: Agents) -> Tensor:
     """
     entering = agents.presence == Presence.ENTERING
     there = agents.observed
-    known = _next(agents.move, -1) >= 0
+    known = _next(agents.label, -1) >= 0
     mask = known & _next(there, False)
     mask &= entering | (there & _before(there | entering))
     return mask & agents.near[:, None]
@@ -125,12 +133,16 @@ def stay_mask(agents: Agents) -> Tensor:
     All from entering to the last but one at which the agent is seen. Not the ego: it never
     leaves.
     """
-    following = _next(agents.presence, int(Presence.ABSENT))
-    goes_on = (following == Presence.PRESENT) | (following == Presence.LEAVING)
-    here = agents.visible & (agents.presence != Presence.LEAVING)
-    mask = here & goes_on
+    mask = pattern_mask(agents)
     mask[:, :, EGO] = False
     return mask
+
+
+def pattern_mask(agents: Agents) -> Tensor:
+    """Tell which tokens [scene, token, agent] the agent goes on living after."""
+    following = _next(agents.presence, int(Presence.ABSENT))
+    goes_on = (following == Presence.PRESENT) | (following == Presence.LEAVING)
+    return agents.visible & (agents.presence != Presence.LEAVING) & goes_on
 
 
 def _next(values: Tensor, last: int | bool) -> Tensor:
@@ -149,7 +161,7 @@ def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> 
     weight = torch.ones(agents.move.shape, device=mask.device)
     entering = agents.presence[:, 1:] == Presence.ENTERING
     weight[:, 1:][entering] = settings.first_move_weight  # At token 0 nobody comes in.
-    target = rows.pack(_next(agents.move, -1))
+    target = rows.pack(_next(agents.label, -1))
     return _choice(
         outputs.move_logits[mask],
         target[mask],
@@ -158,36 +170,68 @@ def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> 
     )
 
 
-def _stay(outputs: MotionOutputs, agents: Agents) -> Term:
-    mask = outputs.rows.pack(stay_mask(agents))
-    following = outputs.rows.pack(_next(agents.presence, int(Presence.ABSENT)))
-    return _event(outputs.leave_logit[mask], following[mask] == Presence.LEAVING)
+def _stay(rows: Rows, leave_logit: Tensor, agents: Agents) -> Term:
+    mask = rows.pack(stay_mask(agents))
+    following = rows.pack(_next(agents.presence, int(Presence.ABSENT)))
+    return _event(leave_logit[mask], following[mask] == Presence.LEAVING)
 
 
-def _entries(outputs: EntryOutputs, entries: Entries, smoothing: float) -> Terms:
+def _pattern(rows: Rows, pattern_logits: Tensor, agents: Agents) -> Term:
+    mask = rows.pack(pattern_mask(agents))
+    target = rows.pack(_next(agents.pattern, 0))
+    return _choice(pattern_logits[mask], target[mask], 0.0)
+
+
+def _entries(outputs: EntryOutputs, batch: Batch, smoothing: float) -> Terms:
     """ADD for every newcomer and BEGIN MOTION once after them; cells of newcomers."""
+    entries = batch.entries
     count = outputs.rows.pack(entries.count)[:, None]
     slot = torch.arange(entries.agent.shape[2], device=count.device)
     decided = slot <= count
     comes = outputs.rows.pack(entries.agent) >= 0
-    cell = outputs.rows.pack(entries.cell)
-    return {
-        "add": _event(outputs.add_logit[decided], comes[decided]),
-        "cell": _choice(outputs.cell_logits[comes], cell[comes], smoothing),
-    }
+    terms = {"add": _event(outputs.add_logit[decided], comes[decided])}
+    if outputs.cell_logits is not None:
+        cell = outputs.rows.pack(entries.cell)
+        terms["cell"] = _choice(outputs.cell_logits[comes], cell[comes], smoothing)
+    if outputs.place_m is not None:
+        gap_m = outputs.place_m - _places(outputs.rows, batch)
+        terms["place"] = _distance(gap_m[comes] / outputs.radius_m)
+    return terms
 
 
-def _details(outputs: DetailOutputs, details: Details) -> Terms:
+def _places(rows: Rows, batch: Batch) -> Tensor:
+    """Where newcomers are in the ego's grid frame [row, slot, 2]; anything for nobody."""
+    pose = rows.pack(batch.agents.pose)  # [row, agent, 3]
+    agent = rows.pack(batch.entries.agent).clamp(min=0)
+    entry_pose = pose.gather(1, agent[..., None].expand(-1, -1, 3))
+    return grid_place(entry_pose, pose[:, EGO, None])
+
+
+def _details(outputs: DetailOutputs, batch: Batch) -> Terms:
     """Kind and size of newcomers; heading and offset also of those who play the part."""
-    pack = outputs.rows.pack
+    details, pack = batch.details, outputs.rows.pack
     real = pack(details.newcomer)
     size_log_m = pack(details.size_lwh_m).clamp(min=0.05).log()
-    return {
+    terms = {
         "kind": _choice(outputs.kind_logits[real], pack(details.kind)[real], 0.0),
-        "size": _distance(outputs.size_log_m[real], size_log_m[real]),
-        "heading": _choice(outputs.heading_logits, pack(details.heading), 0.0),
-        "offset": _distance(outputs.offset_m, pack(details.offset_m)),
+        "size": _distance((outputs.size_log_m - size_log_m)[real]),
     }
+    if outputs.heading_logits is not None:
+        terms["heading"] = _choice(outputs.heading_logits, pack(details.heading), 0.0)
+    if outputs.turned_rad is not None:
+        gap_rad = wrap_angle(outputs.turned_rad - _turns(outputs.rows, batch))
+        terms["turn"] = _distance(gap_rad[:, None] / math.pi)
+    if outputs.offset_m is not None:
+        terms["offset"] = _distance(outputs.offset_m - pack(details.offset_m))
+    return terms
+
+
+def _turns(rows: Rows, batch: Batch) -> Tensor:
+    """Headings of the agents described, relative to the ego [row]."""
+    details, heading_rad = batch.details, batch.agents.pose[..., 2]
+    scene, token = rows.at // details.present.shape[1], rows.pack(details.token)
+    own_rad = heading_rad[scene, token, rows.pack(details.agent)]
+    return own_rad - heading_rad[scene, token, EGO]
 
 
 def _roads(outputs: RoadOutputs, smoothing: float) -> Term:
@@ -215,9 +259,9 @@ def _event(logit: Tensor, happens: Tensor) -> Term:
     return Term(each.sum(), _count(each), _count(each), predicted, happens.sum())
 
 
-def _distance(found: Tensor, wanted: Tensor) -> Term:
-    """Mean squared error of [row, number]."""
-    each = (found - wanted).square().mean(dim=-1)
+def _distance(gap: Tensor) -> Term:
+    """Mean square of gaps [row, number]."""
+    each = gap.square().mean(dim=-1)
     return Term(each.sum(), _count(each), _count(each), _none(each), _none(each))
 
 

@@ -1,5 +1,7 @@
 """The whole network, and one pass over all tokens of a batch at once (training)."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -7,9 +9,9 @@ from torch.nn import functional
 from infgen.clock import CLOCK
 from infgen.config import ModelSettings, TokenSettings
 from infgen.model.agents import AgentEmbedding, AgentRows, MotionStack, Sight
-from infgen.model.batch import Agents, Batch, Details, Entries
+from infgen.model.batch import Agents, Batch
 from infgen.model.entries import CellStack, DetailStack
-from infgen.model.layers import Seen, initialise, normed
+from infgen.model.layers import initialise, normed
 from infgen.model.outputs import (
     DetailOutputs,
     EntryOutputs,
@@ -17,6 +19,7 @@ from infgen.model.outputs import (
     Outputs,
     RoadOutputs,
 )
+from infgen.model.pairs import Shared
 from infgen.model.relations import Rows, relations
 from infgen.model.roads import RoadEncoder
 from infgen.model.sight import RoadFeatures, cell_pose, look_around, see_roads
@@ -55,8 +58,8 @@ class Network(nn.Module):
         self.roads = RoadEncoder(settings, roads)
         self.embed = AgentEmbedding(settings, motion, cells)
         self.motion = MotionStack(settings, motion.num_moves, CLOCK.token_s)
-        self.cells = CellStack(settings, cells)
-        self.details = DetailStack(settings, cells)
+        self.cells = CellStack(settings, cells) if settings.life_cycle else None
+        self.details = DetailStack(settings, cells) if settings.life_cycle else None
         self.apply(initialise)
 
     @property
@@ -79,19 +82,25 @@ class Network(nn.Module):
 
         Args:
             batch: The scenes.
-            hidden_roads: Also predict hidden road tokens (a second pass over the maps).
+            hidden_roads: Also predict hidden road tokens. While training, everyone sees the
+                features of the pass that hides them, as a kind of dropout; otherwise they
+                are predicted in a pass of their own.
         """
         sight = self.roads.look(batch.roads)
-        roads = self.roads(batch.roads, sight)
+        covered = sight.covered(batch.roads) if hidden_roads else sight
+        roads = self.roads(batch.roads, covered if self.training else sight)
         agents = batch.agents
         rows = Rows.where(agents.visible)
         x = self.embed(_agent_rows(agents, rows), self.embed.tables())
-        raw = normed(x)
-        hidden = self.roads.predict_hidden(batch.roads, sight) if hidden_roads else None
+        raw, cells, details = normed(x), self.cells, self.details
+        hidden = None
+        if hidden_roads:
+            known = roads if self.training else self.roads(batch.roads, covered)
+            hidden = self.roads.predict_hidden(batch.roads, known)
         return Outputs(
             motion=self._motion(agents, rows, x, roads),
-            entries=self._entries(agents, batch.entries, rows, raw, roads),
-            details=self._details(agents, batch.details, rows, raw, roads),
+            entries=None if cells is None else _entries(cells, batch, rows, raw, roads),
+            details=None if details is None else _details(details, batch, rows, raw, roads),
             roads=None if hidden is None else RoadOutputs(*hidden),
         )
 
@@ -121,9 +130,9 @@ class Network(nn.Module):
             ),
         )
         x = self.motion(x, past_index, sight)
-        return MotionOutputs(rows, self.motion.move(x), self.motion.leave(x)[:, 0])
+        return self.motion.foretell(rows, x)
 
-    def _past(self, agents: Agents, rows: Rows) -> tuple[Tensor, Tensor, Tensor]:
+    def _past(self, agents: Agents, rows: Rows) -> tuple[Tensor, Tensor, Shared]:
         """Rows, presence and relations of every row's own past, oldest first [N, K]."""
         window = self.settings.window_tokens
 
@@ -137,72 +146,64 @@ class Network(nn.Module):
         ago = ago.expand(len(index), window)[..., None]
         described = torch.cat([relations(pose, pose[index]), ago], dim=-1)
         relation = self.motion.past_relation
-        return index, present, relation.look_up(described, relation.table())
+        return index, present, Shared.of(relation.look_up(described, relation.table()))
 
-    def _entries(
-        self,
-        agents: Agents,
-        entries: Entries,
-        rows: Rows,
-        raw: Tensor,
-        roads: RoadFeatures,
-    ) -> EntryOutputs:
-        """Ask for the newcomers of every token, each slot seeing those before it."""
-        asked = Rows.where(entries.asked)
-        alone = Rows(asked.at, asked.number.flatten()[:, None])
-        ego_pose = agents.pose[:, :, EGO]
-        around = look_around(
-            self.cells.agents_reach(agents.kind.shape[1]),
-            alone,
-            ego_pose.flatten(0, 1)[:, None],
-            agents.pose.flatten(0, 1),
-            rows.number.flatten(0, 1),
-            agents.visible.flatten(0, 1)[:, None],
-        )
-        slot = torch.arange(entries.agent.shape[2], device=raw.device)[:, None]
-        turn = asked.pack(agents.turn).gather(1, around.place)[:, None]  # [N, 1, K]
-        cell = asked.pack(agents.cell).gather(1, around.place)[:, None]
-        seen = around.seen(raw)
-        seen = Seen(seen.features, seen.relation, seen.present[:, None] & (turn < slot))
-        occupied = self.cells.occupied(cell.expand_as(seen.present), seen.present)
-        reach = self.cells.roads_reach()
-        roads_seen = see_roads(reach, asked, ego_pose, roads, _count(agents.kind))
-        x = self.cells(occupied, roads_seen, seen)
-        return EntryOutputs(asked, self.cells.add(x)[..., 0], self.cells.cell(x))
 
-    def _details(
-        self,
-        agents: Agents,
-        details: Details,
-        rows: Rows,
-        raw: Tensor,
-        roads: RoadFeatures,
-    ) -> DetailOutputs:
-        """Describe agents at the cells they enter at, without seeing them."""
-        wanted = Rows.where(details.present)
-        scene = wanted.at // details.present.shape[1]
-        token, cell = wanted.pack(details.token), wanted.pack(details.cell)
-        ego_pose = agents.pose[scene, token, EGO]
-        pose = cell_pose(ego_pose, self.details.centre_m[cell])
-        each = Rows(_count(pose), _count(pose)[:, None])
+def _entries(
+    stack: CellStack, batch: Batch, rows: Rows, raw: Tensor, roads: RoadFeatures
+) -> EntryOutputs:
+    """Ask for the newcomers of every token, each slot seeing those before it."""
+    agents, entries = batch.agents, batch.entries
+    asked = Rows.where(entries.asked)
+    alone = Rows(asked.at, asked.number.flatten()[:, None])
+    ego_pose = agents.pose[:, :, EGO]
+    around = look_around(
+        stack.agents_reach(agents.kind.shape[1]),
+        alone,
+        ego_pose.flatten(0, 1)[:, None],
+        agents.pose.flatten(0, 1),
+        rows.number.flatten(0, 1),
+        agents.visible.flatten(0, 1)[:, None],
+    )
+    slot = torch.arange(entries.agent.shape[2], device=raw.device)[:, None]
+    turn = asked.pack(agents.turn).gather(1, around.place)[:, None]  # [N, 1, K]
+    cell = asked.pack(agents.cell).gather(1, around.place)[:, None]
+    seen = around.seen(raw)
+    seen = replace(seen, present=seen.present[:, None] & (turn < slot))
+    occupied = stack.occupied(cell.expand_as(seen.present), seen.present)
+    reach, scene = stack.roads_reach(), _count(agents.kind)
+    roads_seen = see_roads(reach, asked, ego_pose, roads, scene)
+    return stack.answer(asked, stack(occupied, roads_seen, seen))
 
-        place = torch.arange(agents.kind.shape[1], device=raw.device)
-        turn = wanted.pack(details.turn)[:, None]
-        allowed = agents.visible[scene, token] & (agents.turn[scene, token] < turn)
-        allowed &= place != wanted.pack(details.agent)[:, None]
-        around = look_around(
-            self.details.agents_reach(),
-            each,
-            pose[:, None],
-            agents.pose[scene, token],
-            rows.number[scene, token],
-            allowed[:, None],
-        )
-        reach = self.details.roads_reach()
-        roads_seen = see_roads(reach, each, pose[:, None], roads, scene)
-        x = self.details(cell, roads_seen, around.seen(raw))
-        given = self.details.given(x, wanted.pack(details.kind))
-        return DetailOutputs(wanted, self.details.kind(x), *given)
+
+def _details(
+    stack: DetailStack, batch: Batch, rows: Rows, raw: Tensor, roads: RoadFeatures
+) -> DetailOutputs:
+    """Describe agents where they enter, without seeing them."""
+    agents, details = batch.agents, batch.details
+    wanted = Rows.where(details.present)
+    scene = wanted.at // details.present.shape[1]
+    token, cell = wanted.pack(details.token), wanted.pack(details.cell)
+    ego_pose = agents.pose[scene, token, EGO]
+    pose = cell_pose(ego_pose, stack.asked_at(cell, wanted.pack(details.offset_m)))
+    each = Rows(_count(pose), _count(pose)[:, None])
+
+    place = torch.arange(agents.kind.shape[1], device=raw.device)
+    turn = wanted.pack(details.turn)[:, None]
+    allowed = agents.visible[scene, token] & (agents.turn[scene, token] < turn)
+    allowed &= place != wanted.pack(details.agent)[:, None]
+    around = look_around(
+        stack.agents_reach(),
+        each,
+        pose[:, None],
+        agents.pose[scene, token],
+        rows.number[scene, token],
+        allowed[:, None],
+    )
+    reach = stack.roads_reach()
+    roads_seen = see_roads(reach, each, pose[:, None], roads, scene)
+    x = stack(cell, roads_seen, around.seen(raw))
+    return stack.answer(wanted, x, wanted.pack(details.kind))
 
 
 def _count(like: Tensor) -> Tensor:

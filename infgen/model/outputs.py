@@ -15,11 +15,13 @@ class MotionOutputs:
         rows: The visible agents among [scene, token, agent].
         move_logits: [row, move], by the codebook of the agent's kind.
         leave_logit: Log-odds that the next token is the agent's last [row].
+        pattern_logits: When within the next token a log would show the agent [row, 32].
     """
 
     rows: Rows
     move_logits: Tensor
-    leave_logit: Tensor
+    leave_logit: Tensor | None
+    pattern_logits: Tensor | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +31,16 @@ class EntryOutputs:
     Attributes:
         rows: The tokens that were asked among [scene, token].
         add_logit: Log-odds of ADD against BEGIN MOTION [row, slot].
-        cell_logits: [row, slot, cell].
+        cell_logits: [row, slot, cell] ...
+        place_m: ... or the place itself, in the ego's grid frame [row, slot, 2].
+        radius_m: Of that grid.
     """
 
     rows: Rows
     add_logit: Tensor
-    cell_logits: Tensor
+    cell_logits: Tensor | None
+    place_m: Tensor | None
+    radius_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,15 +51,18 @@ class DetailOutputs:
         rows: The agents described among [scene, detail].
         kind_logits: [row, kind].
         size_log_m: Logarithm of length, width, height, given the kind [row, 3].
-        heading_logits: Given the kind [row, heading].
-        offset_m: In the ego's grid frame, given the kind [row, 2].
+        heading_logits: Given the kind [row, heading] ...
+        turned_rad: ... or the heading itself, relative to the ego's [row].
+        offset_m: From the cell's centre, in the ego's grid frame, given the kind [row, 2];
+            None where places are regressed.
     """
 
     rows: Rows
     kind_logits: Tensor
     size_log_m: Tensor
-    heading_logits: Tensor
-    offset_m: Tensor
+    heading_logits: Tensor | None
+    turned_rad: Tensor | None
+    offset_m: Tensor | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +75,16 @@ class RoadOutputs:
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """All logits of a batch; ``roads`` only if asked for."""
+    """All logits of a batch. What the network has no head for is None, here and above.
+
+    Attributes:
+        motion: What agents do next.
+        entries: Whether and where newcomers enter; None without a life cycle.
+        details: Who they are; None without a life cycle.
+        roads: Hidden road tokens, if asked for.
+    """
 
     motion: MotionOutputs
-    entries: EntryOutputs
-    details: DetailOutputs
+    entries: EntryOutputs | None
+    details: DetailOutputs | None
     roads: RoadOutputs | None

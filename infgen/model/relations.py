@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from infgen.model.layers import RelationEmbedding, Span
+from infgen.model.tables import RelationEmbedding, Span
 
 BLOCK_PAIRS = 1 << 17
 """Distances held at once while neighbours are searched."""

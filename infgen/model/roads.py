@@ -1,13 +1,13 @@
 """The map as features: encoded once per scene, and predicted piece by piece."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
 from infgen.config import ModelSettings
 from infgen.model.batch import Roads
-from infgen.model.layers import Attention, Seen, embedding_mlp, gather, mlp, normed
+from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.relations import Rows, relation_embedding
 from infgen.model.sight import Around, Reach, RoadFeatures, look_around
 from infgen.tokens.codebook import RoadCodebook
@@ -21,6 +21,12 @@ class RoadSight:
 
     rows: Rows
     around: Around
+
+    def covered(self, roads: Roads) -> "RoadSight":
+        """Let nobody see a hidden token, not even its place: it would be given away."""
+        kept = ~self.rows.pack(roads.picked)
+        present = self.around.present & kept[self.around.index]
+        return RoadSight(self.rows, replace(self.around, present=present))
 
 
 class RoadEncoder(nn.Module):
@@ -58,33 +64,28 @@ class RoadEncoder(nn.Module):
 
     def forward(self, roads: Roads, sight: RoadSight) -> RoadFeatures:
         """Encode every road token."""
-        encoded = self._encode(roads, sight, sight.around.present)
-        return RoadFeatures(sight.rows, normed(encoded), roads.pose, roads.real)
+        around = sight.around
+        x = self._embed(roads, sight.rows)
+        for block in self.blocks:
+            x = block(x, around.seen(normed(x)))
+        return RoadFeatures(sight.rows, normed(x), roads.pose, roads.real)
 
-    def predict_hidden(self, roads: Roads, sight: RoadSight) -> tuple[Tensor, Tensor]:
-        """Predict hidden road tokens from their predecessors, which cannot see them.
+    def predict_hidden(self, roads: Roads, covered: RoadFeatures) -> tuple[Tensor, Tensor]:
+        """Predict hidden road tokens from their predecessors, which did not see them.
 
-        A token is predicted if it is hidden and its predecessor is not. Nobody sees a
-        hidden token, not even its place: relations to it would give it away.
+        A token is predicted if it is hidden and its predecessor is not.
+
+        Args:
+            roads: The maps.
+            covered: Features of a pass in which hidden tokens were not seen.
 
         Returns:
             Logits [prediction, token] and the true tokens [prediction].
         """
-        rows, around = sight.rows, sight.around
-        kept = ~rows.pack(roads.picked)
-        encoded = self._encode(roads, sight, around.present & kept[around.index])
         wanted = roads.real & roads.picked & roads.follows
         wanted[:, 1:] &= ~roads.picked[:, :-1]
-        before = rows.number.roll(1, dims=1)[wanted]
-        return self.next_token(encoded[before]), roads.token[wanted]
-
-    def _encode(self, roads: Roads, sight: RoadSight, present: Tensor) -> Tensor:
-        """Features [row, D] of all road tokens, given which neighbours they see."""
-        around = sight.around
-        x = self._embed(roads, sight.rows)
-        for block in self.blocks:
-            x = block(x, Seen(gather(normed(x), around.index), around.relation, present))
-        return x
+        before = covered.rows.number.roll(1, dims=1)[wanted]
+        return self.next_token(covered.features[before]), roads.token[wanted]
 
     def _embed(self, roads: Roads, rows: Rows) -> Tensor:
         """What each road token is, by itself [row, D]."""

@@ -11,8 +11,10 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from infgen.model.layers import RelationEmbedding, Seen, gather
+from infgen.model.layers import Seen
+from infgen.model.pairs import Shared
 from infgen.model.relations import Rows, nearest, relations
+from infgen.model.tables import RelationEmbedding
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +51,13 @@ class Around:
     """
 
     index: Tensor
-    relation: Tensor
+    relation: Shared
     present: Tensor
     place: Tensor
 
     def seen(self, features: Tensor) -> Seen:
         """Join with the features of all rows [row, D]."""
-        return Seen(gather(features, self.index), self.relation, self.present)
+        return Seen(features, self.index, self.relation, self.present)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +103,7 @@ def look_around(
     described = relations(targets.pack(target_pose), source_pose[group, place])
     return Around(
         index=source_row[group, place],
-        relation=reach.relation.look_up(described, reach.table),
+        relation=Shared.of(reach.relation.look_up(described, reach.table)),
         present=present,
         place=place,
     )
@@ -135,3 +137,11 @@ def cell_pose(
     x_m = cos * centre_m[..., 0] - sin * centre_m[..., 1] + ego_pose[..., 0]
     y_m = sin * centre_m[..., 0] + cos * centre_m[..., 1] + ego_pose[..., 1]
     return torch.stack([x_m, y_m, ego_pose[..., 2]], dim=-1)
+
+
+def grid_place(pose: Tensor, ego_pose: Tensor) -> Float32[Tensor, "*row 2"]:
+    """Where poses [..., 3] are in the ego's grid frame. Inverse of ``cell_pose``."""
+    turn_rad = math.pi / 2 - ego_pose[..., 2]
+    cos, sin = turn_rad.cos(), turn_rad.sin()
+    x_m, y_m = (pose - ego_pose)[..., :2].unbind(-1)
+    return torch.stack([cos * x_m - sin * y_m, sin * x_m + cos * y_m], dim=-1)

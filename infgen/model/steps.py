@@ -23,87 +23,19 @@ with an empty past, so a freed row can be given to a newcomer as it is.
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from infgen.model.agents import AgentRows, Sight
 from infgen.model.batch import Roads
+from infgen.model.columns import Column, EntryDetails, EntryQuery, MotionStep
+from infgen.model.entries import CellStack, DetailStack
 from infgen.model.layers import Seen, normed
 from infgen.model.network import EGO, Network
+from infgen.model.pairs import Shared
 from infgen.model.relations import Rows, relations, within_radius
-from infgen.model.sight import RoadFeatures, cell_pose, look_around, see_roads
+from infgen.model.sight import Reach, RoadFeatures, cell_pose, look_around, see_roads
 from infgen.tokens.scene_tokens import Presence
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    """All agents of all rollouts at the end of one half second.
-
-    Attributes:
-        kind: ``AgentKind``.
-        size_lwh_m: Boxes.
-        pose: Quantised x, y, heading (world frame of the scene).
-        move: Move that led here, ``FIRST_MOVE`` where entering, else ``NO_MOVE``.
-        presence: ``Presence``. LEAVING is the last column of an agent.
-        observed: False where absent, unseen or entering (as ``SceneTokens.observed``).
-        cell: Cell of the ego's grid that holds the agent, or ``NO_CELL``.
-    """
-
-    kind: Int64[Tensor, "rollout row"]
-    size_lwh_m: Float32[Tensor, "rollout row 3"]
-    pose: Float32[Tensor, "rollout row 3"]
-    move: Int64[Tensor, "rollout row"]
-    presence: Int64[Tensor, "rollout row"]
-    observed: Bool[Tensor, "rollout row"]
-    cell: Int64[Tensor, "rollout row"]
-
-    @property
-    def visible(self) -> Bool[Tensor, "rollout row"]:
-        """Who can be seen: who is observed, or just entering."""
-        return self.observed | (self.presence == Presence.ENTERING)
-
-
-@dataclass(frozen=True, slots=True)
-class MotionStep:
-    """What follows a column; rows that are not visible hold zeros.
-
-    Attributes:
-        move_logits: Next move, by the row's own kind's codebook.
-        leave_logit: Log-odds that the next token is the agent's last (LEAVING).
-    """
-
-    move_logits: Float32[Tensor, "rollout row move"]
-    leave_logit: Float32[Tensor, "rollout row"]
-
-
-@dataclass(frozen=True, slots=True)
-class EntryQuery:
-    """Whether one more agent enters at this column, and where.
-
-    Attributes:
-        add_logit: Log-odds of ADD against BEGIN MOTION.
-        cell_logits: Cell of the ego's grid, given ADD.
-    """
-
-    add_logit: Float32[Tensor, " rollout"]
-    cell_logits: Float32[Tensor, "rollout cell"]
-
-
-@dataclass(frozen=True, slots=True)
-class EntryDetails:
-    """Who enters at a cell: sample a kind, then take that kind's row of the others.
-
-    Attributes:
-        kind_logits: ``AgentKind`` given the cell.
-        size_lwh_m: Box, given the kind.
-        heading_logits: Heading bin relative to the ego, given the kind.
-        offset_m: Position less the cell's centre, in the ego's grid frame, given the kind.
-    """
-
-    kind_logits: Float32[Tensor, "rollout kind"]
-    size_lwh_m: Float32[Tensor, "rollout kind 3"]
-    heading_logits: Float32[Tensor, "rollout kind heading"]
-    offset_m: Float32[Tensor, "rollout kind 2"]
 
 
 @dataclass(slots=True)
@@ -170,8 +102,34 @@ class Entries:
     roads: Seen
 
 
+@dataclass(frozen=True, slots=True)
+class _Asking:
+    """What asks for newcomers, and how it sees."""
+
+    cells: CellStack
+    details: DetailStack
+    cell_roads: Reach
+    cell_agents: Reach
+    detail_roads: Reach
+    detail_agents: Reach
+
+    @classmethod
+    def of(cls, cells: CellStack, details: DetailStack) -> "_Asking":
+        return cls(
+            cells,
+            details,
+            cells.roads_reach(),
+            cells.agents_reach(0),
+            details.roads_reach(),
+            details.agents_reach(),
+        )
+
+
 class Stepper:
-    """A network ready to be played: in evaluation mode, its tables made once."""
+    """A network ready to be played: in evaluation mode, its tables made once.
+
+    A network without a life cycle has no ``entry_`` methods: they raise ``ValueError``.
+    """
 
     @torch.no_grad()
     def __init__(self, network: Network) -> None:
@@ -180,10 +138,19 @@ class Stepper:
         self._past_table = network.motion.past_relation.table()
         self._roads_reach = network.motion.roads_reach()
         self._agents_reach = network.motion.agents_reach()
-        self._cell_roads_reach = network.cells.roads_reach()
-        self._cell_agents_reach = network.cells.agents_reach(0)
-        self._detail_roads_reach = network.details.roads_reach()
-        self._detail_agents_reach = network.details.agents_reach()
+        self._asking: _Asking | None = None
+        if network.cells is not None and network.details is not None:
+            self._asking = _Asking.of(network.cells, network.details)
+
+    @property
+    def life_cycle(self) -> bool:
+        """Whether agents can enter; if not, the network knows motion only."""
+        return self._asking is not None
+
+    @property
+    def leaves(self) -> bool:
+        """Whether the network says who leaves."""
+        return self.network.motion.leave is not None
 
     @torch.no_grad()
     def begin(self, roads: Roads, scene: Int64[Tensor, " rollout"], rows: int) -> Memory:
@@ -219,12 +186,19 @@ class Stepper:
         place = memory.columns % memory.window
         for block, past in zip(motion.blocks, memory.features, strict=True):
             before = normed(x)
-            x = block(x, rows.pack(past), sight)
+            own = Seen.own(rows.pack(past), sight.past_relation, sight.past_present)
+            x = block(x, own, sight)
             past[:, :, place] = rows.spread(before)
         memory.pose[:, :, place] = column.pose
         memory.visible[:, :, place] = visible
         memory.columns += 1
-        return MotionStep(rows.spread(motion.move(x)), rows.spread(motion.leave(x)[:, 0]))
+        said = motion.foretell(rows, x)
+        leave, pattern = said.leave_logit, said.pattern_logits
+        return MotionStep(
+            rows.spread(said.move_logits),
+            None if leave is None else rows.spread(leave),
+            None if pattern is None else rows.spread(pattern),
+        )
 
     @torch.no_grad()
     def entry_begin(self, memory: Memory, column: Column) -> Entries:
@@ -237,7 +211,7 @@ class Stepper:
         ego_pose = column.pose[:, EGO, None]
         each = torch.arange(rollouts, device=raw.device)
         roads = see_roads(
-            self._cell_roads_reach,
+            self._asked().cell_roads,
             Rows(each, each[:, None]),
             ego_pose,
             memory.roads,
@@ -258,7 +232,7 @@ class Stepper:
         raw = fresh.spread(normed(self._embed(entries.memory, column, fresh)))
         ego_pose = column.pose[:, EGO, None].expand_as(column.pose)
         described = relations(fresh.pack(ego_pose), fresh.pack(column.pose)[:, None])
-        reach = self._cell_agents_reach
+        reach = self._asked().cell_agents
         related = reach.relation.look_up(described, reach.table)[:, 0]
         within = came & within_radius(ego_pose, column.pose, reach.radius_m)
         return replace(
@@ -272,37 +246,63 @@ class Stepper:
     @torch.no_grad()
     def entry_query(self, entries: Entries) -> EntryQuery:
         """Ask for the next newcomer of every rollout."""
-        cells = self.network.cells
+        cells = self._asked().cells
         occupied = cells.occupied(entries.column.cell, entries.within)
-        agents = Seen(entries.raw, entries.relation, entries.within)
+        relation = Shared.of(entries.relation)
+        agents = Seen.own(entries.raw, relation, entries.within)
         x = cells(occupied[:, None], entries.roads, agents)[:, 0]
-        return EntryQuery(cells.add(x)[:, 0], cells.cell(x))
+        each = torch.arange(len(x), device=x.device)
+        said = cells.answer(Rows(each, each), x)
+        return EntryQuery(said.add_logit, said.cell_logits, said.place_m)
 
     @torch.no_grad()
     def entry_details(
-        self, entries: Entries, cell: Int64[Tensor, " rollout"]
+        self,
+        entries: Entries,
+        cell: Int64[Tensor, " rollout"],
+        place_m: Float32[Tensor, "rollout 2"] | None = None,
     ) -> EntryDetails:
-        """Ask who enters at a cell of every rollout."""
-        details, column = self.network.details, entries.column
-        pose = cell_pose(column.pose[:, EGO], details.centre_m[cell])[:, None]
+        """Ask who enters at a cell of every rollout.
+
+        Args:
+            entries: The half second.
+            cell: The cells.
+            place_m: Where in them, in the ego's grid frame; their centres if None.
+        """
+        asking, column = self._asked(), entries.column
+        details, memory = asking.details, entries.memory
+        place_m = details.centre_m[cell] if place_m is None else place_m
+        pose = cell_pose(column.pose[:, EGO], place_m)[:, None]
         each = torch.arange(len(cell), device=cell.device)
         rows = Rows(each, each[:, None])
-        place = torch.arange(column.presence.numel(), device=cell.device)
+        source = torch.arange(column.presence.numel(), device=cell.device)
         around = look_around(
-            self._detail_agents_reach,
+            asking.detail_agents,
             rows,
             pose,
             column.pose,
-            place.view_as(column.presence),
+            source.view_as(column.presence),
             column.visible[:, None],
         )
-        roads = see_roads(
-            self._detail_roads_reach, rows, pose, entries.memory.roads, entries.memory.scene
-        )
+        roads = see_roads(asking.detail_roads, rows, pose, memory.roads, memory.scene)
         x = details(cell, roads, around.seen(entries.raw.flatten(0, 1)))
         kinds = torch.arange(details.given_kind.num_embeddings, device=cell.device)
-        size_log_m, heading, offset_m = details.given(x[:, None], kinds)
-        return EntryDetails(details.kind(x), size_log_m.exp(), heading, offset_m)
+        said = details.answer(rows, x[:, None], kinds)
+        return EntryDetails(
+            said.kind_logits[:, 0],
+            said.size_log_m.exp(),
+            said.heading_logits,
+            said.turned_rad,
+            said.offset_m,
+        )
+
+    def _asked(self) -> _Asking:
+        if self._asking is None:
+            raise ValueError(
+                "these weights know motion only (model.life_cycle is false): "
+                "nobody can enter"
+            )
+        return self._asking
 
     def _embed(self, memory: Memory, column: Column, rows: Rows) -> Tensor:
         """Embed some rows of a column that follows the memory's last."""
@@ -340,4 +340,4 @@ class Stepper:
         related = self.network.motion.past_relation.look_up(
             torch.cat([described, ago], dim=-1), self._past_table
         )
-        return Sight(related, rows.pack(memory.visible), roads, around)
+        return Sight(Shared.of(related), rows.pack(memory.visible), roads, around)

@@ -1,10 +1,12 @@
 """A part of one tokenized scene: some half seconds, the nearest agents and roads."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int8, Int16, Int64
+from jaxtyping import Bool, Float32, Int8, Int16, Int64, UInt8
 
+from infgen.tokens.grid import Grid, encode_cell, to_grid
+from infgen.tokens.noise import Noise, lead_astray
 from infgen.tokens.scene_tokens import FIRST_MOVE, Presence, SceneTokens
 
 
@@ -17,8 +19,10 @@ class SceneWindow:
 
     Attributes:
         record: The whole scene.
+        label: The move to learn for each token: ``move`` until agents are led astray.
         roads: Rows of the record's road tokens that are kept, ascending.
-        kind, size_lwh_m, near, pose, move, presence, observed, cell: As in the record.
+        kind, size_lwh_m, near, pose, move, presence, observed, pattern, cell: As in the
+            record.
         entry_row: Row of each newcomer whose agent is kept ...
         entry_token: ... its token, ascending from 0 ...
         entry_cell: ... and its cell.
@@ -31,8 +35,10 @@ class SceneWindow:
     near: Bool[np.ndarray, " agent"]
     pose: Float32[np.ndarray, "agent token 3"]
     move: Int16[np.ndarray, "agent token"]
+    label: Int16[np.ndarray, "agent token"]
     presence: Int8[np.ndarray, "agent token"]
     observed: Bool[np.ndarray, "agent token"]
+    pattern: UInt8[np.ndarray, "agent token"]
     cell: Int16[np.ndarray, "agent token"]
     entry_row: Int64[np.ndarray, " entry"]
     entry_token: Int64[np.ndarray, " entry"]
@@ -46,7 +52,7 @@ def cut_window(
     stop = min(start + tokens, record.num_tokens)
     presence, observed, move = _begin_at(record, start, stop)
     visible = observed | (presence == Presence.ENTERING)
-    pose = record.pose[:, start:stop]
+    pose, pattern = record.pose[:, start:stop], record.pattern[:, start:stop]
     rows = _nearest_agents(pose, visible, record.ego)[:max_agents]
     roads = _nearest_roads(record.road_pose, pose[record.ego], max_roads)
 
@@ -63,12 +69,34 @@ def cut_window(
         near=record.near[rows],
         pose=pose[rows],
         move=move[rows],
+        label=move[rows],
         presence=presence[rows],
         observed=observed[rows],
+        pattern=np.where(presence == Presence.ABSENT, np.uint8(0), pattern)[rows],
         cell=record.cell[rows, start:stop],
         entry_row=row_of[record.entry_agent[kept]],
         entry_token=entry_token[kept],
         entry_cell=record.entry_cell[kept],
+    )
+
+
+def disturb(
+    window: SceneWindow, noise: Noise, grid: Grid, random: np.random.Generator
+) -> SceneWindow:
+    """Lead agents astray, all but the ego: what is told relative to it stays true.
+
+    Who is absent, entering or not observed is where it was. Cells follow the poses.
+    """
+    moving = window.observed.copy()
+    moving[0] = False
+    strays = lead_astray(window.kind, window.pose, window.move, moving, noise, random)
+    cell = encode_cell(to_grid(strays.pose[..., :2], strays.pose[0]), grid)
+    return replace(
+        window,
+        pose=strays.pose,
+        move=strays.move,
+        label=strays.label,
+        cell=np.where(strays.off, cell, window.cell),
     )
 
 

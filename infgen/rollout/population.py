@@ -14,14 +14,7 @@ from jaxtyping import Bool, Float32, Int8, Int16, Int32, Int64
 from infgen.geometry import to_world, wrap_angle
 from infgen.rollout.trace import NOBODY, Start
 from infgen.tokens.codebook import MotionCodebook
-from infgen.tokens.grid import (
-    Grid,
-    decode_cell,
-    decode_heading,
-    encode_cell,
-    from_grid,
-    to_grid,
-)
+from infgen.tokens.grid import Grid, encode_cell, from_grid, to_grid
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
 
 EGO_ROW = 0
@@ -64,17 +57,15 @@ class Newcomers:
 
     Attributes:
         who: Rollouts that have one; the other entries mean nothing.
-        cell: Cell of the ego's grid.
-        offset_m: Position less the cell's centre, in the grid frame.
-        heading: Bin of the heading relative to the ego.
+        place_m: Where in the ego's grid frame.
+        turned_rad: Heading relative to the ego.
         kind: ``AgentKind``.
         size_lwh_m: Box.
     """
 
     who: Bool[np.ndarray, " rollout"]
-    cell: Int16[np.ndarray, " rollout"]
-    offset_m: Float32[np.ndarray, "rollout 2"]
-    heading: Int16[np.ndarray, " rollout"]
+    place_m: Float32[np.ndarray, "rollout 2"]
+    turned_rad: Float32[np.ndarray, " rollout"]
     kind: Int8[np.ndarray, " rollout"]
     size_lwh_m: Float32[np.ndarray, "rollout 3"]
 
@@ -174,8 +165,29 @@ def move_on(
     return moved, path
 
 
+def leave_beyond(before: Population, moved: Population, radius_m: float) -> Population:
+    """Let whoever crosses a circle around the ego outwards be there for the last time.
+
+    Who was outside all the time stays: the ego may come nearer.
+
+    Args:
+        before: Half a second earlier.
+        moved: Now.
+        radius_m: Of the circle.
+    """
+    leaves = (_ego_distance_m(moved) > radius_m) & (_ego_distance_m(before) <= radius_m)
+    leaves &= moved.presence == Presence.PRESENT
+    presence = np.where(leaves, np.int8(Presence.LEAVING), moved.presence)
+    return replace(moved, presence=presence)
+
+
+def _ego_distance_m(population: Population) -> Float32[np.ndarray, "rollout row"]:
+    away_m = population.pose[..., :2] - population.pose[:, EGO_ROW, None, :2]
+    return np.hypot(away_m[..., 0], away_m[..., 1])
+
+
 def enter(
-    population: Population, newcomers: Newcomers, grid: Grid
+    population: Population, newcomers: Newcomers
 ) -> tuple[Population, Int64[np.ndarray, " rollout"]]:
     """Give each newcomer the first free row of its rollout.
 
@@ -201,9 +213,7 @@ def enter(
     new.life[rollout, row] = population.born[rollout]
     new.kind[rollout, row] = newcomers.kind[rollout]
     new.size_lwh_m[rollout, row] = newcomers.size_lwh_m[rollout]
-    new.pose[rollout, row] = entry_pose(population.pose[:, EGO_ROW], newcomers, grid)[
-        rollout
-    ]
+    new.pose[rollout, row] = entry_pose(population.pose[:, EGO_ROW], newcomers)[rollout]
     new.move[rollout, row] = FIRST_MOVE
     new.presence[rollout, row] = Presence.ENTERING
     new.observed[rollout, row] = False
@@ -213,9 +223,8 @@ def enter(
 
 
 def entry_pose(
-    ego_pose: Float32[np.ndarray, "rollout 3"], newcomers: Newcomers, grid: Grid
+    ego_pose: Float32[np.ndarray, "rollout 3"], newcomers: Newcomers
 ) -> Float32[np.ndarray, "rollout 3"]:
     """Poses [rollout, 3] of newcomers in the scene's frame."""
-    local_m = decode_cell(newcomers.cell, grid) + newcomers.offset_m
-    heading_rad = wrap_angle(decode_heading(newcomers.heading, grid) + ego_pose[:, 2])
-    return np.column_stack([from_grid(local_m, ego_pose), heading_rad])
+    heading_rad = wrap_angle(newcomers.turned_rad + ego_pose[:, 2])
+    return np.column_stack([from_grid(newcomers.place_m, ego_pose), heading_rad])

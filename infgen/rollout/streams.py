@@ -22,6 +22,7 @@ class Purpose(IntEnum):
     CELL = 3
     KIND = 4
     HEADING = 5
+    PATTERN = 6
 
 
 @dataclass(frozen=True, slots=True)

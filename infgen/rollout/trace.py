@@ -28,6 +28,8 @@ class Frame:
         token: The half second: steps ``5 token + 1`` to ``5 token + 5``.
         life: Who is in each row during it, or ``NOBODY``.
         path: x, y, heading of every row at its five steps.
+        shown: At which of them a detector would see it; always, but for weights that have
+            learned validity patterns.
         leaving: Rows whose agent is there for the last time.
         born: Life of an agent placed at the end of this half second, else ``NOBODY``; its
             row is free in ``life``.
@@ -38,6 +40,7 @@ class Frame:
     token: int
     life: Int32[np.ndarray, "rollout row"]
     path: Float32[np.ndarray, "rollout row 5 3"]
+    shown: Bool[np.ndarray, "rollout row 5"]
     leaving: Bool[np.ndarray, "rollout row"]
     born: Int32[np.ndarray, "rollout row"]
     kind: Int8[np.ndarray, "rollout row"]
@@ -86,9 +89,13 @@ def collect(
 
 @dataclass(frozen=True, slots=True)
 class _Lives:
-    """One row per life of a rollout, filled frame by frame."""
+    """One row per life of a rollout, filled frame by frame.
+
+    Who is ``there`` has a pose; who is ``valid`` is seen as well.
+    """
 
     pose: Float32[np.ndarray, "life step 3"]
+    there: Bool[np.ndarray, "life step"]
     valid: Bool[np.ndarray, "life step"]
     kind: Int8[np.ndarray, " life"]
     size_lwh_m: Float32[np.ndarray, "life 3"]
@@ -102,6 +109,7 @@ def _lives(start: Start, frames: Sequence[Frame], at: int) -> _Lives:
     steps = CLOCK.end_step(frames[-1].token) + 1
     lives = _Lives(
         pose=np.zeros((count, steps, 3), dtype=np.float32),
+        there=np.zeros((count, steps), dtype=bool),
         valid=np.zeros((count, steps), dtype=bool),
         kind=np.zeros(count, dtype=np.int8),
         size_lwh_m=np.zeros((count, 3), dtype=np.float32),
@@ -118,7 +126,7 @@ def _write_history(lives: _Lives, start: Start) -> None:
     tracks, rows, now = start.scene.tracks, start.logged_row, start.scene.now
     logged, span = len(rows), slice(0, now + 1)
     seen = tracks.valid[rows, span]
-    lives.valid[:logged, span] = seen
+    lives.there[:logged, span] = lives.valid[:logged, span] = seen
     lives.pose[:logged, span, :2] = tracks.xyz_m[rows, span, :2] * seen[..., None]
     lives.pose[:logged, span, 2] = tracks.heading_rad[rows, span] * seen
     lives.kind[:logged] = start.history.kind
@@ -132,7 +140,8 @@ def _write_frame(lives: _Lives, frame: Frame, at: int) -> None:
     life, born = frame.life[at], frame.born[at]
     there, new = life != NOBODY, born != NOBODY
     lives.pose[life[there], span] = frame.path[at][there]
-    lives.valid[life[there], span] = True
+    lives.there[life[there], span] = True
+    lives.valid[life[there], span] = frame.shown[at][there]
     lives.exit_step[life[frame.leaving[at]]] = end
     lives.kind[born[new]] = frame.kind[at][new]
     lives.size_lwh_m[born[new]] = frame.size_lwh_m[at][new]
@@ -155,8 +164,9 @@ def _rollout(start: Start, lives: _Lives, weights: str) -> Rollout:
         id=np.concatenate([start.history.track_id, inserted_id]),
         kind=lives.kind,
         size_lwh_m=lives.size_lwh_m,
-        xyz_m=np.concatenate([lives.pose[..., :2], z_m[..., None]], axis=-1),
-        heading_rad=lives.pose[..., 2],
+        xyz_m=np.concatenate([lives.pose[..., :2], z_m[..., None]], axis=-1)
+        * lives.valid[..., None],
+        heading_rad=lives.pose[..., 2] * lives.valid,
         valid=lives.valid,
         logged=np.arange(count) < logged,
         entry_step=lives.entry_step,
@@ -184,13 +194,13 @@ def _heights(start: Start, lives: _Lives) -> Float32[np.ndarray, "life step"]:
     z_m[:, now:] = ground_m[:, left] * (1 - share) + ground_m[:, right] * share
     z_m[:, now:] += clearance_m[:, None]
     z_m[:logged, : now + 1] = tracks.xyz_m[rows, : now + 1, 2]
-    return z_m * lives.valid
+    return z_m
 
 
 def _ground_at_knots(start: Start, lives: _Lives) -> Float32[np.ndarray, "life knot"]:
     """Road height at the end of every half second from now on, held where nobody is."""
     knots = np.arange(start.scene.now, lives.valid.shape[1], CLOCK.steps_per_token)
-    history, there = start.history, lives.valid[:, knots]
+    history, there = start.history, lives.there[:, knots]
     xy_m = lives.pose[:, knots, :2].reshape(-1, 2)
     ground_m = ground_z_m(xy_m, history.road_pose[:, :2], history.road_z_m)
     # Hold the last known height after an exit, the first known one before an entry.

@@ -6,9 +6,7 @@ structured array, tags included.
 """
 
 import gzip
-import struct
 from collections.abc import Iterable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +15,27 @@ from jaxtyping import Float64
 
 from infgen.scene import FeatureKind, LinkKind, RoadMap, Scene, Side, Signals, Tracks
 from infgen.sources.tfrecord import frame
+from infgen.sources.wire import BYTES, FIXED32, FIXED64, VARINT
+from infgen.sources.wire_write import double, integer, key, message, varint
 
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
-_WIRE_DTYPES = {_VARINT: "u1", _FIXED64: "<f8", _FIXED32: "<f4"}
+_WIRE_DTYPES = {VARINT: "u1", FIXED64: "<f8", FIXED32: "<f4"}
 
 
 _Fields = dict[str, tuple[int, int]]
 """Names of a message's fields to their number and wire type."""
 
-_POINT: _Fields = {"x": (1, _FIXED64), "y": (2, _FIXED64), "z": (3, _FIXED64)}
+_POINT: _Fields = {"x": (1, FIXED64), "y": (2, FIXED64), "z": (3, FIXED64)}
 _STATE: _Fields = {
-    "x": (2, _FIXED64),
-    "y": (3, _FIXED64),
-    "z": (4, _FIXED64),
-    "length": (5, _FIXED32),
-    "width": (6, _FIXED32),
-    "height": (7, _FIXED32),
-    "heading": (8, _FIXED32),
-    "velocity_x": (9, _FIXED32),
-    "velocity_y": (10, _FIXED32),
-    "valid": (11, _VARINT),
+    "x": (2, FIXED64),
+    "y": (3, FIXED64),
+    "z": (4, FIXED64),
+    "length": (5, FIXED32),
+    "width": (6, FIXED32),
+    "height": (7, FIXED32),
+    "heading": (8, FIXED32),
+    "velocity_x": (9, FIXED32),
+    "velocity_y": (10, FIXED32),
+    "valid": (11, VARINT),
 }
 _UNSEEN = b"\x58\x00"
 """The message of a state that says ``valid: false`` and nothing else."""
@@ -51,15 +50,15 @@ def encode_scenario(scene: Scene) -> bytes:
     roles = zip(scene.predict_row.tolist(), scene.predict_difficulty.tolist(), strict=True)
     return b"".join(
         [
-            b"".join(_double(1, time_s) for time_s in scene.timestamps_s.tolist()),
+            b"".join(double(1, time_s) for time_s in scene.timestamps_s.tolist()),
             _tracks(scene.tracks, origin),
-            b"".join(_int(4, track) for track in scene.interest_id.tolist()),
-            _message(5, scene.scenario_id.encode()),
-            _int(6, scene.ego),
+            b"".join(integer(4, track) for track in scene.interest_id.tolist()),
+            message(5, scene.scenario_id.encode()),
+            integer(6, scene.ego),
             _dynamic_states(scene.signals, origin, scene.tracks.num_steps),
             _map_features(scene.road_map, origin),
-            _int(10, scene.now),
-            *(_message(11, _int(1, row) + _int(2, level)) for row, level in roles),
+            integer(10, scene.now),
+            *(message(11, integer(1, row) + integer(2, level)) for row, level in roles),
         ]
     )
 
@@ -83,10 +82,10 @@ def _tracks(tracks: Tracks, origin_xyz_m: Float64[np.ndarray, "3"]) -> bytes:
         zip(tracks.id.tolist(), kinds.tolist(), strict=True)
     ):
         written = [
-            _message(3, _UNSEEN if skip else state.tobytes())
+            message(3, _UNSEEN if skip else state.tobytes())
             for state, skip in zip(states[row], unseen[row].tolist(), strict=True)
         ]
-        parts.append(_message(2, _int(1, track) + _int(2, kind) + b"".join(written)))
+        parts.append(message(2, integer(1, track) + integer(2, kind) + b"".join(written)))
     return b"".join(parts)
 
 
@@ -128,7 +127,7 @@ def _bytes_of(rows: np.ndarray) -> np.ndarray:
 def _points(number: int, xyz_m: Float64[np.ndarray, "point 3"]) -> bytes:
     """Write points, each as field ``number`` holding a ``MapPoint``."""
     rows = _rows(_POINT, x=xyz_m[:, 0], y=xyz_m[:, 1], z=xyz_m[:, 2])
-    head = _key(number, _BYTES) + _varint(rows.itemsize)
+    head = key(number, BYTES) + varint(rows.itemsize)
     heads = np.tile(np.frombuffer(head, "u1"), (len(rows), 1))
     return np.hstack([heads, _bytes_of(rows)]).tobytes()
 
@@ -139,13 +138,14 @@ def _dynamic_states(signals: Signals, origin_xyz_m: np.ndarray, num_steps: int) 
     size = len(stops) // max(1, len(signals.step))
     lights = zip(signals.lane_id.tolist(), signals.state.tolist(), strict=True)
     rows = [
-        _message(1, _int(1, lane) + _int(2, state) + stops[row * size : (row + 1) * size])
+        message(
+            1, integer(1, lane) + integer(2, state) + stops[row * size : (row + 1) * size]
+        )
         for row, (lane, state) in enumerate(lights)
     ]
     ends = np.searchsorted(signals.step, np.arange(num_steps + 1))
     return b"".join(
-        _message(7, b"".join(rows[ends[step] : ends[step + 1]]))
-        for step in range(num_steps)
+        message(7, b"".join(rows[ends[step] : ends[step + 1]])) for step in range(num_steps)
     )
 
 
@@ -158,7 +158,7 @@ def _map_features(road_map: RoadMap, origin_xyz_m: np.ndarray) -> bytes:
     ):
         points_m = xyz_m[road_map.point_offsets[row] : road_map.point_offsets[row + 1]]
         body = _feature(road_map, tables, row, points_m)
-        parts.append(_message(8, _int(1, feature) + _message(kind, body)))
+        parts.append(message(8, integer(1, feature) + message(kind, body)))
     return b"".join(parts)
 
 
@@ -167,10 +167,10 @@ def _feature(road_map: RoadMap, tables: "_Tables", row: int, points_m: np.ndarra
     if kind == FeatureKind.LANE:
         return _lane(road_map, tables, row, points_m)
     if kind in (FeatureKind.ROAD_LINE, FeatureKind.ROAD_EDGE):
-        return _int(1, int(road_map.feature_type[row])) + _points(2, points_m)
+        return integer(1, int(road_map.feature_type[row])) + _points(2, points_m)
     if kind == FeatureKind.STOP_SIGN:
         lanes = road_map.sign_lane_id[tables.signs.get(int(road_map.feature_id[row]), [])]
-        return b"".join(_int(1, lane) for lane in lanes.tolist()) + _points(2, points_m)
+        return b"".join(integer(1, lane) for lane in lanes.tolist()) + _points(2, points_m)
     return _points(1, points_m)
 
 
@@ -199,28 +199,28 @@ class _Tables:
 def _rows_by(keys: Iterable[Any]) -> dict[Any, list[int]]:
     """Row numbers of each key, ascending."""
     found: dict[Any, list[int]] = {}
-    for row, key in enumerate(keys):
-        found.setdefault(key, []).append(row)
+    for row, owner in enumerate(keys):
+        found.setdefault(owner, []).append(row)
     return found
 
 
 def _lane(road_map: RoadMap, tables: _Tables, row: int, points_m: np.ndarray) -> bytes:
     lane = int(road_map.feature_id[row])
     parts = [
-        _double(1, float(road_map.speed_limit_mph[row])),
-        _int(2, int(road_map.feature_type[row])),
-        _int(3, int(road_map.interpolating[row])),
+        double(1, float(road_map.speed_limit_mph[row])),
+        integer(2, int(road_map.feature_type[row])),
+        integer(3, int(road_map.interpolating[row])),
         _points(8, points_m),
     ]
     for number, link in ((9, LinkKind.ENTRY), (10, LinkKind.EXIT)):
         others = road_map.link_other_id[tables.links.get((lane, link), [])]
-        parts += [_int(number, other) for other in others.tolist()]
+        parts += [integer(number, other) for other in others.tolist()]
     for number, side in ((11, Side.LEFT), (12, Side.RIGHT)):
         beside = tables.neighbours.get((lane, side), [])
-        parts += [_message(number, _neighbour(road_map, tables, at)) for at in beside]
+        parts += [message(number, _neighbour(road_map, tables, at)) for at in beside]
     for number, side in ((13, Side.LEFT), (14, Side.RIGHT)):
         along = tables.boundaries.get((lane, side), [])
-        parts += [_message(number, _boundary(road_map, at)) for at in along]
+        parts += [message(number, _boundary(road_map, at)) for at in along]
     return b"".join(parts)
 
 
@@ -229,9 +229,9 @@ def _neighbour(road_map: RoadMap, tables: _Tables, at: int) -> bytes:
     shared = tables.shared.get(at, [])
     return b"".join(
         [
-            _int(1, int(road_map.neighbour_other_id[at])),
-            *(_int(number, index) for number, index in spans),
-            *(_message(6, _boundary(road_map, row)) for row in shared),
+            integer(1, int(road_map.neighbour_other_id[at])),
+            *(integer(number, index) for number, index in spans),
+            *(message(6, _boundary(road_map, row)) for row in shared),
         ]
     )
 
@@ -240,32 +240,4 @@ def _boundary(road_map: RoadMap, at: int) -> bytes:
     first, last = road_map.boundary_span[at].tolist()
     feature = int(road_map.boundary_feature_id[at])
     kind = int(road_map.boundary_type[at])
-    return _int(1, first) + _int(2, last) + _int(3, feature) + _int(4, kind)
-
-
-@cache
-def _key(number: int, wire: int) -> bytes:
-    return _varint(number << 3 | wire)
-
-
-def _varint(value: int) -> bytes:
-    """Seven bits a byte, lowest first; negative numbers as 64-bit two's complement."""
-    value &= (1 << 64) - 1
-    parts = bytearray()
-    while value > 0x7F:
-        parts.append(value & 0x7F | 0x80)
-        value >>= 7
-    parts.append(value)
-    return bytes(parts)
-
-
-def _int(number: int, value: int) -> bytes:
-    return _key(number, _VARINT) + _varint(value)
-
-
-def _double(number: int, value: float) -> bytes:
-    return _key(number, _FIXED64) + struct.pack("<d", value)
-
-
-def _message(number: int, body: bytes) -> bytes:
-    return _key(number, _BYTES) + _varint(len(body)) + body
+    return integer(1, first) + integer(2, last) + integer(3, feature) + integer(4, kind)

@@ -55,6 +55,22 @@ def make_move_table(codebook: MotionCodebook) -> MoveTable:
     )
 
 
+@lru_cache(maxsize=4)
+def neighbours(table: MoveTable, count: int) -> Int16[np.ndarray, "3 move near"]:
+    """Return for each move some that end near to it, itself (or a twin) among them.
+
+    Args:
+        table: The moves.
+        count: How many.
+    """
+    near = []
+    for weights in table.weights:
+        spread = np.concatenate([weights[:4] / -2, np.ones_like(weights[:1])])
+        gap = spread.T @ weights  # [move, move], less the square of the row
+        near.append(np.argpartition(gap, count - 1, axis=1)[:, :count])
+    return np.stack(near).astype(np.int16)
+
+
 def nearest_moves(
     target: Float32[np.ndarray, "row 3"],
     pose: Float32[np.ndarray, "row 3"],
@@ -72,11 +88,28 @@ def nearest_moves(
         kind: ``AgentKind`` of each agent.
         table: The moves to choose from.
     """
+    return nearest_few(target, pose, kind, table, 1)[:, 0]
+
+
+def nearest_few(
+    target: Float32[np.ndarray, "row 3"],
+    pose: Float32[np.ndarray, "row 3"],
+    kind: Int8[np.ndarray, " row"],
+    table: MoveTable,
+    count: int,
+) -> Int16[np.ndarray, "row near"]:
+    """Find the few moves from each pose that end nearest to each target, nearest first.
+
+    What near is and the arguments are as for ``nearest_moves``, the first of these; there
+    must be ``count`` moves.
+    """
     order = np.argsort(kind, kind="stable")
-    move = np.empty(len(order), dtype=np.int16)
+    move = np.empty((len(order), count), dtype=np.int16)
+    near = neighbours(table, count)
     for start in range(0, len(order), _ROWS_AT_ONCE):
         rows = order[start : start + _ROWS_AT_ONCE]
-        move[rows] = _nearest(to_local(target[rows], pose[rows]), kind[rows], table)
+        wanted = to_local(target[rows], pose[rows])
+        move[rows] = _nearest(wanted, kind[rows], table, near)
     return move
 
 
@@ -109,22 +142,27 @@ def follow(
     return move, advance(pose, kind, move, table.codebook)
 
 
-def _nearest(wanted: np.ndarray, kind: np.ndarray, table: MoveTable) -> np.ndarray:
-    """Return the nearest move of each pose wanted; ``kind`` ascends."""
+def _nearest(
+    wanted: np.ndarray, kind: np.ndarray, table: MoveTable, near: np.ndarray
+) -> np.ndarray:
+    """Return the nearest moves [row, few] of each pose wanted; ``kind`` ascends."""
     corners_m = _corners(wanted, table.codebook.size_lw_m[kind])  # [row, 8]
-    row, move = _candidates(wanted, corners_m, kind, table)
+    row, move = _candidates(wanted, corners_m, kind, table, near)
     gap_m = _mean_gap(table.corners_m[kind[row], move], corners_m[row])
 
-    rows = np.arange(len(wanted))
-    least = np.minimum.reduceat(gap_m, np.searchsorted(row, rows))
-    best = np.flatnonzero(gap_m == least[row])
-    return move[best[np.searchsorted(row[best], rows)]]
+    order = np.lexsort([gap_m, row])  # Stable: of equally near moves the first.
+    first = np.searchsorted(row, np.arange(len(wanted)))
+    return move[order[first[:, None] + np.arange(near.shape[2])]]
 
 
 def _candidates(
-    wanted: np.ndarray, corners_m: np.ndarray, kind: np.ndarray, table: MoveTable
+    wanted: np.ndarray,
+    corners_m: np.ndarray,
+    kind: np.ndarray,
+    table: MoveTable,
+    near: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows and moves, ascending, among which each row's nearest move surely is."""
+    """Return rows and moves, ascending, among which each row's nearest few surely are."""
     spread = _spread(wanted, table.reach_m[kind])
     square = (spread**2).sum(axis=-1)
     spread = np.column_stack([spread, np.ones_like(square)])
@@ -133,9 +171,11 @@ def _candidates(
     for number in np.flatnonzero(np.diff(ends)):
         rows = slice(ends[number], ends[number + 1])
         gap = spread[rows] @ table.weights[number]  # [row, move], less square
-        guess_m = _mean_gap(table.corners_m[number, gap.argmin(axis=1)], corners_m[rows])
+        guess = near[number, gap.argmin(axis=1)]  # [row, few]
+        guess_m = _mean_gap(table.corners_m[number, guess], corners_m[rows, None])
+        guess_m = guess_m.max(axis=1)
 
-        # The nearest move is no farther than the guess, its spread at most 1.42 times.
+        # The nearest few are no farther than any few at most, their spreads 1.42 times.
         twice = (2 * guess_m**2).astype(np.float32)
         # Sixty roundings of a float32, relative to moves about as long as the one wanted.
         slack = np.float32(5e-6) * (square[rows] + twice)
@@ -145,8 +185,8 @@ def _candidates(
 
 
 def _mean_gap(one_m: np.ndarray, other_m: np.ndarray) -> np.ndarray:
-    """Return the mean distance of four corners; arrays are [box, 8]: all x, then all y."""
-    away_m = ((one_m - other_m) ** 2).T
+    """Return the mean distance of four corners; arrays are [..., 8]: all x, then all y."""
+    away_m = np.moveaxis((one_m - other_m) ** 2, -1, 0)
     return np.sqrt(away_m[:4] + away_m[4:]).sum(axis=0) / 4
 
 

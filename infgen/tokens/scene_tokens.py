@@ -72,6 +72,8 @@ class SceneTokens:
         presence: ``Presence``.
         observed: Whether the log shows the agent at both ends of the token; False at
             ``ENTERING`` (SPEC 3.3).
+        pattern: Bit i: whether the log shows the agent at step i + 1 of the token, before
+            short gaps are filled and at any distance (``tokens.patterns``); 0 where absent.
         cell: Cell of the ego's grid that holds the agent, or ``NO_CELL``; only where it is
             observed or entering.
         near: Whether the agent is ever observed within the motion-loss radius of the ego.
@@ -111,6 +113,7 @@ class SceneTokens:
     move: Int16[np.ndarray, "agent token"]
     presence: Int8[np.ndarray, "agent token"]
     observed: Bool[np.ndarray, "agent token"]
+    pattern: UInt8[np.ndarray, "agent token"]
     cell: Int16[np.ndarray, "agent token"]
     near: Bool[np.ndarray, " agent"]
     entry_token: Int16[np.ndarray, " entry"]

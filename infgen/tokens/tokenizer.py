@@ -13,7 +13,7 @@ from infgen.tokens.grid import make_grid
 from infgen.tokens.moves import make_move_table
 from infgen.tokens.presence import makes_a_move, seen_tokens
 from infgen.tokens.roads import match_roads, road_pieces
-from infgen.tokens.scene_tokens import SceneTokens
+from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.sequence import write_words
 from infgen.tokens.signals import signal_lines, signals_at
 from infgen.tokens.tracks import Paths, read_paths
@@ -66,6 +66,7 @@ def tokenize_scene(
         move=agents.move,
         presence=agents.presence,
         observed=agents.observed,
+        pattern=np.where(agents.presence == Presence.ABSENT, np.uint8(0), paths.pattern),
         cell=agents.cell,
         near=paths.near,
         entry_token=entries.token,

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int8, Int32, Int64
+from jaxtyping import Bool, Float32, Int8, Int32, Int64, UInt8
 
 from infgen.clock import CLOCK, Clock
 from infgen.config import TokenSettings
 from infgen.geometry import wrap_angle
 from infgen.scene import AgentKind, Scene, Tracks
+from infgen.tokens.patterns import encode_patterns
 
 MAX_TURN_RAD = 1.5
 """No agent turns farther in one step; a heading that does is an error of the log."""
@@ -35,6 +36,8 @@ class Paths:
         pose: x, y, heading at each border; meaningless where not valid.
         z_m: Height of the box centre at each border.
         valid: Whether the agent is known there, and near enough to the ego.
+        pattern: Which steps of each token the log itself shows (``tokens.patterns``),
+            however far from the ego.
         near: Whether it is ever observed within the motion-loss radius of the ego.
         at_now: Whether it is known at the last step of the history.
     """
@@ -46,6 +49,7 @@ class Paths:
     pose: Float32[np.ndarray, "agent border 3"]
     z_m: Float32[np.ndarray, "agent border"]
     valid: Bool[np.ndarray, "agent border"]
+    pattern: UInt8[np.ndarray, "agent token"]
     near: Bool[np.ndarray, " agent"]
     at_now: Bool[np.ndarray, " agent"]
 
@@ -59,6 +63,7 @@ class Paths:
             pose=self.pose[rows],
             z_m=self.z_m[rows],
             valid=self.valid[rows],
+            pattern=self.pattern[rows],
             near=self.near[rows],
             at_now=self.at_now[rows],
         )
@@ -111,6 +116,7 @@ def read_paths(
         pose=pose,
         z_m=filled.xyz_m[:, :: clock.steps_per_token, 2][:, : tokens + 1],
         valid=valid,
+        pattern=encode_patterns(tracks.valid, clock),
         near=near,
         at_now=known[:, scene.now],
     )

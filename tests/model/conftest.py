@@ -41,6 +41,18 @@ TINY = ModelSettings(
     max_entries=3,
 )
 
+VARIANTS = {
+    "full": {},
+    "smart": {"life_cycle": False},
+    "no leave token": {"leave_token": False},
+    "no cell token": {"cell_token": False},
+    "no heading token": {"heading_token": False},
+    "no leave, no cell token": {"leave_token": False, "cell_token": False},
+    "patterns": {"pattern_tokens": True},
+    "smart with patterns": {"life_cycle": False, "pattern_tokens": True},
+}
+"""Baselines and ablations of SPEC 7, and heads that are off by default."""
+
 
 def make_motion_codebook(num_moves=NUM_MOVES):
     random = np.random.default_rng(0)
@@ -131,6 +143,7 @@ def _record(name, kind, pose, move, presence, roads, random):
         move=move.astype(np.int16),
         presence=presence,
         observed=observed,
+        pattern=np.where(absent, 0, _any_pattern(absent.shape)).astype(np.uint8),
         cell=cell,
         near=np.ones(agents, dtype=bool),
         entry_token=token.astype(np.int16),
@@ -157,6 +170,10 @@ def _record(name, kind, pose, move, presence, roads, random):
         anchor_token=none.astype(np.int16),
         anchor_pose=np.empty((0, 3), dtype=np.float32),
     )
+
+
+def _any_pattern(shape):
+    return np.random.default_rng(1).integers(32, size=shape)
 
 
 def move_world(record, turn_rad, shift_m):
@@ -189,6 +206,12 @@ def make_network(settings=TINY, seed=0):
 @pytest.fixture(scope="session")
 def network():
     return make_network().eval()
+
+
+@pytest.fixture(scope="module", params=VARIANTS)
+def variant(request):
+    """Settings of each variant in turn."""
+    return replace(TINY, **VARIANTS[request.param])
 
 
 @pytest.fixture(scope="session")

@@ -6,14 +6,21 @@ import numpy as np
 import pytest
 import torch
 
+from infgen.config import TrainSettings
 from infgen.model.batch import NOBODY, OUTSIDE, collate, collate_roads, to_device
 from infgen.model.window import cut_window
-from infgen.tokens.grid import decode_cell, from_grid, make_grid
+from infgen.tokens.grid import decode_cell, encode_cell, from_grid, make_grid, to_grid
+from infgen.tokens.moves import advance, make_move_table, nearest_moves
+from infgen.tokens.noise import make_noise
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_MOVE, Presence
 
 
+def parts(batch):
+    return batch.agents, batch.roads, batch.entries, batch.details
+
+
 def tensors(batch):
-    for part in (batch.agents, batch.roads, batch.entries, batch.details):
+    for part in parts(batch):
         for field in fields(part):
             yield field.name, getattr(part, field.name)
 
@@ -87,6 +94,24 @@ def test_padding_is_absent_and_unreal(record, limits):
     assert not batch.entries.asked[0, 4:].any()
 
 
+def test_patterns_are_those_of_the_scene_and_0_for_who_is_absent(record, limits):
+    scene = record(3, agents=5, tokens=9, lives=[(0, 8)] * 4)
+    part = cut_window(record(2, tokens=10, lives=LIVES), 3, 18, 99, 99)
+
+    agents = collate([scene, record(4)], limits, 0).agents
+
+    assert torch.equal(agents.pattern[0, :, 0], torch.from_numpy(scene.pattern[0]).long())
+    assert (agents.pattern[agents.presence == Presence.ABSENT] == 0).all()
+    assert (part.pattern[part.presence == Presence.ABSENT] == 0).all()
+    assert part.pattern.any()
+
+
+def test_moves_are_learned_as_they_were_made(record, limits):
+    agents = collate([record(3, agents=12, tokens=9), record(4)], limits, 0).agents
+
+    assert torch.equal(agents.label, agents.move)
+
+
 def test_newcomers_take_turns_from_near_to_far(record, limits):
     scene = record(8, tokens=5, lives=[(0, 4), (2, 4), (2, 4), (3, 4)], spread_m=20.0)
 
@@ -117,8 +142,12 @@ def test_all_others_have_no_turn_and_those_outside_the_grid_an_endless_one(recor
     assert turn[:, 0].tolist() == [-1] * 4
 
 
-def test_details_decode_to_where_the_agent_is(record, limits, grid_settings):
-    batch = collate([record(3, agents=12, tokens=9)], limits, 0)
+@pytest.mark.parametrize("disturbed", [False, True])
+def test_details_decode_to_where_the_agent_is(
+    record, limits, grid_settings, noise, disturbed
+):
+    scene = record(3, agents=12, tokens=9)
+    batch = collate([scene], limits, 0, noise if disturbed else None)
     details, agents = batch.details, batch.agents
     grid = make_grid(grid_settings)
 
@@ -133,6 +162,118 @@ def test_details_decode_to_where_the_agent_is(record, limits, grid_settings):
             pose[2] - ego_pose[2] - grid.heading_centre_rad[details.heading[0, row]]
         )
         assert abs((turned_rad + np.pi) % (2 * np.pi) - np.pi) < np.radians(5.001)
+
+
+@pytest.fixture(scope="module")
+def noise(codebooks):
+    return make_noise(TrainSettings(noise_moves=6, noise_roads=4), *codebooks())
+
+
+def with_a_gap(scene):
+    """The scene with row 1 unseen for two tokens, then going on."""
+    observed, move = scene.observed.copy(), scene.move.copy()
+    observed[1, 3:5], move[1, 3:5] = False, NO_MOVE
+    return replace(scene, observed=observed, move=move)
+
+
+@pytest.fixture(scope="module")
+def pair(record, limits, noise):
+    """The same three scenes as they are and disturbed."""
+    lives = [(0, 8), (0, 8), (3, 8), (2, 6), (0, 5), (5, 8)]
+    scenes = [record(3, tokens=9, lives=lives), record(4, agents=14), record(5)]
+    scenes[0] = with_a_gap(scenes[0])
+    return collate(scenes, limits, 7), collate(scenes, limits, 7, noise)
+
+
+def test_noise_without_a_choice_leaves_a_batch_as_it_is(record, limits, codebooks):
+    scenes = [with_a_gap(record(3, agents=12, tokens=9)), record(4)]
+    none = make_noise(TrainSettings(noise_moves=1, noise_roads=1), *codebooks())
+
+    plain, noisy = collate(scenes, limits, 7), collate(scenes, limits, 7, none)
+
+    for (name, one), (_, two) in zip(tensors(plain), tensors(noisy), strict=True):
+        assert torch.equal(one, two), name
+
+
+def test_noise_changes_only_what_agents_do_and_where_they_are(pair):
+    plain, noisy = pair
+
+    changed = {
+        f"{type(part).__name__}.{field.name}"
+        for part, other in zip(parts(plain), parts(noisy), strict=True)
+        for field in fields(part)
+        if not torch.equal(getattr(part, field.name), getattr(other, field.name))
+    }
+    told_of_players = {"Details.cell", "Details.heading", "Details.offset_m"}
+    asked = {"Details.agent", "Details.token", "Details.kind", "Details.size_lwh_m"}
+    agents = {"Agents.pose", "Agents.move", "Agents.label", "Agents.cell"}
+    assert agents | {"Details.offset_m", "Roads.token"} <= changed
+    assert changed <= agents | told_of_players | asked | {"Roads.token"}
+
+
+def test_noise_moves_neither_the_ego_nor_who_is_absent_entering_or_unseen(pair):
+    plain, noisy = pair
+    still = ~plain.agents.observed
+    still[:, :, 0] = True
+
+    for name in ("pose", "move", "label", "cell"):
+        one, two = getattr(plain.agents, name), getattr(noisy.agents, name)
+        assert torch.equal(one[still], two[still]), name
+        assert not torch.equal(one, two)
+    assert (plain.agents.presence[still] == Presence.PRESENT).any()  # The gap.
+
+
+def test_noisy_agents_go_where_their_moves_lead_and_learn_to_come_back(pair, codebooks):
+    plain, noisy = pair
+    codebook, _ = codebooks()
+    table = make_move_table(codebook)
+    scene, token, row = noisy.agents.observed.nonzero(as_tuple=True)
+    kind = noisy.agents.kind[scene, row].numpy().astype(np.int8)
+    before = noisy.agents.pose[scene, token - 1, row].numpy()
+    wanted = plain.agents.pose[scene, token, row].numpy()
+
+    move = noisy.agents.move[scene, token, row].numpy().astype(np.int16)
+    ends = advance(before, kind, move, codebook)
+    label = nearest_moves(wanted, before, kind, table)
+
+    np.testing.assert_allclose(noisy.agents.pose[scene, token, row], ends, atol=1e-4)
+    others = row.numpy() > 0  # The ego goes as logged.
+    np.testing.assert_array_equal(
+        noisy.agents.label[scene, token, row].numpy()[others], label[others]
+    )
+
+
+def test_noisy_agents_are_in_the_cells_they_are_in(pair, grid_settings):
+    agents = pair[1].agents
+    grid = make_grid(grid_settings)
+    in_grid_m = to_grid(agents.pose[..., :2].numpy(), agents.pose[:, :, :1].numpy())
+
+    cell = torch.from_numpy(encode_cell(in_grid_m, grid)).long()
+
+    assert torch.equal(agents.cell[agents.observed], cell[agents.observed])
+
+
+def test_noise_draws_what_is_its_own_and_by_draw_and_scene(record, limits, noise):
+    scenes = [record(3, agents=12, tokens=9), record(4)]
+
+    one, two = (collate(scenes, limits, 7, noise) for _ in range(2))
+    alone, other = collate(scenes[1:], limits, 7, noise), collate(scenes, limits, 8, noise)
+    plain = collate(scenes, limits, 7)
+
+    pairs = zip(tensors(one), tensors(two), strict=True)
+    assert all(torch.equal(a, b) for (_, a), (_, b) in pairs)
+    own = alone.agents.move[0]
+    assert torch.equal(own, one.agents.move[1, : own.shape[0], : own.shape[1]])
+    assert not torch.equal(one.agents.move, other.agents.move)
+    assert torch.equal(one.roads.picked, plain.roads.picked)
+
+
+def test_road_tokens_to_predict_are_never_disturbed(pair):
+    plain, noisy = pair
+    changed = plain.roads.token != noisy.roads.token
+
+    assert changed.any()
+    assert not changed[plain.roads.picked].any()
 
 
 def test_those_who_play_newcomers_are_there_already_and_not_the_ego(record, limits):

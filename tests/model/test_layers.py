@@ -1,26 +1,28 @@
 """Attention is what its textbook form says, and tables are the functions they stand for."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch.nn import functional
 
+from infgen.model import pairs
 from infgen.model.layers import (
     Attention,
     FourierEmbedding,
-    RelationEmbedding,
     Seen,
-    Span,
+    dropout_factors,
     gather,
     initialise,
     normed,
 )
+from infgen.model.pairs import Shared
 
-WIDTH, HEADS = 16, 2
+WIDTH, HEADS, SOURCES = 16, 2, 9
 
 
-def plain_attention(layer, target, seen):
+def plain_attention(layer, target, seen, relation):
     """The layer as SPEC 4.1 writes it: keys and values of every pair, one by one."""
     targets, slots, width = target.shape
     split = (layer.heads, width // layer.heads)
@@ -29,8 +31,8 @@ def plain_attention(layer, target, seen):
     def affine(norm, x):
         return x * norm.weight + norm.bias
 
-    x = affine(source, seen.features)
-    r = affine(layer.norm_relation, seen.relation)
+    x = affine(source, seen.features[seen.index])
+    r = affine(layer.norm_relation, relation)
     key = (layer.key(x) + layer.relation_key(r)).unflatten(-1, split)
     value = (layer.value(x) + layer.relation_value(r)).unflatten(-1, split)
     normal = layer.norm_target(target)
@@ -60,21 +62,23 @@ def make_layer(bipartite):
 
 def make_seen(targets, slots, neighbours):
     torch.manual_seed(2)
-    features = normed(torch.randn(targets, neighbours, WIDTH)).requires_grad_()
+    features = normed(torch.randn(SOURCES, WIDTH)).requires_grad_()
+    index = torch.randint(SOURCES, (targets, neighbours))
     relation = normed(torch.randn(targets, neighbours, WIDTH)).requires_grad_()
     present = torch.rand(targets, slots, neighbours) < 0.6
     present[0] = False  # One target sees nobody.
-    return Seen(features, relation, present)
+    return Seen(features, index, Shared.of(relation), present), relation
 
 
 @pytest.mark.parametrize("bipartite", [False, True])
 @pytest.mark.parametrize("slots", [1, 3])
 def test_factorised_attention_is_the_plain_one_and_so_are_its_gradients(bipartite, slots):
-    layer, seen = make_layer(bipartite), make_seen(5, slots, 7)
+    layer, (seen, relation) = make_layer(bipartite), make_seen(5, slots, 7)
     target = torch.randn(5, slots, WIDTH, requires_grad=True)
-    inputs = [target, seen.features, seen.relation, *layer.parameters()]
+    inputs = [target, seen.features, relation, *layer.parameters()]
 
-    found, wanted = layer(target, seen), plain_attention(layer, target, seen)
+    found = layer(target, seen)
+    wanted = plain_attention(layer, target, seen, relation)
     pull = torch.randn_like(found)
     gradients = torch.autograd.grad(found, inputs, pull)
     expected = torch.autograd.grad(wanted, inputs, pull)
@@ -84,10 +88,42 @@ def test_factorised_attention_is_the_plain_one_and_so_are_its_gradients(bipartit
         torch.testing.assert_close(gradient, other, atol=2e-5, rtol=1e-5)
 
 
+def test_targets_taken_a_few_at_a_time_give_what_all_at_once_give(monkeypatch):
+    layer, (seen, relation) = make_layer(True), make_seen(5, 2, 7)
+    target = torch.randn(5, 2, WIDTH, requires_grad=True)
+    inputs = [target, seen.features, relation, *layer.parameters()]
+
+    def run():
+        found = layer(target, seen)
+        return found, *torch.autograd.grad(found.square().sum(), inputs, retain_graph=True)
+
+    whole = run()
+    monkeypatch.setattr(pairs, "CACHED_NUMBERS", 2 * 7 * WIDTH)
+    parts = run()
+
+    for part, other in zip(parts, whole, strict=True):
+        torch.testing.assert_close(part, other, atol=1e-5, rtol=1e-5)
+
+
+def test_the_gradients_of_all_layers_that_share_relations_add_up():
+    first, second = make_layer(True), make_layer(True)
+    seen, relation = make_seen(5, 1, 7)
+    target = torch.randn(5, 1, WIDTH)
+
+    (both,) = torch.autograd.grad(
+        (first(target, seen) + 3 * second(target, seen)).square().sum(), relation
+    )
+    plain = plain_attention(first, target, seen, relation)
+    plain = plain + 3 * plain_attention(second, target, seen, relation)
+    (wanted,) = torch.autograd.grad(plain.square().sum(), relation)
+
+    torch.testing.assert_close(both, wanted, atol=1e-3, rtol=1e-4)
+
+
 def test_targets_without_slots_are_targets_with_one():
-    layer, seen = make_layer(True), make_seen(5, 1, 7)
+    layer, (seen, _) = make_layer(True), make_seen(5, 1, 7)
     target = torch.randn(5, WIDTH)
-    flat = Seen(seen.features, seen.relation, seen.present[:, 0])
+    flat = replace(seen, present=seen.present[:, 0])
 
     torch.testing.assert_close(layer(target, flat), layer(target[:, None], seen)[:, 0])
 
@@ -96,22 +132,21 @@ def test_a_target_without_neighbours_still_passes_gate_and_feed_forward():
     layer = make_layer(False)
     target = torch.randn(3, WIDTH)
     nobody = torch.zeros(3, 0, WIDTH)
+    none = torch.zeros(3, 0, dtype=torch.bool)
 
-    updated = layer(target, Seen(nobody, nobody, torch.zeros(3, 0, dtype=torch.bool)))
+    updated = layer(target, Seen.own(nobody, Shared.of(nobody), none))
 
     assert torch.isfinite(updated).all()
     assert (updated - target).abs().max() > 0.1
 
 
 def test_what_is_not_present_does_not_matter_whatever_it_holds():
-    layer, seen = make_layer(False), make_seen(5, 1, 7)
+    layer, (seen, relation) = make_layer(False), make_seen(5, 1, 7)
     target = torch.randn(5, 1, WIDTH)
     hidden = ~seen.present[:, 0, :, None]
-    other = Seen(
-        seen.features.masked_fill(hidden, 3.0),
-        seen.relation.masked_fill(hidden, -5.0),
-        seen.present,
-    )
+    features = seen.features[seen.index].masked_fill(hidden, 3.0)
+    other = relation.masked_fill(hidden, -5.0)
+    other = Seen.own(features, Shared.of(other), seen.present)
 
     assert torch.equal(layer(target, seen), layer(target, other))
 
@@ -119,8 +154,8 @@ def test_what_is_not_present_does_not_matter_whatever_it_holds():
 def test_dropout_leaves_the_mean_of_what_is_seen():
     torch.manual_seed(0)
     layer = Attention(WIDTH, HEADS, 0.5, bipartite=False).train()
-    seen = make_seen(1, 1, 400)
-    seen = Seen(seen.features, seen.relation, torch.ones(1, 1, 400, dtype=torch.bool))
+    seen, _ = make_seen(1, 1, 400)
+    seen = replace(seen, present=torch.ones(1, 1, 400, dtype=torch.bool))
     target = torch.randn(1, 1, WIDTH)
 
     noisy = torch.stack([layer.look(target, seen) for _ in range(100)]).mean(dim=0)
@@ -144,64 +179,14 @@ def test_parameters_start_as_the_paper_has_them():
     assert float(embedding.frequency.weight.detach().std()) == pytest.approx(0.02, rel=0.2)
 
 
-@pytest.fixture
-def relation():
-    torch.manual_seed(3)
-    turn = Span(-math.pi, math.pi, 1025, closed=True)
-    spans = [Span(0.0, 30.0, 601), turn, Span(-4.0, 0.0, 5)]
-    embedding = RelationEmbedding(spans, 8, WIDTH)
-    embedding.apply(initialise)
-    return embedding.eval()
+def test_one_byte_a_place_drops_the_share_asked_for():
+    torch.manual_seed(0)
 
+    factors = dropout_factors(torch.empty(1003, 7), 0.1)
 
-def exact(relation, values):
-    return normed(FourierEmbedding.forward(relation, values))
-
-
-def test_a_table_is_its_function_but_for_its_kinks(relation):
-    values = torch.rand(50, 9, 3) * torch.tensor([30.0, 6.2, 0.0])
-    values += torch.tensor([0.0, -3.1, 0.0])
-    values[..., 2] = torch.randint(-4, 0, (50, 9)).float()
-
-    found = relation.look_up(values, relation.table())
-
-    gap = (found - exact(relation, values)).abs()
-    assert gap.quantile(0.99) < 1e-4  # Elsewhere a ReLU bends between two nodes.
-    assert gap.max() < 2e-3
-
-
-def test_a_table_gives_its_nodes_exactly(relation):
-    values = torch.tensor([[[0.0, 0.0, -4.0], [30.0, math.pi / 2, -1.0]]])
-
-    found = relation.look_up(values, relation.table())
-
-    torch.testing.assert_close(found, exact(relation, values), atol=1e-5, rtol=0.0)
-
-
-def test_rounding_does_not_tell_a_half_turn_left_from_one_right(relation):
-    angles = torch.tensor([math.pi - 1e-7, -math.pi + 1e-7])
-    values = torch.stack([torch.full((2,), 5.0), angles, torch.full((2,), -1.0)], dim=-1)
-
-    left, right = relation.look_up(values[None], relation.table())[0]
-
-    torch.testing.assert_close(left, right, atol=1e-3, rtol=0.0)
-
-
-def test_values_beyond_a_table_are_taken_as_its_ends(relation):
-    values = torch.tensor([[[31.0, 0.0, -9.0], [30.0, 0.0, -4.0]]])
-
-    beyond, end = relation.look_up(values, relation.table())[0]
-
-    assert torch.equal(beyond, end)
-
-
-def test_tables_learn(relation):
-    values = torch.tensor([[[3.3, 0.3, -2.0]]])
-
-    relation.look_up(values, relation.table()).square()[..., 0].sum().backward()
-
-    assert relation.frequency.weight.grad.abs().sum() > 0
-    assert all(p.grad is not None for p in relation.parameters())
+    assert factors.unique().tolist() == pytest.approx([0.0, 1 / (1 - 26 / 256)])
+    assert float((factors == 0).float().mean()) == pytest.approx(26 / 256, abs=0.01)
+    assert float(factors.mean()) == pytest.approx(1, abs=0.01)
 
 
 def test_gathered_gradients_add_up():

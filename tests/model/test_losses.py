@@ -130,6 +130,20 @@ def test_newcomers_outside_the_grid_are_not_asked_for(network, record, limits, s
     assert float(terms["cell"].count) == 0
 
 
+def test_the_label_is_learned_and_not_the_move(network, record, limits, settings):
+    batch = collate([record(3, agents=6, tokens=7, roads=40)], limits, 0)
+    label = torch.where(batch.agents.label >= 0, 5, batch.agents.label)
+    other = replace(batch, agents=replace(batch.agents, label=label))
+    outputs = network(batch)
+
+    said = outputs.motion.move_logits.new_zeros(outputs.motion.move_logits.shape)
+    said[:, 5] = 50.0
+    sure = replace(outputs, motion=replace(outputs.motion, move_logits=said))
+
+    assert float(losses(sure, other, settings)["motion"].mean) < 1e-4
+    assert float(losses(sure, batch, settings)["motion"].mean) > 10
+
+
 def test_the_first_move_of_a_newcomer_counts_three_times(network, record, limits, settings):
     scene = record(8, tokens=4, lives=[(2, 3)])
 

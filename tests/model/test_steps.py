@@ -1,10 +1,14 @@
 """Played one column at a time, the network says what it says of all columns at once."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from infgen.model.batch import OUTSIDE, collate, collate_roads
-from infgen.model.steps import Column, Stepper
+from infgen.model.columns import Column
+from infgen.model.sight import grid_place
+from infgen.model.steps import Stepper
 from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE, Presence
 
 CLOSE = {"atol": 1e-4, "rtol": 1e-4}
@@ -25,6 +29,24 @@ def column_at(agents, token, turns=OUTSIDE + 1):
     )
 
 
+def places(batch, token, slot):
+    """Where the newcomer of a slot is in the ego's grid frame; anything for nobody."""
+    pose = batch.agents.pose[:, token]
+    agent = batch.entries.agent[:, token, slot].clamp(min=0)
+    return grid_place(pose[torch.arange(len(agent)), agent], pose[:, 0])
+
+
+def same(step, wanted):
+    """Both say nothing, or both the same."""
+    assert (step is None) == (wanted is None)
+    if step is not None:
+        torch.testing.assert_close(step, wanted, **CLOSE)
+
+
+def of(values, *index):
+    return None if values is None else values[index]
+
+
 def play(network, batch, records):
     """Teacher-forced logits: motion per token, entries per (token, turn)."""
     stepper = Stepper(network)
@@ -32,14 +54,15 @@ def play(network, batch, records):
     rows = batch.agents.kind.shape[1]
     memory = stepper.begin(collate_roads(records, 10_000), torch.arange(scenes), rows)
     motion, queries, details = [], {}, {}
-    slots = batch.entries.agent.shape[2]
+    slots, by_cell = batch.entries.agent.shape[2], network.settings.cell_token
     for token in range(batch.agents.pose.shape[1]):
-        if token > 0:
+        if token > 0 and stepper.life_cycle:
             entries = stepper.entry_begin(memory, column_at(batch.agents, token, turns=0))
             for slot in range(slots):
                 queries[token, slot] = stepper.entry_query(entries)
                 cell = batch.entries.cell[:, token, slot]
-                details[token, slot] = stepper.entry_details(entries, cell)
+                place_m = None if by_cell else places(batch, token, slot)
+                details[token, slot] = stepper.entry_details(entries, cell, place_m)
                 column = column_at(batch.agents, token, turns=slot + 1)
                 entries = stepper.entry_add(entries, column)
         motion.append(stepper.motion_step(memory, column_at(batch.agents, token)))
@@ -53,7 +76,8 @@ def records(record):
 
 
 @pytest.fixture(scope="module")
-def both(network, records, limits):
+def both(variant, new_network, records, limits):
+    network = new_network(variant).eval()
     batch = collate(records, limits, draw=0)
     with torch.no_grad():
         outputs = network(batch)
@@ -62,35 +86,33 @@ def both(network, records, limits):
 
 def test_motion_is_the_same_step_by_step(both):
     batch, outputs, (motion, _, _) = both
-    visible = batch.agents.visible
-
-    moves = outputs.motion.rows.spread(outputs.motion.move_logits)
-    leave = outputs.motion.rows.spread(outputs.motion.leave_logit)
-
-    for token, step in enumerate(motion):
-        seen = visible[:, token]
-        torch.testing.assert_close(step.move_logits[seen], moves[:, token][seen], **CLOSE)
-        torch.testing.assert_close(step.leave_logit[seen], leave[:, token][seen], **CLOSE)
+    for name in ("move_logits", "leave_logit", "pattern_logits"):
+        said = getattr(outputs.motion, name)
+        spread = None if said is None else outputs.motion.rows.spread(said)
+        for token, step in enumerate(motion):
+            seen = batch.agents.visible[:, token]
+            wanted = None if spread is None else spread[:, token][seen]
+            same(of(getattr(step, name), seen), wanted)
 
 
 def test_queries_for_newcomers_are_the_same_step_by_step(both):
     batch, outputs, (_, queries, _) = both
-    asked = batch.entries.asked
-    add = outputs.entries.rows.spread(outputs.entries.add_logit)
-    cells = outputs.entries.rows.spread(outputs.entries.cell_logits)
+    said = outputs.entries
+    assert (said is None) == (not queries)
     assert (batch.entries.agent >= 0).sum() >= 3
-
     for (token, slot), query in queries.items():
-        seen = asked[:, token]
-        torch.testing.assert_close(query.add_logit[seen], add[seen, token, slot], **CLOSE)
-        torch.testing.assert_close(
-            query.cell_logits[seen], cells[seen, token, slot], **CLOSE
-        )
+        seen = batch.entries.asked[:, token]
+        for name in ("add_logit", "cell_logits", "place_m"):
+            wanted = getattr(said, name)
+            wanted = None if wanted is None else said.rows.spread(wanted)
+            same(of(getattr(query, name), seen), of(wanted, seen, token, slot))
 
 
 def test_details_of_newcomers_are_the_same_step_by_step(both):
     batch, outputs, (_, _, details) = both
     found, wanted = outputs.details, batch.details
+    if found is None:
+        return
     pack = found.rows.pack
     scene = found.rows.at // wanted.present.shape[1]
     compared = 0
@@ -98,11 +120,27 @@ def test_details_of_newcomers_are_the_same_step_by_step(both):
         token, turn = int(pack(wanted.token)[row]), int(pack(wanted.turn)[row])
         step, kind = details[token, turn], int(pack(wanted.kind)[row])
         at = scene[row]
-        torch.testing.assert_close(step.kind_logits[at], found.kind_logits[row], **CLOSE)
-        size = step.size_lwh_m[at, kind].log()
-        torch.testing.assert_close(size, found.size_log_m[row], **CLOSE)
-        heading = step.heading_logits[at, kind]
-        torch.testing.assert_close(heading, found.heading_logits[row], **CLOSE)
-        torch.testing.assert_close(step.offset_m[at, kind], found.offset_m[row], **CLOSE)
+        same(step.kind_logits[at], found.kind_logits[row])
+        same(step.size_lwh_m[at, kind].log(), found.size_log_m[row])
+        for name in ("heading_logits", "turned_rad", "offset_m"):
+            same(of(getattr(step, name), at, kind), of(getattr(found, name), row))
         compared += 1
     assert compared >= 3
+
+
+def test_weights_that_know_motion_only_let_nobody_in(tiny, new_network, records):
+    stepper = Stepper(new_network(replace(tiny, life_cycle=False)))
+    roads = collate_roads(records, 10_000)
+    memory = stepper.begin(roads, torch.arange(2), rows=4)
+    nobody = Column(
+        kind=torch.zeros((2, 4), dtype=torch.int64),
+        size_lwh_m=torch.ones((2, 4, 3)),
+        pose=torch.zeros((2, 4, 3)),
+        move=torch.full((2, 4), NO_MOVE),
+        presence=torch.zeros((2, 4), dtype=torch.int64),
+        observed=torch.zeros((2, 4), dtype=torch.bool),
+        cell=torch.full((2, 4), NO_CELL),
+    )
+
+    with pytest.raises(ValueError, match="motion only"):
+        stepper.entry_begin(memory, nobody)

@@ -1,16 +1,25 @@
-"""Toy stages that do small, real work on real files."""
+"""Toy stages that do small, real work on real files, and a training run of seconds."""
 
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
+from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.tokens.codebook import MotionCodebook, RoadCodebook
+from infgen.tokens.scene_tokens import SceneTokens
+from infgen.tokens.tokenizer import tokenize_scene
+from pipeline.course import Course
 from pipeline.events import Events
+from pipeline.loader import TokenScenes
 from pipeline.request import Request
 from pipeline.root import Root
 from pipeline.runner import Orders, Result, run
+from pipeline.stage import Unit
+from pipeline.store import write_records
+from pipeline.tokenize import SCHEMA
 
 TOYS = Path(__file__).with_name("toys")
 STAGES = """\
@@ -92,3 +101,92 @@ def workshop(tmp_path, monkeypatch) -> Workshop:
     yield shop
     for name in ("toy_count", "toy_total", "toy_climb"):
         sys.modules.pop(name, None)
+
+
+TRAINING = {
+    "tokenize": TokenSettings(grid_radius_m=60.0, grid_step_m=4.0),
+    "model": ModelSettings(
+        width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4
+    ),
+    "train": TrainSettings(
+        steps=6,
+        batch_scenes=2,
+        warmup_steps=2,
+        checkpoint_every=2,
+        validate_every=4,
+        validation_scenes=2,
+        learning_rate=1e-3,
+    ),
+}
+
+
+@pytest.fixture(scope="session")
+def train_settings():
+    """Settings, by section, of a training run of seconds."""
+    return TRAINING
+
+
+@pytest.fixture(scope="session")
+def shards(tmp_path_factory, crossing, metre_moves, bent_roads):
+    """Two token shards of three scenes each, and the codebooks they are written with."""
+    folder = tmp_path_factory.mktemp("shards")
+    for number, name in enumerate(("training", "validation")):
+        scenes = [crossing(speed_mps=8.0 + 2 * number + i) for i in range(3)]
+        tokens = [
+            replace(
+                tokenize_scene(scene, metre_moves, bent_roads, TRAINING["tokenize"]),
+                scenario_id=f"{name}-{i}",
+            )
+            for i, scene in enumerate(scenes)
+        ]
+        group = folder / name / "tokens-000.zarr"
+        group.parent.mkdir()
+        write_records(group, tokens, SceneTokens, SCHEMA, compress=False)
+    books = folder / "vocab"
+    books.mkdir()
+    for name, book, kind, schema in (
+        ("motion", metre_moves, MotionCodebook, "infgen.motion/1"),
+        ("roads", bent_roads, RoadCodebook, "infgen.roads/1"),
+    ):
+        write_records(books / f"{name}.zarr", [book], kind, schema, compress=False)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def train_unit(shards):
+    """The unit of work of stage ``train`` on these shards."""
+    task = {
+        "scenes": [str(shards / "training")],
+        "held_out": [str(shards / "validation")],
+        "codebooks": str(shards / "vocab"),
+    }
+    return Unit("weights", {}, task)
+
+
+@pytest.fixture
+def course(shards, tmp_path):
+    """The same as what a training loop is given."""
+    return Course(
+        TRAINING["model"],
+        TRAINING["train"],
+        TRAINING["tokenize"],
+        TokenScenes([shards / "training"]),
+        TokenScenes([shards / "validation"]),
+        tmp_path,
+    )
+
+
+@pytest.fixture
+def books(metre_moves, bent_roads):
+    """The codebooks of the shards."""
+    return metre_moves, bent_roads
+
+
+@pytest.fixture(scope="session")
+def quiet():
+    """A progress that nobody listens to."""
+
+    def tell(done, total, note=""):
+        assert 0 <= done <= total
+
+    return tell

@@ -1,22 +1,130 @@
-"""Which scenes a training step reads follows from its number."""
+"""Batches are the same whoever makes them, and wherever training begins."""
 
-from pipeline.loader import draw_of_step, scenes_of_step
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from infgen.model.tensors import map_tensors
+from infgen.tokens.noise import make_noise
+from pipeline.distributed import Team
+from pipeline.loader import TokenScenes, draw_of_step, held_out_batches, train_batches
 
 
-def test_every_epoch_visits_every_scene_once_in_another_order():
-    visits = [scenes_of_step(step, batch=3, count=7, seed=5) for step in range(7)]
-
-    flat = [row for batch in visits for row in batch]
-    epochs = [flat[at : at + 7] for at in (0, 7, 14)]
-    assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
-    assert epochs[0] != epochs[1]
+def numbers(parts):
+    """All tensors of some batches, one after the other."""
+    found = []
+    map_tensors(parts, lambda tensor: found.append(tensor) or tensor)
+    return found
 
 
-def test_batches_larger_than_the_data_wrap_around():
-    assert sorted(scenes_of_step(0, batch=5, count=2, seed=0)[:4]) == [0, 0, 1, 1]
+def assert_same(one, other):
+    pairs = list(zip(numbers(one), numbers(other), strict=True))
+    assert pairs
+    assert all(torch.equal(a, b) for a, b in pairs)
+    assert [b.scenario_ids for b in one] == [b.scenario_ids for b in other]
 
 
 def test_every_step_and_seed_has_its_own_draw():
     draws = {draw_of_step(step, seed) for step in range(50) for seed in range(50)}
 
     assert len(draws) == 2500
+
+
+def test_the_batch_of_a_step_does_not_depend_on_where_training_began(course):
+    recipe = course.recipe(Team())
+    from_start = list(train_batches(recipe, range(5), 0))
+    from_three = list(train_batches(recipe, range(3, 5), 0))
+
+    for one, other in zip(from_start[3:], from_three, strict=True):
+        assert_same(one, other)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_batch_of_a_step_does_not_depend_on_who_makes_it(course, workers):
+    recipe = course.recipe(Team())
+
+    by_thread = list(train_batches(recipe, range(5), 0))
+    by_workers = list(train_batches(recipe, range(5), workers))
+
+    assert len(by_workers) == 5
+    for one, other in zip(by_thread, by_workers, strict=True):
+        assert_same(one, other)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_noise_is_the_same_whoever_makes_it_and_never_in_held_out_scenes(
+    course, books, workers
+):
+    recipe = course.recipe(Team())
+    noise = make_noise(replace(course.train, noise_moves=3), *books)
+    noisy = replace(recipe, noise=noise)
+
+    made = list(train_batches(noisy, range(3), workers))
+
+    for step, parts in enumerate(made):
+        assert_same(noisy[step], parts)
+        logged = recipe[step][0].agents
+        assert torch.equal(logged.presence, parts[0].agents.presence)
+        assert not torch.equal(logged.label, parts[0].agents.label)
+    (held_out,) = held_out_batches(course.held_out, course.limits, 9, 0, 9)
+    assert torch.equal(held_out.agents.label, held_out.agents.move)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_whoever_stops_early_leaves_nothing_behind(course, workers):
+    with closing(train_batches(course.recipe(Team()), range(1000), workers)) as batches:
+        next(batches)
+
+
+def test_an_error_while_a_batch_is_made_comes_through(course):
+    recipe = course.recipe(Team())
+    broken = replace(recipe, order=replace(recipe.order, size=np.zeros((9, 2), int)))
+
+    with pytest.raises(IndexError, match="of 3"):
+        list(train_batches(broken, range(4), 0))
+
+
+def test_parts_of_a_batch_are_together_the_batch(course):
+    how = replace(course.train, batch_scenes=3, accumulate=1)
+    wide = replace(course, train=how).recipe(Team())
+    parts = [
+        replace(course, train=how).recipe(Team(rank, 3))[7][0].scenario_ids
+        for rank in range(3)
+    ]
+
+    assert sum(parts, ()) == wide[7][0].scenario_ids
+    own = replace(course, train=replace(how, accumulate=3)).recipe(Team())
+    assert [part.scenario_ids for part in own[7]] == parts
+
+
+def test_held_out_batches_are_the_same_each_time_and_no_more_than_asked_for(course):
+    first, again = (
+        [b.scenario_ids for b in held_out_batches(course.held_out, course.limits, 2, 0, 3)]
+        for _ in range(2)
+    )
+
+    assert first == again
+    assert [len(ids) for ids in first] == [2, 1]
+
+
+def test_scenes_of_several_groups_are_one_sequence(shards):
+    scenes = TokenScenes([shards / "training", shards / "validation"])
+
+    assert len(scenes) == 6
+    assert scenes[3].scenario_id == "validation-0"
+    assert [scene.scenario_id for scene in scenes[4:]] == ["validation-1", "validation-2"]
+    with pytest.raises(IndexError):
+        scenes[6]
+
+
+def test_sizes_are_known_without_reading_scenes(shards, course):
+    scenes = TokenScenes([shards / "training", shards / "validation"])
+    limits = replace(course.limits, roads=30, tokens=10)
+
+    expected = [(s.num_agents * min(s.num_tokens, 10), 30) for s in scenes]
+
+    np.testing.assert_array_equal(scenes.sizes(limits), expected)
+    assert TokenScenes([]).sizes(limits).shape == (0, 2)

@@ -1,4 +1,5 @@
 import csv
+import html
 import json
 import re
 from dataclasses import asdict, replace
@@ -143,8 +144,9 @@ def finished(root: Path) -> Inputs:
     lines = [
         {"step": step, "learning_rate": 0.1, "motion": 7.0 / step} for step in (1, 2, 3)
     ]
+    held_out = {"stay_count": 40.0, "stay_predicted": 0.2, "stay_logged": 0.25}
     text = "".join(
-        json.dumps(line) + "\n" for line in [*lines, {"step": 3, "validation": {}}]
+        json.dumps(line) + "\n" for line in [*lines, {"step": 3, "validation": held_out}]
     )
     (root / "train" / "train.jsonl").write_text(text)
     manifest(root, "ingest", {"ingest": {"limit": 0}}, {"scenes": 2}, [logs], [SOURCE])
@@ -273,7 +275,7 @@ def test_the_page_draws_errors_counts_scores_training_and_a_rollout(written):
     assert "Agents by window" in titles
     assert "Scores by window (corrected)" in titles
     assert "Score of each feature (paper)" in titles
-    assert "Training: terms of the loss" in titles
+    assert {"Next move", "Leaving: predicted and logged"} <= set(titles)
     assert any(title.startswith("Rollout 0 of") for title in titles)
     assert any(title.startswith("Log of") for title in titles)
 
@@ -320,16 +322,22 @@ def test_the_same_inputs_give_the_same_bytes(inputs, written, tmp_path):
     assert again == written[1]
 
 
-def test_rollouts_without_entries_stand_beside_the_papers_third_table(tmp_path):
+@pytest.mark.parametrize(
+    ("mode", "insert", "table"),
+    [("long", None, 2), ("long", False, 3), ("motion-only", None, 3), ("wosac", None, 3)],
+)
+def test_rollouts_without_entries_stand_beside_the_papers_third_table(
+    tmp_path, mode, insert, table
+):
     root = tmp_path / "root"
     inputs = finished(root)
-    settings = asdict(replace(RolloutSettings(), insert=False, remove=False))
+    settings = asdict(RolloutSettings(mode=mode, insert=insert, remove=insert))
     manifest(root, "rollout", {"rollout": settings}, {}, inputs.units("rollout"))
 
     _, files = write(inputs, tmp_path / "out")
 
-    assert "table 3" in files["report.html"]
-    assert "0.7432" in files["report.html"]
+    assert f"paper's table {table}" in html.unescape(files["report.html"])
+    assert ("0.7432" in files["report.html"]) == (table == 3)
 
 
 def test_a_report_without_any_score_still_says_so(tmp_path, inputs, summary):

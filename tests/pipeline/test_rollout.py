@@ -171,6 +171,26 @@ def test_agents_far_away_are_played_where_everyone_is_asked_for(
     assert len(rollouts[0].id) == agents
 
 
+@pytest.mark.parametrize(
+    ("model", "plays"),
+    [({}, "motion, entries, exits"), ({"life_cycle": False}, "motion only")],
+)
+def test_the_report_says_what_the_weights_play(
+    inputs, tmp_path, metre_moves, bent_roads, model, plays
+):
+    sizes = dataclasses.replace(TINY, **model)
+    network = Network(sizes, metre_moves, bent_roads, TokenSettings())
+    save_network(inputs.folder("train"), network, state_of(network), step=7)
+    settings = dataclasses.replace(SETTINGS, scenes=1, seconds=1.0)
+    (unit,) = stage.STAGE.plan(inputs, settings)
+
+    report, rollouts = play(unit, tmp_path / "out", settings)
+
+    assert report["plays"] == plays
+    if model:
+        assert all(rollout.logged.all() for rollout in rollouts)
+
+
 def test_the_stage_sums_up_its_units(inputs, tmp_path):
     done = []
     for unit in stage.STAGE.plan(inputs, SETTINGS):
@@ -182,5 +202,6 @@ def test_the_stage_sums_up_its_units(inputs, tmp_path):
     report = stage.STAGE.finish(inputs, done, target, SETTINGS, no_progress)
 
     assert report["rollouts"] == 8
+    assert report["plays"] == "motion, entries, exits"
     assert len(report["refused"]) == 1
     assert len(pl.read_parquet(target / "index.parquet")) == 8

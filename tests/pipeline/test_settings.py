@@ -2,10 +2,18 @@ from pathlib import Path
 
 import pytest
 
-from infgen.config import ConfigError
+from infgen.config import (
+    ConfigError,
+    ModelSettings,
+    TokenSettings,
+    TrainSettings,
+    build,
+    decisive,
+)
+from infgen.model.network import Network
 from pipeline.plan import needed
 from pipeline.settings import DEFAULT_FILE, SOURCES, load_stages
-from pipeline.stages import MODULES
+from pipeline.stages import MODULES, load_stage
 
 OWN_FILE = Path(__file__).parents[2] / "stages.yaml"
 GOOD = """\
@@ -53,7 +61,41 @@ def test_the_packaged_file_loads_and_lists_every_stage_in_order():
 
     assert list(file.stages) == list(MODULES)
     assert needed(file.stages, ["report"]) == list(MODULES)
-    assert {"demo", "smoke", "small", "paper"} <= file.profiles.keys()
+    assert {"demo", "smoke", "small", "tiny", "paper"} <= file.profiles.keys()
+
+
+def test_every_packaged_profile_gives_settings_that_exist():
+    file = load_stages(DEFAULT_FILE, {})
+    kinds = {
+        section: kind
+        for name in file.stages
+        for section, kind in load_stage(MODULES[name]).settings.items()
+    }
+
+    for profile in file.profiles:
+        for section, given in file.choose(profile).values.items():
+            build(kinds[section], {k: v.value for k, v in given.items()}, profile)
+
+
+def test_the_packaged_profile_small_has_a_million_parameters(metre_moves, bent_roads):
+    chosen = load_stages(DEFAULT_FILE, {}).choose("small").values["model"]
+    sizes = build(ModelSettings, {k: v.value for k, v in chosen.items()}, "small")
+
+    network = Network(sizes, metre_moves, bent_roads, TokenSettings())
+
+    books = 2048 - metre_moves.num_moves + 1024 - bent_roads.num_roads
+    count = sum(p.numel() for p in network.parameters()) + books * (sizes.width + 1)
+    assert 0.9e6 < count < 1.1e6
+
+
+def test_the_papers_loss_weights_are_those_of_the_paper():
+    chosen = load_stages(DEFAULT_FILE, {}).choose("small,paper-loss").values
+
+    weights = {k: v.value for k, v in chosen["train"].items() if k.endswith("_weight")}
+    assert weights["motion_weight"] == weights["heading_weight"] == 1
+    assert weights["cell_weight"] == weights["stay_weight"] == weights["add_weight"] == 10
+    assert (weights["size_weight"], weights["kind_weight"]) == (0.2, 5)
+    assert chosen["model"]["width"].value == 48
 
 
 def test_stages_name_their_modules_deps_and_params(load):
@@ -75,6 +117,17 @@ def test_profile_and_words_are_laid_over_the_base_in_this_order(load):
         "train.steps": "7",
         "model.width": "32",
     }
+
+
+def test_profiles_are_stacked_from_left_to_right(load):
+    file = load(f"{GOOD}  long: {{train: {{steps: 50}}, model: {{width: 8}}}}\n")
+
+    assert values(file.choose("small,long"))["train.steps"] == 50
+    assert values(file.choose("long, small"))["train.steps"] == 3
+    assert values(file.choose("long,small"))["model.width"] == 8
+    assert file.choose("small,long").sources == ("one.tfrecord", "two.tfrecord")
+    assert file.names_sources("long,small")
+    assert not file.names_sources("long,plain")
 
 
 def test_a_profile_may_name_its_own_sources(load):
@@ -132,6 +185,8 @@ def test_what_is_wrong_is_named_with_its_line(load, old, new, message):
     ("profile", "words", "message"),
     [
         ("smal", [], "no profile 'smal'; did you mean 'small'"),
+        ("plain,smal", [], "no profile 'smal'; did you mean 'small'"),
+        ("small,", [], "no profile ''"),
         (None, ["train.steps"], "expected section.key=value"),
         (None, ["trian.steps=1"], "no section 'trian'; did you mean 'train'"),
     ],
@@ -139,6 +194,19 @@ def test_what_is_wrong_is_named_with_its_line(load, old, new, message):
 def test_wrong_words_are_named(load, profile, words, message):
     with pytest.raises(ConfigError, match=message):
         load().choose(profile, words)
+
+
+def test_settings_that_decide_nothing_are_left_out_of_keys():
+    how = TrainSettings()
+    other = TrainSettings(loader_workers=3, checkpoint_minutes=1.0, start="work/train")
+
+    assert decisive(other) == decisive(how)
+    assert decisive(TrainSettings(steps=1)) != decisive(how)
+
+
+@pytest.mark.parametrize("value", [True, "true"])
+def test_yes_is_a_word_where_auto_may_stand_too(value):
+    assert build(TrainSettings, {"compile": value}, "stages.yaml").compile == "true"
 
 
 def test_a_missing_file_is_named(tmp_path):

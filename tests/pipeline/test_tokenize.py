@@ -129,7 +129,7 @@ def test_tokens_are_mapped_not_read(tokenized):
     columns, about = map_group(tokenized[0].path / "tokens-000.zarr")
 
     assert not columns["pose"].flags.owndata
-    assert about == {"schema": "infgen.tokens/1", "count": 2}
+    assert about == {"schema": "infgen.tokens/2", "count": 2}
 
 
 def test_a_scene_that_cannot_be_tokenized_is_named_with_the_reason(tokenized):

@@ -1,6 +1,7 @@
 """Training learns, stops, goes on, and ends with the same bytes however it got there."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,99 +11,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from infgen.config import ModelSettings, TokenSettings, TrainSettings
-from infgen.tokens.codebook import MotionCodebook, RoadCodebook
-from infgen.tokens.scene_tokens import SceneTokens
-from infgen.tokens.tokenizer import tokenize_scene
-from pipeline.checkpoint import POINTER, load_checkpoint, save_checkpoint
+from infgen.config import ConfigError
+from pipeline.checkpoint import POINTER
 from pipeline.folders import StoreError
-from pipeline.loader import TokenScenes, held_out_batches, train_batches
-from pipeline.stage import Done, Unit
+from pipeline.manifest import list_files
+from pipeline.root import RUN_FOLDER
+from pipeline.stage import Done, Source
 from pipeline.stopping import Stopped
-from pipeline.store import write_records
-from pipeline.tokenize import SCHEMA
-from pipeline.train import OUTPUTS, STAGE, finish, load_network, plan, work
+from pipeline.train import OUTPUTS, STAGE, finish, load_network, plan, reads, work
 from pipeline.train_log import read_log
-from pipeline.training import Course, TrainingError, begin, train
-from pipeline.weights import read_about, state_of
-
-SETTINGS = {
-    "tokenize": TokenSettings(grid_radius_m=60.0, grid_step_m=4.0),
-    "model": ModelSettings(
-        width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4
-    ),
-    "train": TrainSettings(
-        steps=6,
-        batch_scenes=2,
-        warmup_steps=2,
-        checkpoint_every=2,
-        validate_every=4,
-        validation_scenes=2,
-        learning_rate=1e-3,
-    ),
-}
-
+from pipeline.weights import read_about
 
 TERMS = ("motion", "stay", "add", "cell", "kind", "size", "heading", "offset", "map")
-
-
-def quiet(done, total, note=""):
-    """Nobody listens."""
-
-
-@pytest.fixture(scope="module")
-def shards(tmp_path_factory, crossing, metre_moves, bent_roads):
-    """Two token shards of three scenes each, and the codebooks they are written with."""
-    folder = tmp_path_factory.mktemp("shards")
-    for number, name in enumerate(("training", "validation")):
-        scenes = [crossing(speed_mps=8.0 + 2 * number + i) for i in range(3)]
-        tokens = [
-            replace(
-                tokenize_scene(scene, metre_moves, bent_roads, SETTINGS["tokenize"]),
-                scenario_id=f"{name}-{i}",
-            )
-            for i, scene in enumerate(scenes)
-        ]
-        group = folder / name / "tokens-000.zarr"
-        group.parent.mkdir()
-        write_records(group, tokens, SceneTokens, SCHEMA, compress=False)
-    books = folder / "vocab"
-    books.mkdir()
-    for name, book, kind, schema in (
-        ("motion", metre_moves, MotionCodebook, "infgen.motion/1"),
-        ("roads", bent_roads, RoadCodebook, "infgen.roads/1"),
-    ):
-        write_records(books / f"{name}.zarr", [book], kind, schema, compress=False)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def unit(shards):
-    task = {
-        "scenes": [str(shards / "training")],
-        "held_out": [str(shards / "validation")],
-        "codebooks": str(shards / "vocab"),
-    }
-    return Unit("weights", {}, task)
-
-
-@pytest.fixture
-def course(shards, tmp_path):
-    return Course(
-        SETTINGS["model"],
-        SETTINGS["train"],
-        SETTINGS["tokenize"],
-        TokenScenes([shards / "training"]),
-        TokenScenes([shards / "validation"]),
-        tmp_path,
-    )
-
-
-@pytest.fixture
-def books(metre_moves, bent_roads):
-    return metre_moves, bent_roads
 
 
 def contents(folder):
@@ -110,21 +31,33 @@ def contents(folder):
 
 
 @pytest.fixture(scope="module")
-def whole(unit, tmp_path_factory):
+def make(train_unit, train_settings, quiet):
+    """``make(folder, progress, **changes)`` does the whole unit and returns its report."""
+
+    def work_in(folder, progress=quiet, **changes):
+        how = replace(train_settings["train"], **changes)
+        return work(train_unit, folder, {**train_settings, "train": how}, progress)
+
+    return work_in
+
+
+@pytest.fixture(scope="module")
+def whole(make, tmp_path_factory):
     """What an uninterrupted run leaves."""
     folder = tmp_path_factory.mktemp("whole")
-    return folder, work(unit, folder, SETTINGS, quiet)
+    return folder, make(folder)
 
 
 def test_a_run_leaves_weights_their_page_and_their_log(whole):
     folder, report = whole
 
-    assert sorted(p.name for p in folder.iterdir()) == sorted(OUTPUTS)
+    assert sorted(p.name for p in folder.iterdir()) == sorted([*OUTPUTS, RUN_FOLDER])
     assert report["steps"] == 6
     assert report["scenes"] == report["held_out"] == 3
     assert report["weights"] == read_about(folder)["weights"]
     assert report["validation"]["total"] > 0
-    assert set(report["run"]) == {"seconds", "threads"}
+    assert report["run"]["processes"] == 1
+    assert report["run"]["scenes_per_s"] > 0
 
 
 def test_the_log_has_every_term_of_every_step(whole):
@@ -134,39 +67,53 @@ def test_the_log_has_every_term_of_every_step(whole):
     steps = [line for line in lines if "motion" in line]
     for name in TERMS:
         assert all(f"{name}_count" in line for line in steps)
+    assert all(line["motion_perplexity"] > 1 for line in steps)
     assert [line["step"] for line in lines if "validation" in line] == [4, 6]
     assert steps[0]["learning_rate"] == pytest.approx(5e-4)
 
 
-def test_the_same_run_gives_the_same_bytes(whole, unit, tmp_path):
-    work(unit, tmp_path / "again", SETTINGS, quiet)
+def test_speed_is_noted_apart_from_what_is_reproducible(whole):
+    notes = read_log(whole[0] / RUN_FOLDER / "pace.jsonl")
+
+    assert [note["step"] for note in notes] == [1, 2, 3, 4, 5, 6]
+    assert all(note["scenes_per_s"] > 0 for note in notes)
+    assert notes[-1]["peak_memory_mib"] > 10
+    assert RUN_FOLDER not in {Path(name).parts[0] for name in list_files(whole[0])}
+
+
+def test_the_same_run_gives_the_same_bytes(whole, make, tmp_path):
+    make(tmp_path / "again")
 
     assert contents(tmp_path / "again") == contents(whole[0])
 
 
-def test_another_seed_gives_other_weights(whole, unit, tmp_path):
-    other = {**SETTINGS, "train": replace(SETTINGS["train"], seed=1)}
+def test_how_often_checkpoints_are_written_and_by_whom_batches_are_made_is_free(
+    whole, make, tmp_path
+):
+    make(tmp_path, checkpoint_every=0, checkpoint_minutes=0.0, loader_workers=1)
 
-    report = work(unit, tmp_path, other, quiet)
+    assert contents(tmp_path) == contents(whole[0])
 
-    assert report["weights"] != whole[1]["weights"]
+
+def test_another_seed_gives_other_weights(whole, make, tmp_path):
+    assert make(tmp_path, seed=1)["weights"] != whole[1]["weights"]
 
 
 @pytest.mark.parametrize("stop_at", [1, 3, 6])
 def test_a_run_that_is_stopped_saves_and_goes_on_to_the_same_bytes(
-    whole, unit, tmp_path, monkeypatch, stop_at
+    whole, make, tmp_path, monkeypatch, stop_at
 ):
-    monkeypatch.setattr("pipeline.training.TELL_EVERY_S", 0.0)
+    monkeypatch.setattr("pipeline.pace.TELL_EVERY_S", 0.0)
 
     def stop(done, total, note=""):
         if done == stop_at:
             raise Stopped(signal.SIGTERM)
 
     with pytest.raises(Stopped):
-        work(unit, tmp_path, SETTINGS, stop)
+        make(tmp_path, stop)
     assert json.loads((tmp_path / POINTER).read_text())["step"] == stop_at
 
-    work(unit, tmp_path, SETTINGS, quiet)
+    make(tmp_path)
 
     assert contents(tmp_path) == contents(whole[0])
 
@@ -183,123 +130,61 @@ work(Unit("weights", {}, json.loads(sys.argv[1])), Path(sys.argv[2]), settings, 
 """
 
 
-def start(unit, folder):
-    settings = {name: asdict(value) for name, value in SETTINGS.items()}
-    words = [json.dumps(dict(unit.task)), str(folder), json.dumps(settings)]
-    return subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, *words],
-        stdout=subprocess.DEVNULL,
-        cwd=Path(__file__).parents[2],
-    )
+@pytest.fixture
+def start(train_unit, train_settings):
+    """``start(folder)`` begins the same run, in steps of its own time, as a process."""
+
+    def start_in(folder):
+        plain = {name: asdict(value) for name, value in train_settings.items()}
+        plain["train"]["checkpoint_every"] = 1
+        words = [json.dumps(dict(train_unit.task)), str(folder), json.dumps(plain)]
+        return subprocess.Popen(
+            [sys.executable, "-c", SCRIPT, *words],
+            stdout=subprocess.DEVNULL,
+            cwd=Path(__file__).parents[2],
+        )
+
+    return start_in
 
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_again_and_again_ends_with_the_same_bytes(
-    whole, unit, tmp_path
+    whole, start, tmp_path
 ):
     random = np.random.default_rng(0)
-    for _ in range(3):
-        run = start(unit, tmp_path)
-        deadline = time.monotonic() + 60
-        while run.poll() is None and not list(tmp_path.glob("checkpoint-*")):
+    seen = []
+    for kill in range(3):
+        run = start(tmp_path)
+        deadline = time.monotonic() + 120
+        while run.poll() is None and checkpoint_step(tmp_path) <= kill:
             assert time.monotonic() < deadline
-            time.sleep(0.01)
-        time.sleep(float(random.uniform(0, 0.5)))
+            time.sleep(0.002)
+        time.sleep(float(random.uniform(0, 0.2)))
+        seen.append(checkpoint_step(tmp_path))
         run.kill()
         run.wait()
 
-    assert start(unit, tmp_path).wait() == 0
+    assert start(tmp_path).wait() == 0
 
+    assert seen == sorted(seen)
+    assert seen[0] > 0
+    # Both the weights and every line of the loss curve.
     assert contents(tmp_path) == contents(whole[0])
 
 
-def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(course, books):
-    training = begin(course, *books)
-    save_checkpoint(course.folder, training, 2)
-    half = course.folder / "checkpoint-000000004"
-    half.mkdir()
-    (half / "network.safetensors").write_bytes(b"half")
-    before = {name: value.clone() for name, value in state_of(training.network).items()}
-    for parameter in training.network.parameters():
-        parameter.data += 1
-
-    assert load_checkpoint(course.folder, training) == 2
-
-    after = state_of(training.network)
-    assert all(torch.equal(after[name], value) for name, value in before.items())
-    save_checkpoint(course.folder, training, 4)
-    assert [p.name for p in course.folder.glob("checkpoint-*")] == [half.name]
+def checkpoint_step(folder):
+    pointer = folder / POINTER
+    return json.loads(pointer.read_text())["step"] if pointer.exists() else 0
 
 
-def test_a_checkpoint_holds_the_optimiser_and_the_average(course, books):
-    training = begin(course, *books)
-    train(replace(course, train=replace(course.train, steps=2)), training, quiet)
-    other = begin(course, *books)
-
-    assert load_checkpoint(course.folder, other) == 2
-
-    for name, value in training.average.items():
-        assert torch.equal(other.average[name], value)
-    pairs = zip(training.network.parameters(), other.network.parameters(), strict=True)
-    for one, two in pairs:
-        state, restored = training.optimiser.state[one], other.optimiser.state[two]
-        assert state.keys() == restored.keys()
-        assert all(torch.equal(state[what], restored[what]) for what in state)
-
-
-def test_a_loss_that_is_not_finite_names_its_scenes_and_keeps_the_weights(
-    course, books, monkeypatch
-):
-    training = begin(course, *books)
-    batches = train_batches
-
-    def broken(*arguments):
-        for number, batch in enumerate(batches(*arguments)):
-            size = batch.agents.size_lwh_m * (torch.nan if number == 3 else 1)
-            yield replace(batch, agents=replace(batch.agents, size_lwh_m=size))
-
-    monkeypatch.setattr("pipeline.training.train_batches", broken)
-
-    with pytest.raises(TrainingError, match=r"step 3: .* training-\d, training-\d"):
-        train(course, training, quiet)
-
-    other = begin(course, *books)
-    assert load_checkpoint(course.folder, other) == 3
-    assert all(torch.isfinite(p).all() for p in other.network.parameters())
-
-
-def test_no_scenes_to_train_on_is_said(course, books):
-    empty = replace(course, scenes=TokenScenes([]))
-
-    with pytest.raises(TrainingError, match="no scenes of split 'training'"):
-        train(empty, begin(course, *books), quiet)
-
-
-def test_without_held_out_scenes_there_is_no_validation(course, books):
-    found = train(replace(course, held_out=[]), begin(course, *books), quiet)
-
-    assert found == {}
-
-
-def test_the_loss_goes_down(course, books):
-    how = replace(course.train, steps=30, learning_rate=1e-2, label_smoothing=0.0)
-    longer = replace(course, train=replace(how, checkpoint_every=1000, validate_every=0))
-
-    train(longer, begin(longer, *books), quiet)
-
-    motion = [line["motion"] for line in read_log(course.folder / "train.jsonl")[:-1]]
-    assert len(motion) == 30
-    assert np.mean(motion[-5:]) < 0.7 * np.mean(motion[:5])
-
-
-def test_weights_are_all_that_loading_needs(whole, metre_moves, bent_roads):
+def test_weights_are_all_that_loading_needs(whole, train_settings, metre_moves, bent_roads):
     network = load_network(whole[0])
 
     assert not network.training
     np.testing.assert_array_equal(network.motion_codebook().path, metre_moves.path)
     np.testing.assert_array_equal(network.road_codebook().curve_m, bent_roads.curve_m)
-    assert network.settings == SETTINGS["model"]
-    assert network.grid_settings == SETTINGS["tokenize"]
+    assert network.settings == train_settings["model"]
+    assert network.grid_settings == train_settings["tokenize"]
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "model.json"])
@@ -326,12 +211,12 @@ def test_weights_of_other_sizes_are_refused(whole, tmp_path):
         load_network(tmp_path)
 
 
-def test_finish_gathers_what_the_unit_made(whole, tmp_path):
+def test_finish_gathers_what_the_unit_made(whole, train_settings, quiet, tmp_path):
     folder, report = whole
     target = tmp_path / "stage"
 
     found = finish(
-        MadeInputs(), [Done("weights", "k", folder, report)], target, SETTINGS, quiet
+        MadeInputs(), [Done("weights", "k", folder, report)], target, train_settings, quiet
     )
 
     assert contents(target) == contents(folder)
@@ -358,8 +243,8 @@ class MadeInputs:
         return "-".join((stage, *names))
 
 
-def test_the_plan_is_one_unit_of_the_two_splits():
-    (unit,) = plan(MadeInputs(), SETTINGS)
+def test_the_plan_is_one_unit_of_the_two_splits(train_settings):
+    (unit,) = plan(MadeInputs(), train_settings)
 
     tokens = "/tokens/"
     training = [f"{tokens}training.tfrecord-0", f"{tokens}training.tfrecord-1"]
@@ -371,31 +256,51 @@ def test_the_plan_is_one_unit_of_the_two_splits():
     assert STAGE.in_driver
 
 
-def test_the_batch_of_a_step_does_not_depend_on_where_training_began(course):
-    from_start = list(train_batches(course.scenes, course.limits, 2, 0, range(5)))
-    from_three = list(train_batches(course.scenes, course.limits, 2, 0, range(3, 5)))
+class BegunInputs(MadeInputs):
+    """The same, with weights to begin with."""
 
-    for one, two in zip(from_start[3:], from_three, strict=True):
-        assert one.scenario_ids == two.scenario_ids
-        assert torch.equal(one.agents.pose, two.agents.pose)
-        assert torch.equal(one.roads.picked, two.roads.picked)
+    sources = (Source("/weights", "start", "f" * 64),)
 
 
-def test_held_out_batches_are_the_same_each_time_and_no_more_than_asked_for(course):
-    first, again = (
-        [b.scenario_ids for b in held_out_batches(course.held_out, course.limits, 2, 0, 3)]
-        for _ in range(2)
+def test_weights_to_begin_with_are_part_of_the_unit(train_settings):
+    (unit,) = plan(BegunInputs(), train_settings)
+
+    assert unit.inputs["start"] == "f" * 64
+    assert unit.task["start"] == "/weights"
+
+
+@pytest.fixture
+def asking(train_settings):
+    def ask(start):
+        return {**train_settings, "train": replace(train_settings["train"], start=start)}
+
+    return ask
+
+
+def test_weights_to_begin_with_are_named_by_folder_or_key(whole, asking, tmp_path):
+    key = "0123456789abcdef"
+    made = tmp_path / "store" / "train" / key
+    shutil.copytree(whole[0], made)
+    latest = tmp_path / "latest"
+    latest.symlink_to(made)
+
+    for word in (str(made), str(latest), key, key + 48 * "0", key[:5]):
+        assert reads(tmp_path, asking(word)) == [
+            Source(str(made), "start", whole[1]["weights"])
+        ]
+    assert reads(tmp_path, asking("")) == []
+    with pytest.raises(ConfigError, match=r"train.start is 'beef', but there is no such"):
+        reads(tmp_path, asking("beef"))
+
+
+def test_training_goes_on_from_the_weights_it_begins_with(
+    whole, train_unit, train_settings, quiet, tmp_path
+):
+    task = {**train_unit.task, "start": str(whole[0])}
+    how = replace(train_settings["train"], steps=0, seed=9)
+
+    report = work(
+        replace(train_unit, task=task), tmp_path, {**train_settings, "train": how}, quiet
     )
 
-    assert first == again
-    assert [len(ids) for ids in first] == [2, 1]
-
-
-def test_scenes_of_several_groups_are_one_sequence(shards):
-    scenes = TokenScenes([shards / "training", shards / "validation"])
-
-    assert len(scenes) == 6
-    assert scenes[3].scenario_id == "validation-0"
-    assert [scene.scenario_id for scene in scenes[4:]] == ["validation-1", "validation-2"]
-    with pytest.raises(IndexError):
-        scenes[6]
+    assert report["weights"] == whole[1]["weights"]

@@ -1,10 +1,58 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 
-from infgen.config import TokenSettings
+from infgen.config import ModelSettings, RolloutSettings, TokenSettings
+from infgen.model.network import Network
+from infgen.model.steps import Stepper
+from infgen.rollout.player import Player
 from infgen.rollout.trace import Start
 from infgen.tokens.grid import make_grid
 from infgen.tokens.tokenizer import tokenize_scene
+
+SMALL = ModelSettings(
+    width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4
+)
+
+
+@pytest.fixture
+def player(metre_moves, bent_roads):
+    """``player(model={}, **settings)``: an untrained network, ready to be played."""
+
+    def build(model=None, **settings):
+        torch.manual_seed(0)
+        sizes = replace(SMALL, **(model or {}))
+        network = Network(sizes, metre_moves, bent_roads, TokenSettings())
+        return Player(
+            stepper=Stepper(network),
+            codebook=metre_moves,
+            roads=bent_roads,
+            tokens=TokenSettings(),
+            settings=RolloutSettings(**{"seconds": 4.0, "max_agents": 24, **settings}),
+            device=torch.device("cpu"),
+        )
+
+    return build
+
+
+@pytest.fixture
+def force():
+    """``force(player, add=None, leave=None)``: fix log-odds of entering and leaving."""
+
+    def fix(player, *, add=None, leave=None):
+        network = player.stepper.network
+        if add is not None:
+            say(network.cells.add, add)
+        if leave is not None:
+            say(network.motion.leave, leave)
+
+    def say(head, logit):
+        torch.nn.init.zeros_(head[-1].weight)
+        torch.nn.init.constant_(head[-1].bias, logit)
+
+    return fix
 
 
 @pytest.fixture

@@ -1,28 +1,31 @@
 import numpy as np
 import pytest
 
+from infgen.config import TokenSettings
 from infgen.rollout.population import (
     EGO_ROW,
     NOBODY,
     Newcomers,
     enter,
     entry_pose,
+    leave_beyond,
     move_on,
     settle,
 )
 from infgen.scene import AgentKind
+from infgen.tokens.grid import make_grid
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
 
 PRESENT, LEAVING = Presence.PRESENT, Presence.LEAVING
 
 
 def newcomers(who, cell, heading=60, offset_m=(0.0, 0.0)):
-    count = len(who)
+    count, grid = len(who), make_grid(TokenSettings())
+    place_m = grid.centre_m[cell] + np.array(offset_m, dtype=np.float32)
     return Newcomers(
         who=np.array(who),
-        cell=np.full(count, cell, dtype=np.int16),
-        offset_m=np.tile(np.array(offset_m, dtype=np.float32), (count, 1)),
-        heading=np.full(count, heading, dtype=np.int16),
+        place_m=np.tile(place_m, (count, 1)),
+        turned_rad=np.full(count, grid.heading_centre_rad[heading]),
         kind=np.full(count, AgentKind.CYCLIST, dtype=np.int8),
         size_lwh_m=np.tile(np.array([2.0, 1.0, 1.7], dtype=np.float32), (count, 1)),
     )
@@ -97,10 +100,27 @@ def test_the_ego_never_leaves(parked, start, metre_moves):
     assert after.presence[0, EGO_ROW] == PRESENT
 
 
+def test_whoever_crosses_the_circle_outwards_leaves_and_who_was_outside_stays(
+    parked, start, metre_moves
+):
+    # Cars 8, 16 and 24 m ahead of the ego, which stands; each drives 5 m on.
+    before = settle([start(parked(3))], min_rows=5)[-1]
+    moved, _ = move_on(
+        before, np.array([[0, 5, 5, 5, 0]]), np.zeros((1, 5), bool), metre_moves
+    )
+
+    after = leave_beyond(before, moved, 18.0)
+
+    np.testing.assert_array_equal(
+        after.presence[0], [PRESENT, PRESENT, LEAVING, PRESENT, 0]
+    )
+    np.testing.assert_array_equal(moved.presence[0, 1:4], PRESENT)
+
+
 def test_a_newcomer_takes_the_first_free_row_with_a_life_of_its_own(parked, start, grid):
     population = settle([start(parked(1)), start(parked(2))], min_rows=4)[-1]
 
-    after, row = enter(population, newcomers([True, False], grid.ego_cell - 5), grid)
+    after, row = enter(population, newcomers([True, False], grid.ego_cell - 5))
 
     np.testing.assert_array_equal(row, [2, -1])
     np.testing.assert_array_equal(after.life[0], [0, 1, 2, NOBODY])
@@ -119,7 +139,7 @@ def test_a_freed_row_is_used_again_by_another_life(
     leaving, _ = move_on(population, move, np.array([[False, True]]), metre_moves)
     gone, _ = move_on(leaving, move, stay, metre_moves)
 
-    after, row = enter(gone, newcomers([True], grid.ego_cell - 5), grid)
+    after, row = enter(gone, newcomers([True], grid.ego_cell - 5))
 
     assert row[0] == 1
     assert after.life[0, 1] == 2
@@ -128,7 +148,7 @@ def test_a_freed_row_is_used_again_by_another_life(
 def test_a_full_rollout_turns_newcomers_away(parked, start, grid):
     population = settle([start(parked(1))], min_rows=2)[-1]
 
-    after, row = enter(population, newcomers([True], grid.ego_cell - 5), grid)
+    after, row = enter(population, newcomers([True], grid.ego_cell - 5))
 
     assert row[0] == -1
     np.testing.assert_array_equal(after.life, population.life)
@@ -144,7 +164,7 @@ def test_a_cell_to_the_egos_right_is_to_its_right_whichever_way_it_faces(
     # Three cells to the right of the ego, and one metre ahead within the cell.
     ego = np.array([[0.0, 0.0, heading_rad]], dtype=np.float32)
 
-    pose = entry_pose(ego, newcomers([True], grid.ego_cell + 3, offset_m=(0.0, 1.0)), grid)
+    pose = entry_pose(ego, newcomers([True], grid.ego_cell + 3, offset_m=(0.0, 1.0)))
 
     np.testing.assert_allclose(pose[0, :2], expected, atol=1e-4)
 

@@ -1,3 +1,4 @@
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -58,3 +59,53 @@ def test_events_happen_with_their_probability(logit, uniform):
     )
 
     assert result.item() == expected.item()
+
+
+def shares_of(shares, **sampling):
+    """How often each choice of known shares is made, for 1000 evenly spread numbers."""
+    logits = torch.log(torch.tensor(shares, dtype=torch.float64)).repeat(1000, 1)
+    uniform = (torch.arange(1000, dtype=torch.float64) + 0.5) / 1000
+    picks = choose(logits, uniform, **sampling)
+    return torch.bincount(picks, minlength=len(shares)) / 1000
+
+
+@pytest.mark.parametrize(
+    ("sampling", "expected"),
+    [
+        ({}, [0.1, 0.2, 0.3, 0.4]),
+        ({"top": 2}, [0, 0, 3 / 7, 4 / 7]),
+        ({"nucleus": 0.39}, [0, 0, 0, 1]),  # The likeliest alone has the share asked for.
+        ({"nucleus": 0.41}, [0, 0, 3 / 7, 4 / 7]),
+        ({"nucleus": 0.8}, [0, 2 / 9, 3 / 9, 4 / 9]),
+        ({"nucleus": 1.0}, [0.1, 0.2, 0.3, 0.4]),
+        # Of the two likeliest the first has 4/7, more than half.
+        ({"top": 2, "nucleus": 0.5}, [0, 0, 0, 1]),
+        # Shares squared: 1, 4, 9, 16 of 30.
+        ({"temperature": 0.5}, [1 / 30, 4 / 30, 9 / 30, 16 / 30]),
+        ({"temperature": 0.5, "nucleus": 0.6}, [0, 0, 9 / 25, 16 / 25]),
+        ({"temperature": 1e6}, [0.25, 0.25, 0.25, 0.25]),
+    ],
+)
+def test_shares_are_those_computed_by_hand(sampling, expected):
+    found = shares_of([0.1, 0.2, 0.3, 0.4], **sampling)
+
+    torch.testing.assert_close(found, torch.tensor(expected).float(), atol=2e-3, rtol=0)
+
+
+def test_the_largest_number_never_picks_what_cannot_be():
+    logits = torch.tensor([[0.0, float("-inf"), -1.0, float("-inf")]])
+
+    for nucleus in (1.0, 0.99):
+        pick = choose(
+            logits, torch.tensor([1 - 2**-53], dtype=torch.float64), nucleus=nucleus
+        )
+        assert pick.item() == 2
+
+
+@pytest.mark.parametrize(("bias", "expected"), [(0.0, 0.5), (1.0, 0.731), (-2.0, 0.119)])
+def test_a_bias_moves_the_log_odds(bias, expected):
+    uniform = (torch.arange(10_000, dtype=torch.float64) + 0.5) / 10_000
+
+    share = happens(torch.zeros(10_000), uniform, bias).float().mean()
+
+    assert float(share) == pytest.approx(expected, abs=1e-3)

@@ -7,8 +7,9 @@ import torch
 from infgen.config import ModelSettings, RolloutSettings, TokenSettings
 from infgen.model.network import Network
 from infgen.model.steps import Stepper
+from infgen.rollout.player import Player
 from infgen.rollout.rollout import NEVER
-from infgen.rollout.simulate import Player, simulate
+from infgen.rollout.simulate import simulate
 from infgen.rollout.trace import collect
 
 SMALL = ModelSettings(

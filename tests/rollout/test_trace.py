@@ -19,11 +19,12 @@ def play(begin, codebook, grid, seconds, speed=5, leave_at=None, add_at=None):
         moved, path = move_on(population, np.full(shape, speed), leave, codebook)
         population = moved
         if token == add_at:
-            population, _ = enter(moved, car_ahead(grid), grid)
+            population, _ = enter(moved, car_ahead(grid))
         yield Frame(
             token=token,
             life=moved.life,
             path=path,
+            shown=np.ones(path.shape[:3], bool),
             leaving=moved.presence == Presence.LEAVING,
             born=np.where(population.life != moved.life, population.life, np.int32(NOBODY)),
             kind=population.kind,
@@ -32,12 +33,11 @@ def play(begin, codebook, grid, seconds, speed=5, leave_at=None, add_at=None):
 
 
 def car_ahead(grid):
-    ahead = np.flatnonzero((grid.centre_m == [0, 30]).all(axis=1))
+    ahead = (grid.centre_m == [0, 30]).all(axis=1)
     return Newcomers(
         who=np.array([True]),
-        cell=ahead.astype(np.int16),
-        offset_m=np.zeros((1, 2), dtype=np.float32),
-        heading=np.array([60], dtype=np.int16),
+        place_m=grid.centre_m[ahead],
+        turned_rad=grid.heading_centre_rad[60:61],
         kind=np.array([AgentKind.VEHICLE], dtype=np.int8),
         size_lwh_m=np.array([[4.0, 2.0, 1.5]], dtype=np.float32),
     )
@@ -108,7 +108,15 @@ def test_a_batch_gives_each_start_its_own_rollout(parked, start, metre_moves, gr
             token=frame.token,
             **{
                 name: np.concatenate([getattr(frame, name)] * 2)
-                for name in ("life", "path", "leaving", "born", "kind", "size_lwh_m")
+                for name in (
+                    "life",
+                    "path",
+                    "shown",
+                    "leaving",
+                    "born",
+                    "kind",
+                    "size_lwh_m",
+                )
             },
         )
         for frame in play(one, metre_moves, grid, 1.0)

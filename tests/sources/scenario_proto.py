@@ -48,19 +48,19 @@ _MESSAGES = {
     "map_features=8:*MapFeature current_time_index=10:int32 "
     "tracks_to_predict=11:*RequiredPrediction",
 }
-"""Fields as ``name=number:type``; ``*`` for repeated ones."""
+"""Fields as ``name=number:type``; ``*`` for repeated ones, ``**`` for packed ones."""
 
 
-def scenario_class() -> Any:
-    """Build the message class of ``Scenario``."""
-    file = descriptor_pb2.FileDescriptorProto(name="scenario.proto", package="oracle")
-    for name, fields in _MESSAGES.items():
+def message_class(messages: dict[str, str], wanted: str) -> Any:
+    """Build the class of one of several messages."""
+    file = descriptor_pb2.FileDescriptorProto(name=f"{wanted}.proto", package="oracle")
+    for name, fields in messages.items():
         message = file.message_type.add(name=name)
         for field in fields.split():
             _add_field(message, field)
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName("oracle.Scenario"))
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"oracle.{wanted}"))
 
 
 def _add_field(message: Any, text: str) -> None:
@@ -69,10 +69,12 @@ def _add_field(message: Any, text: str) -> None:
     field = message.field.add(name=name, number=int(number))
     repeated = kind.startswith("*")
     field.label = _FIELD.LABEL_REPEATED if repeated else _FIELD.LABEL_OPTIONAL
-    kind = kind.removeprefix("*")
+    if kind.startswith("**"):
+        field.options.packed = True
+    kind = kind.lstrip("*")
     field.type = _SCALARS.get(kind, _FIELD.TYPE_MESSAGE)
     if kind not in _SCALARS:
         field.type_name = f".oracle.{kind}"
 
 
-Scenario = scenario_class()
+Scenario = message_class(_MESSAGES, "Scenario")

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from infgen.scene import RoadMap, Signals, Tracks
 from infgen.sources.tfrecord import iter_records
 from infgen.sources.towns.scenes import draw_scene
+from infgen.sources.wire_write import varint
 from infgen.sources.womd import decode_scene
-from infgen.sources.womd_write import _varint, encode_scenario, write_tfrecord
+from infgen.sources.womd_write import encode_scenario, write_tfrecord
 from tests.sources.oracle import expected_scene
 from tests.sources.records import NOW, SHARED, changed, small_scenario
 from tests.sources.scenario_proto import Scenario
@@ -158,7 +159,7 @@ def test_a_scene_without_a_map_or_roles_is_written(small):
 
 @given(st.integers(0, 2**63 - 1))
 def test_varints_hold_seven_bits_a_byte_lowest_first(value):
-    written = _varint(value)
+    written = varint(value)
 
     assert sum((byte & 0x7F) << 7 * at for at, byte in enumerate(written)) == value
     assert [byte >> 7 for byte in written] == [1] * (len(written) - 1) + [0]

@@ -6,7 +6,13 @@ from hypothesis import strategies as st
 from infgen.geometry import box_corners, to_local
 from infgen.scene import AgentKind
 from infgen.tokens.codebook import BOX_LW_M, MotionCodebook
-from infgen.tokens.moves import advance, follow, make_move_table, nearest_moves
+from infgen.tokens.moves import (
+    advance,
+    follow,
+    make_move_table,
+    nearest_few,
+    nearest_moves,
+)
 
 
 def random_codebook(rng, moves=200, spread=(8.0, 1.0, 0.6)):
@@ -49,6 +55,40 @@ def test_the_nearest_move_is_the_one_that_measuring_all_corners_finds(seed, stra
 
     gap_m = measure_them_all(target, pose, kind, codebook)
     np.testing.assert_array_equal(found, gap_m.argmin(axis=1))
+
+
+@given(
+    st.integers(0, 2**32),
+    st.sampled_from([1, 2, 5, 40, 200]),
+    st.sampled_from([0.01, 3.0, 300.0]),
+)
+@settings(deadline=None)
+def test_the_nearest_few_are_those_that_measuring_all_corners_finds(seed, count, stray):
+    rng = np.random.default_rng(seed)
+    codebook = random_codebook(rng)
+    rows = 20
+    kind = rng.integers(0, 3, rows).astype(np.int8)
+    pose = (rng.normal(size=(rows, 3)) * [30, 30, 1]).astype(np.float32)
+    ahead = advance(pose, kind, rng.integers(0, 200, rows).astype(np.int16), codebook)
+    target = ahead + (rng.normal(size=(rows, 3)) * stray).astype(np.float32)
+
+    few = nearest_few(target, pose, kind, make_move_table(codebook), count)
+
+    gap_m = measure_them_all(target, pose, kind, codebook)
+    in_order = np.argsort(gap_m, axis=1, kind="stable")[:, :count]
+    np.testing.assert_array_equal(few, in_order)
+
+
+def test_the_nearest_of_few_is_the_nearest():
+    rng = np.random.default_rng(3)
+    table = make_move_table(random_codebook(rng))
+    target = rng.normal(size=(50, 3)).astype(np.float32)
+    pose, kind = np.zeros_like(target), rng.integers(0, 3, 50).astype(np.int8)
+
+    few = nearest_few(target, pose, kind, table, 7)
+
+    np.testing.assert_array_equal(few[:, 0], nearest_moves(target, pose, kind, table))
+    assert all(len(set(row)) == 7 for row in few.tolist())
 
 
 def test_of_twins_the_first_is_chosen():

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infgen.views.figures import Interval, Series, interval_chart, line_chart, ticks
+from infgen.views.axes import ticks
+from infgen.views.figures import Interval, Series, interval_chart, line_chart
 
 SVG = "{http://www.w3.org/2000/svg}"
 

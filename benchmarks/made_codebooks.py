@@ -1,0 +1,32 @@
+"""Full-size codebooks made by rule.
+
+What a step costs does not depend on which moves there are, so benchmarks need no data.
+"""
+
+import numpy as np
+
+from infgen.config import VocabSettings
+from infgen.tokens.arcs import line_arcs
+from infgen.tokens.codebook import BOX_LW_M, MotionCodebook, RoadCodebook
+from infgen.tokens.fan import fan
+from infgen.tokens.limits import limits_of
+
+FAN_SPACING_M, ARC_SPACING_M = (0.1, 0.025, 0.05), 0.05
+"""By kind: fine enough to fill a codebook."""
+
+
+def made_codebooks() -> tuple[MotionCodebook, RoadCodebook]:
+    """Make codebooks of the default sizes."""
+    settings = VocabSettings()
+    moves, roads = settings.num_moves, settings.num_roads
+    still = np.zeros((1, 6, 3), dtype=np.float32)
+    limits = limits_of(settings)
+    path = np.stack(
+        [
+            np.concatenate([still, fan(kind, limits, spacing_m)])[:moves]
+            for kind, spacing_m in enumerate(FAN_SPACING_M)
+        ]
+    )
+    motion = MotionCodebook(BOX_LW_M, path, np.zeros(path.shape[:2], dtype=bool))
+    curve_m = line_arcs(ARC_SPACING_M)[:roads]
+    return motion, RoadCodebook(curve_m, np.zeros(len(curve_m), dtype=bool))

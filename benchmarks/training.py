@@ -1,0 +1,237 @@
+"""What one scene costs in a training step: forward, backward and update.
+
+On the scene that all such figures of ours are about (637f20cafde22ff8), or on the largest
+built-in one where it is absent::
+
+    python benchmarks/training.py [--size paper] [--threads 2] [--device cpu]
+
+Every row is a process of its own, so its memory is too. The last line is one JSON object:
+``cpu_s_per_scene`` and ``peak_rss_mib`` of the first row, one scene a step, and
+``flops_over_peak``: multiply-adds of matrix products a second over those of a plain product
+of large matrices in the same process. On a GPU seconds are the clock's.
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+from made_codebooks import made_codebooks
+from records import SHARED, read_split
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+
+from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.model.batch import Batch, Limits, collate, to_device
+from infgen.model.network import Network
+from infgen.scene import Scene
+from infgen.sources.womd import iter_scenes
+from infgen.tokens.tokenizer import tokenize_scene
+from pipeline.checkpoint import Training
+from pipeline.course import repeatable
+from pipeline.descent import Descent
+from pipeline.distributed import Team
+from pipeline.screen import show_table
+
+SCENE = "637f20cafde22ff8"
+RECORD = SHARED.parents[1] / "golden" / "wosac" / SCENE / "scenario.tfrecord"
+SIZES = {
+    "paper": ModelSettings(),
+    "small": ModelSettings(
+        width=48, heads=4, map_blocks=1, motion_blocks=2, scene_blocks=1, fourier_bands=16
+    ),
+}
+FEW_NEIGHBOURS = 5
+"""Map tokens per agent that the public reference sees."""
+WARM, STEPS = 2, 5
+PEAK_SIDE = 2048
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One row of the table.
+
+    Attributes:
+        size: ``paper`` or ``small``.
+        scenes: Scenes of a step.
+        neighbours: Map tokens that an agent sees; 0 for the default.
+        device: Where.
+        threads: Of the processor.
+    """
+
+    size: str
+    scenes: int
+    neighbours: int
+    device: str
+    threads: int
+
+
+def read_scene() -> Scene:
+    """Read the scene that figures are about, or the largest built-in one."""
+    if RECORD.is_file():
+        return next(s for s in iter_scenes(RECORD) if isinstance(s, Scene))
+    return max(read_split("training"), key=lambda scene: len(scene.tracks.id))
+
+
+def prepare(case: Case) -> tuple[Descent, Batch, Training]:
+    """Make the network, its optimiser, and a batch of one scene several times."""
+    model = SIZES[case.size]
+    if case.neighbours:
+        model = replace(model, map_agent_neighbours=case.neighbours)
+    grid, how = TokenSettings(), TrainSettings()
+    motion, roads = made_codebooks()
+    tokens = tokenize_scene(read_scene(), motion, roads, grid)
+    batch = collate([tokens] * case.scenes, Limits.of(model, how, grid), 0)
+    torch.manual_seed(0)
+    device = torch.device(case.device)
+    network = Network(model, motion, roads, grid).to(device)
+    optimiser = torch.optim.AdamW(network.parameters(), fused=True)
+    average = {name: p.detach().clone() for name, p in network.named_parameters()}
+    training = Training(network, average, optimiser)
+    descent = Descent(training, how, Team(device=device), 1)
+    return descent, to_device(batch, device), training
+
+
+def used_s(device: str) -> float:
+    """Seconds used so far: of the processor, or of the clock for a GPU."""
+    if device != "cpu":
+        torch.cuda.synchronize()
+        return time.perf_counter()
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def seconds(work: Callable[[], object], times: int, device: str) -> float:
+    """Mean seconds that a call uses."""
+    start = used_s(device)
+    for _ in range(times):
+        work()
+    return (used_s(device) - start) / times
+
+
+def peak_flops(device: str) -> float:
+    """Operations a second (of the clock) of a product of large matrices."""
+    low = device != "cpu" and torch.cuda.is_bf16_supported()
+    kind = torch.bfloat16 if low else torch.float32
+    one = torch.randn(PEAK_SIDE, PEAK_SIDE, device=device, dtype=kind)
+    other, best = one.clone(), 0.0
+
+    def product() -> Tensor:
+        return one @ other
+
+    product()
+    for _ in range(5):
+        start = time.perf_counter()
+        seconds(product, 4, device)
+        best = max(best, 4 * 2 * PEAK_SIDE**3 / (time.perf_counter() - start))
+    return best
+
+
+def measure(case: Case) -> dict[str, float]:
+    """Measure one row, in this process."""
+    torch.set_num_threads(case.threads)
+    descent, batch, training = prepare(case)
+    with repeatable():
+        with FlopCounterMode(display=False) as counter:
+            descent.step([batch], range(1), 0)
+        for step in range(1, WARM):
+            descent.step([batch], range(1), step)
+        start = time.perf_counter()
+        used = seconds(lambda: descent.step([batch], range(1), WARM), STEPS, case.device)
+        passed_s = (time.perf_counter() - start) / STEPS
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    if case.device != "cpu":
+        memory = torch.cuda.max_memory_allocated() / 2**20
+    flops = float(counter.get_total_flops())
+    return {
+        "agents": float(batch.agents.visible.sum()) / case.scenes,
+        "roads": float(batch.roads.real.sum()) / case.scenes,
+        "parameters": float(sum(p.numel() for p in training.network.parameters())),
+        "used_s_per_scene": used / case.scenes,
+        "clock_s_per_scene": passed_s / case.scenes,
+        "peak_rss_mib": memory,
+        "gflop_per_scene": flops / case.scenes / 1e9,
+        "flops_over_peak": flops / passed_s / peak_flops(case.device),
+    }
+
+
+def in_own_process(case: Case) -> dict[str, float]:
+    """Measure one row in a fresh process."""
+    command = [sys.executable, str(Path(__file__)), "--case", json.dumps(asdict(case))]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def report(size: str, device: str, threads: int) -> None:
+    """Print the table and, last, the figures as JSON."""
+    cases = {
+        "one scene": Case(size, 1, 0, device, threads),
+        "four scenes": Case(size, 4, 0, device, threads),
+        f"one scene, {FEW_NEIGHBOURS} map tokens per agent": Case(
+            size, 1, FEW_NEIGHBOURS, device, threads
+        ),
+    }
+    found = {name: in_own_process(case) for name, case in cases.items()}
+    first = next(iter(found.values()))
+    used = "CPU-s" if device == "cpu" else "s"
+    show_table(
+        f"training step, {size} ({first['parameters']:,.0f} parameters), "
+        f"{first['agents']:.0f} agents at a time, {first['roads']:.0f} road tokens",
+        (
+            "step of",
+            f"{used} a scene",
+            "clock s",
+            "peak MiB",
+            "GFLOP a scene",
+            "of matmul peak",
+        ),
+        [
+            (
+                name,
+                f"{row['used_s_per_scene']:.2f}",
+                f"{row['clock_s_per_scene']:.2f}",
+                f"{row['peak_rss_mib']:.0f}",
+                f"{row['gflop_per_scene']:.1f}",
+                f"{row['flops_over_peak']:.0%}",
+            )
+            for name, row in found.items()
+        ],
+    )
+    few = found[f"one scene, {FEW_NEIGHBOURS} map tokens per agent"]
+    figures = {
+        "size": size,
+        "device": device,
+        "threads": threads,
+        "cpu_s_per_scene": round(first["used_s_per_scene"], 3),
+        "cpu_s_per_scene_of_four": round(found["four scenes"]["used_s_per_scene"], 3),
+        "cpu_s_few_neighbours": round(few["used_s_per_scene"], 3),
+        "peak_rss_mib": round(first["peak_rss_mib"]),
+        "gflop_per_scene": round(first["gflop_per_scene"], 1),
+        "flops_over_peak": round(first["flops_over_peak"], 3),
+    }
+    print(json.dumps(figures))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure all rows, or the one that another process asks for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--size", choices=sorted(SIZES), default="paper")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--case", type=json.loads, help=argparse.SUPPRESS)
+    asked = parser.parse_args(arguments)
+    if asked.case:
+        print(json.dumps(measure(Case(**asked.case))))
+    else:
+        report(asked.size, asked.device, asked.threads)
+
+
+if __name__ == "__main__":
+    main()

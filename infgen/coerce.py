@@ -1,0 +1,92 @@
+"""Plain values, as YAML or the command line gave them, to settings of the right types."""
+
+import types
+from collections.abc import Mapping
+from dataclasses import field, fields
+from difflib import get_close_matches
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A setting that does not exist or cannot have that value."""
+
+
+def free(default: T) -> T:
+    """Default of a setting that decides how work is done, and nothing of what comes out.
+
+    Keys leave it out: what was made with another value is not made again.
+    """
+    made: T = field(default=default, metadata={"free": True})
+    return made
+
+
+def decisive(settings: Any) -> dict[str, Any]:
+    """Settings that decide what comes out, by name: all but the ``free`` ones."""
+    return {
+        f.name: getattr(settings, f.name)
+        for f in fields(settings)
+        if not f.metadata.get("free")
+    }
+
+
+def build(kind: type[T], values: Mapping[str, Any], where: str) -> T:
+    """Make settings from plain values. A key that is not a field is an error.
+
+    Args:
+        kind: The settings' dataclass.
+        values: Field names to values, as YAML or the command line gave them.
+        where: What to call the place in messages (``stages.yaml:12: train``).
+
+    Raises:
+        ConfigError: naming the key, where it stands, and the nearest real one; or the value
+            and the type expected.
+    """
+    return kind(**{key: settle(kind, key, value, where) for key, value in values.items()})
+
+
+def settle(kind: type, key: str, value: Any, where: str) -> Any:
+    """Check one setting and give its value the type of its field.
+
+    Raises:
+        ConfigError: as ``build`` does.
+    """
+    names = [field.name for field in fields(kind)]
+    if key not in names:
+        near = get_close_matches(key, names, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"there is {', '.join(names)}"
+        raise ConfigError(f"{where}: no setting {key!r}; {hint}")
+    return coerce(value, get_type_hints(kind)[key], f"{where}.{key}")
+
+
+def coerce(value: Any, kind: Any, where: str) -> Any:
+    """Give a plain value the type of its field.
+
+    A YAML ``5e-4`` arrives as a string and becomes a float; a float is never cut to an int.
+
+    Raises:
+        ConfigError: naming the place, the value and the type expected.
+    """
+    if get_origin(kind) in (Union, types.UnionType):
+        if value is None:
+            return None
+        kind = next(k for k in get_args(kind) if k is not type(None))
+    wrong = ConfigError(f"{where} is {value!r}; expected {getattr(kind, '__name__', kind)}")
+    if kind is str and isinstance(value, bool):
+        return str(value).lower()  # YAML's ``true`` where ``auto`` may stand too.
+    if kind is bool:
+        if str(value).lower() not in ("true", "false"):
+            raise wrong
+        return str(value).lower() == "true"
+    if isinstance(value, bool) or value is None:
+        raise wrong
+    if kind is str:
+        return str(value)
+    try:
+        number = float(value)
+        if kind is int and number != int(number):
+            raise wrong
+        return kind(number)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise wrong from error

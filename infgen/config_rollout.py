@@ -1,0 +1,178 @@
+"""Settings of rollouts: what is played, how choices are sampled, and who may enter."""
+
+from dataclasses import dataclass
+
+from infgen.coerce import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class RolloutMode:
+    """What one word for a kind of rollout stands for.
+
+    Attributes:
+        seconds: Length.
+        everyone: Whether everyone of the log is played, however far from the ego.
+        insert: Whether agents may enter.
+        remove: Whether agents may leave.
+        fixed: Names of those of the above that a setting of their own must not change.
+    """
+
+    seconds: float
+    everyone: bool
+    insert: bool
+    remove: bool
+    fixed: tuple[str, ...]
+
+
+MODES = {
+    "long": RolloutMode(30.0, False, True, True, ()),
+    "motion-only": RolloutMode(30.0, False, False, False, ("insert", "remove")),
+    "wosac": RolloutMode(
+        8.0, True, False, False, ("seconds", "everyone", "insert", "remove")
+    ),
+}
+"""``long``: agents come and go. ``motion-only``: nobody does (the paper's table 3).
+``wosac``: Waymo's protocol, which fixes all four."""
+
+
+@dataclass(frozen=True, slots=True)
+class RolloutSettings:
+    """How futures are played (SPEC 6).
+
+    What the mode leaves open, ``seconds``, ``everyone``, ``insert`` and ``remove`` may say
+    otherwise; where the mode fixes it, another value is an error.
+
+    Attributes:
+        split: Split whose scenes are played (start of the file name).
+        mode: ``long``, ``motion-only`` or ``wosac``: see ``MODES``.
+        seconds: Length of a rollout after the history; the mode's if None.
+        count: Rollouts per scene.
+        scenes: Scenes to play; 0 for all of the split.
+        scenes_per_task: Scenes of one unit of work.
+        batch: Rollouts that are played at once.
+        everyone: Whether to play every agent of the log that is there at now, however far
+            from the ego, or those within ``tokenize.max_distance_m``; the mode's if None.
+        insert: Whether agents may enter; the mode's if None.
+        remove: Whether agents may leave; the mode's if None.
+        leave_radius_m: Whoever gets farther from the ego leaves, if anyone may; 0 for
+            nobody. For weights that do not say who leaves (SPEC 7).
+        patterns: Whether agents are seen and lost as by a detector, with weights that have
+            learned validity patterns.
+        top_moves: Most likely moves that are sampled from; 0 for all.
+        top_cells: Most likely cells that are sampled from; 0 for all.
+        move_nucleus: Least share of probability that the moves sampled from have together,
+            the most likely first; 1 for all.
+        cell_nucleus: The same for cells.
+        move_temperature: Logits of moves are divided by it: below 1 the likely become
+            likelier.
+        cell_temperature: The same for cells.
+        heading_temperature: The same for heading bins.
+        add_bias: Added to the log-odds that one more agent enters.
+        leave_bias: Added to the log-odds that an agent leaves.
+        entry_mask: Whether newcomers are kept off other boxes, and vehicles near lanes. The
+            paper lets them in anywhere.
+        entry_lane_m: Farthest from a lane's middle that a vehicle may enter. Most logged
+            newcomers are parked cars that come into view: of all, 47 % are within 5 m, 69 %
+            within 10 m, 78 % within 15 m; of those that drive, 96, 97 and 97 %.
+        entry_tries: Cells that are tried for one newcomer before there is none.
+        max_entries: Newcomers per half second.
+        max_agents: Agents at any one time.
+        seed: Of all random streams.
+    """
+
+    split: str = "validation"
+    mode: str = "long"
+    seconds: float | None = None
+    count: int = 32
+    scenes: int = 0
+    scenes_per_task: int = 8
+    batch: int = 32
+    everyone: bool | None = None
+    insert: bool | None = None
+    remove: bool | None = None
+    leave_radius_m: float = 0.0
+    patterns: bool = False
+    top_moves: int = 5
+    top_cells: int = 10
+    move_nucleus: float = 1.0
+    cell_nucleus: float = 1.0
+    move_temperature: float = 1.0
+    cell_temperature: float = 1.0
+    heading_temperature: float = 1.0
+    add_bias: float = 0.0
+    leave_bias: float = 0.0
+    entry_mask: bool = True
+    entry_lane_m: float = 15.0
+    entry_tries: int = 4
+    max_entries: int = 16
+    max_agents: int = 128
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse contradictions.
+
+        Raises:
+            ConfigError: naming the setting, its value and the way out.
+        """
+        if self.mode not in MODES:
+            raise ConfigError(
+                f"rollout.mode is {self.mode!r}; expected {' or '.join(MODES)}"
+            )
+        for name in MODES[self.mode].fixed:
+            given, fixed = getattr(self, name), getattr(MODES[self.mode], name)
+            if given is not None and given != fixed:
+                raise ConfigError(
+                    f"rollout.{name} is {given}, but rollout.mode={self.mode} is played "
+                    f"with {fixed}; say so, leave it out, or choose another mode"
+                )
+        self._check_numbers()
+
+    def _check_numbers(self) -> None:
+        for name in ("move_temperature", "cell_temperature", "heading_temperature"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(
+                    f"rollout.{name} is {getattr(self, name)}; expected more than 0 "
+                    "(for the most likely alone, say rollout.top_moves=1)"
+                )
+        for name in ("move_nucleus", "cell_nucleus"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ConfigError(
+                    f"rollout.{name} is {getattr(self, name)}; expected up to 1, above 0"
+                )
+        for name, least in (
+            ("count", 1),
+            ("scenes", 0),
+            ("scenes_per_task", 1),
+            ("batch", 1),
+            ("leave_radius_m", 0),
+            ("top_moves", 0),
+            ("top_cells", 0),
+            ("entry_lane_m", 0),
+            ("entry_tries", 1),
+            ("max_entries", 0),
+            ("max_agents", 1),
+        ):
+            if not getattr(self, name) >= least:
+                raise ConfigError(
+                    f"rollout.{name} is {getattr(self, name)}; expected {least} or more"
+                )
+
+    @property
+    def length_s(self) -> float:
+        """Seconds that are played."""
+        return MODES[self.mode].seconds if self.seconds is None else self.seconds
+
+    @property
+    def plays_everyone(self) -> bool:
+        """Whether agents however far away are played."""
+        return MODES[self.mode].everyone if self.everyone is None else self.everyone
+
+    @property
+    def inserts(self) -> bool:
+        """Whether agents may enter."""
+        return MODES[self.mode].insert if self.insert is None else self.insert
+
+    @property
+    def removes(self) -> bool:
+        """Whether agents may leave."""
+        return MODES[self.mode].remove if self.remove is None else self.remove

@@ -1,0 +1,216 @@
+"""The closed loop, half a second at a time, for a batch of rollouts.
+
+::
+
+    session = Session(player, start)
+    while planning:
+        frame = session.step(ego_pose)      # or session.step(): the network drives
+
+The order within a half second is SPEC 12.2's: everyone moves, whoever leaves is marked,
+then newcomers enter one by one until the network says that motion begins.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32
+
+from infgen.clock import CLOCK
+from infgen.geometry import wrap_angle
+from infgen.model.batch import collate_roads
+from infgen.model.columns import MotionStep
+from infgen.model.steps import Memory
+from infgen.rollout.newcomers import Asking, add_newcomers
+from infgen.rollout.player import Player
+from infgen.rollout.population import (
+    EGO_ROW,
+    Population,
+    leave_beyond,
+    move_on,
+    settle,
+)
+from infgen.rollout.room import make_room
+from infgen.rollout.sampling import choose, happens
+from infgen.rollout.streams import Purpose, Stream
+from infgen.rollout.trace import NOBODY, Frame, Start
+from infgen.tokens.moves import follow, make_move_table
+from infgen.tokens.scene_tokens import Presence
+
+
+class Session:
+    """A batch of rollouts under way, whose egos may be driven from outside.
+
+    What a rollout does depends on its own scene, index, seed and driver only, never on the
+    others of the batch (but for rounding in the network's sums).
+
+    Attributes:
+        population: Everyone at the end of the last half second.
+        token: That half second.
+    """
+
+    @torch.inference_mode()
+    def __init__(self, player: Player, starts: Start | Sequence[Start]) -> None:
+        """Play the history.
+
+        Args:
+            player: Network and settings.
+            starts: Scenes to continue; several rollouts of one scene share its map.
+        """
+        starts = [starts] if isinstance(starts, Start) else list(starts)
+        self._player = player
+        self._streams = [Stream.of(s.seed, s.scene.scenario_id, s.index) for s in starts]
+        history = settle(starts, player.settings.max_agents)
+        self._memory, self._asking = _begin(player, starts, self._streams, history[0])
+        for population in history[:-1]:
+            player.stepper.motion_step(self._memory, player.column(population))
+        self.population = history[-1]
+        self.token = starts[0].history.now
+        self._table = make_move_table(player.codebook)
+        self._driven_to: np.ndarray | None = None
+
+    @property
+    def ego_pose(self) -> Float32[np.ndarray, "rollout 3"]:
+        """Where each rollout's ego is: x, y, heading in the scene's frame."""
+        if self._driven_to is not None:
+            return self._driven_to
+        return self.population.pose[:, EGO_ROW]
+
+    @torch.inference_mode()
+    def step(self, ego_pose: Float32[np.ndarray, "*steps 3"] | None = None) -> Frame:
+        """Play the next half second; all others react to the ego in the one after it.
+
+        Args:
+            ego_pose: Where the ego drives, in the scene's frame: its pose [3] at the end of
+                the half second, or at each of its five steps [5, 3]. For a batch with the
+                rollouts as first dimension. The network sees it as moves of its codebook,
+                each of which makes up for what the last one left out. None lets the network
+                drive.
+        """
+        player, token = self._player, self.token + 1
+        path = None if ego_pose is None else self._ego_path(ego_pose)
+        before = self._at_the_wheel(path)
+        said = player.stepper.motion_step(self._memory, player.column(before))
+        moved, paths = self._move(before, said, path, token)
+        after = moved
+        if player.inserts:
+            after = add_newcomers(self._asking, self._memory, moved, token)
+        self.population, self.token = after, token
+        self._driven_to = None if path is None else path[:, -1]
+        return Frame(
+            token=token,
+            life=moved.life,
+            path=paths,
+            shown=self._shown(before, moved, said, token),
+            leaving=moved.presence == Presence.LEAVING,
+            born=np.where(after.life != moved.life, after.life, np.int32(NOBODY)),
+            kind=after.kind,
+            size_lwh_m=after.size_lwh_m,
+        )
+
+    def _ego_path(self, ego_pose: np.ndarray) -> Float32[np.ndarray, "rollout step 3"]:
+        """Poses of the egos at the five steps; on a straight way if only the end is given.
+
+        Raises:
+            ValueError: if there is not one pose, or five, for each rollout.
+        """
+        rollouts, steps = len(self._streams), CLOCK.steps_per_token
+        given = np.asarray(ego_pose, dtype=np.float32)
+        given = given[None] if rollouts == 1 and given.shape[0] != 1 else given
+        if given.shape == (rollouts, steps, 3):
+            return given
+        if given.shape != (rollouts, 3):
+            raise ValueError(
+                f"ego_pose has shape {ego_pose.shape}; expected ({rollouts}, 3) or "
+                f"({rollouts}, {steps}, 3); the first dimension may be left out if it is 1"
+            )
+        begin = self.ego_pose
+        way = given - begin
+        way[:, 2] = wrap_angle(way[:, 2])
+        share = np.arange(1, steps + 1, dtype=np.float32)[:, None] / steps
+        path = begin[:, None] + share * way[:, None]
+        path[..., 2] = wrap_angle(path[..., 2])
+        path[:, -1] = given
+        return path
+
+    def _at_the_wheel(self, path: np.ndarray | None) -> Population:
+        """Everyone as the network sees them; it takes over from where the ego really is."""
+        if self._driven_to is None or path is not None:
+            return self.population
+        pose = self.population.pose.copy()
+        pose[:, EGO_ROW] = self._driven_to
+        return replace(self.population, pose=pose)
+
+    def _move(
+        self, before: Population, said: MotionStep, ego_path: np.ndarray | None, token: int
+    ) -> tuple[Population, np.ndarray]:
+        """Sample everyone's move, and who leaves; drive the egos that are driven."""
+        player, settings = self._player, self._player.settings
+        move = self._moves(said, token)
+        if ego_path is not None:
+            target, pose = ego_path[:, -1], before.pose[:, EGO_ROW]
+            kind = before.kind[:, EGO_ROW]
+            move[:, EGO_ROW], _ = follow(target, pose, kind, self._table)
+        moved, path = move_on(before, move, self._leaves(said, token), player.codebook)
+        if settings.removes and settings.leave_radius_m:
+            moved = leave_beyond(before, moved, settings.leave_radius_m)
+        if ego_path is not None:
+            path = path.copy()  # The population goes on from where the moves led.
+            path[:, EGO_ROW] = ego_path
+        return moved, path
+
+    def _moves(self, said: MotionStep, token: int) -> np.ndarray:
+        settings, rows = self._player.settings, said.move_logits.shape[1]
+        drawn = choose(
+            said.move_logits,
+            self._player.luck(self._streams, token, Purpose.MOVE, rows),
+            settings.top_moves,
+            nucleus=settings.move_nucleus,
+            temperature=settings.move_temperature,
+        )
+        return drawn.cpu().numpy()
+
+    def _leaves(self, said: MotionStep, token: int) -> Bool[np.ndarray, "rollout row"]:
+        settings, shape = self._player.settings, said.move_logits.shape[:2]
+        if said.leave_logit is None or not settings.removes:
+            return np.zeros(shape, dtype=bool)
+        luck = self._player.luck(self._streams, token, Purpose.LEAVE, shape[1])
+        return happens(said.leave_logit, luck, settings.leave_bias).cpu().numpy()
+
+    def _shown(
+        self, before: Population, moved: Population, said: MotionStep, token: int
+    ) -> Bool[np.ndarray, "rollout row 5"]:
+        """When a detector would see everyone.
+
+        The ego always, a newcomer as soon as it is in, whoever leaves to the end: so an
+        entry and an exit are where they are said to be.
+        """
+        steps = CLOCK.steps_per_token
+        shown = np.ones((*moved.life.shape, steps), dtype=bool)
+        if said.pattern_logits is None or not self._player.settings.patterns:
+            return shown
+        rows = moved.life.shape[1]
+        luck = self._player.luck(self._streams, token, Purpose.PATTERN, rows)
+        pattern = choose(said.pattern_logits, luck).cpu().numpy()
+        shown &= (pattern[..., None] >> np.arange(steps) & 1).astype(bool)
+        shown[:, EGO_ROW] = True
+        shown[..., 0] |= before.presence == Presence.ENTERING
+        shown[..., -1] |= moved.presence == Presence.LEAVING
+        return shown
+
+
+def _begin(
+    player: Player, starts: Sequence[Start], streams: Sequence[Stream], first: Population
+) -> tuple[Memory, Asking]:
+    """Encode every map once, however many rollouts of it there are."""
+    maps = {start.scene.scenario_id: start.history for start in starts}
+    number = {name: at for at, name in enumerate(maps)}
+    scene = np.array([number[start.scene.scenario_id] for start in starts], dtype=np.int64)
+    histories = list(maps.values())
+    roads = collate_roads(histories, max(history.num_roads for history in histories))
+    memory = player.stepper.begin(roads, player.tensor(scene), first.life.shape[1])
+    settings, room = player.settings, None
+    if settings.entry_mask:
+        room = make_room(histories, player.roads, scene, settings.entry_lane_m)
+    return memory, Asking(player, streams, room)

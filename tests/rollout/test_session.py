@@ -1,0 +1,137 @@
+"""Egos driven from outside: they go where they are told, and the world reacts."""
+
+import numpy as np
+import pytest
+
+from infgen.rollout.session import Session
+from infgen.rollout.simulate import simulate
+from infgen.rollout.trace import collect
+
+ALONE = {"insert": False, "remove": False, "max_agents": 6}
+
+
+@pytest.fixture
+def session(crossing, start, player):
+    """``session(count=1, **settings)``: rollouts of a crossing, the ego at (-30, 0)."""
+
+    def build(count=1, **settings):
+        scene = crossing()
+        starts = [start(scene, at) for at in range(count)]
+        return Session(player(**{**ALONE, **settings}), starts)
+
+    return build
+
+
+def pose(x_m, y_m=0.0, heading_rad=0.0):
+    return np.array([x_m, y_m, heading_rad], dtype=np.float32)
+
+
+def test_without_a_driver_a_session_is_a_simulation(crossing, start, player):
+    begin, playing = [start(crossing())], player(seconds=1.5, max_entries=2)
+    session = Session(playing, begin[0])
+
+    frames = [session.step() for _ in range(3)]
+
+    (stepped,) = collect(begin, frames, "weights")
+    (simulated,) = collect(begin, list(simulate(playing, begin)), "weights")
+    np.testing.assert_array_equal(stepped.xyz_m, simulated.xyz_m)
+    assert session.token == 4
+
+
+def test_the_ego_goes_where_it_is_driven(session):
+    driven = session()
+    np.testing.assert_allclose(driven.ego_pose, [[-30, 0, 0]], atol=1e-5)
+
+    frame = driven.step(pose(-24.7, 0.3, 0.1))
+
+    path = frame.path[0, 0]
+    np.testing.assert_allclose(path[:, 0], [-28.94, -27.88, -26.82, -25.76, -24.7], 1e-5)
+    np.testing.assert_allclose(path[:, 2], [0.02, 0.04, 0.06, 0.08, 0.1], atol=1e-6)
+    np.testing.assert_array_equal(driven.ego_pose, [pose(-24.7, 0.3, 0.1)])
+
+
+def test_five_poses_are_taken_as_they_are(session):
+    driven = session()
+    path = np.array([pose(-29 + step, step % 2) for step in range(5)])
+
+    frame = driven.step(path)
+
+    np.testing.assert_array_equal(frame.path[0, 0], path)
+
+
+def test_a_way_that_turns_past_west_is_not_driven_backwards(session):
+    driven = session()
+    driven.step(pose(-25, 0, 3.1))
+
+    frame = driven.step(pose(-27, 0, -3.1))
+
+    assert (np.abs(frame.path[0, 0, :, 2]) > 3.09).all()
+
+
+def test_errors_of_moves_do_not_add_up(session):
+    # The codebook has whole metres only; 4.4 m per half second is none of its moves.
+    driven = session()
+    gaps_m, moves = [], []
+    for step in range(1, 6):
+        driven.step(pose(-30 + 4.4 * step))
+        gaps_m.append(driven.ego_pose[0, 0] - driven.population.pose[0, 0, 0])
+        moves.append(int(driven.population.move[0, 0]))
+
+    assert moves == [4, 5, 4, 5, 4]
+    np.testing.assert_allclose(gaps_m, [0.4, -0.2, 0.2, -0.4, 0.0], atol=1e-4)
+
+
+def test_others_react_in_the_next_half_second_and_not_before(session):
+    def play(first):
+        driven = session(top_moves=0)
+        frames = [driven.step(first), driven.step(pose(-20))]
+        return frames
+
+    ahead, aside = play(pose(-25)), play(pose(-28, 6.0, 1.2))
+
+    np.testing.assert_array_equal(ahead[0].path[0, 1:], aside[0].path[0, 1:])
+    assert not np.array_equal(ahead[1].path[0, 1:], aside[1].path[0, 1:])
+
+
+def test_the_network_takes_over_from_where_the_ego_really_is(session):
+    driven = session()
+    driven.step(pose(-25.4, 0.2))  # No move of the codebook ends there.
+
+    frame = driven.step()
+
+    moves_m = np.linalg.norm(np.diff(frame.path[0, 0, :, :2], axis=0), axis=1)
+    first_m = np.linalg.norm(frame.path[0, 0, 0, :2] - [-25.4, 0.2])
+    np.testing.assert_allclose(first_m, moves_m, atol=1e-4)
+
+
+def test_each_rollout_of_a_batch_has_its_own_driver(session):
+    driven = session(count=3)
+    poses = np.array([pose(-25), pose(-26), pose(-27)])
+
+    frame = driven.step(poses)
+
+    np.testing.assert_array_equal(frame.path[:, 0, -1], poses)
+
+
+@pytest.mark.parametrize(
+    ("count", "shape"), [(1, (4, 3)), (2, (3,)), (2, (3, 3)), (2, (2, 4, 3))]
+)
+def test_other_numbers_of_poses_are_refused(session, count, shape):
+    driven = session(count=count)
+
+    with pytest.raises(ValueError, match=r"ego_pose has shape"):
+        driven.step(np.zeros(shape, dtype=np.float32))
+
+
+def test_newcomers_enter_around_the_driven_ego(crossing, start, player, force):
+    playing = player(max_entries=2, remove=False)
+    force(playing, add=20.0)
+    driven = Session(playing, start(crossing()))
+    for step in range(1, 4):
+        driven.step(pose(-30 + 8.0 * step))
+
+    now = driven.population
+    away_m = now.pose[0, :, :2] - driven.ego_pose[0, :2]
+    entering = now.presence[0] == 2
+    assert entering.any()
+    assert (np.linalg.norm(away_m[entering], axis=1) < 75.6).all()

@@ -1,0 +1,283 @@
+"""Every variant of the network is played, and what must always hold holds."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from infgen.geometry import boxes_overlap
+from infgen.metrics.radius import live_within
+from infgen.rollout.population import EGO_ROW
+from infgen.rollout.rollout import NEVER
+from infgen.rollout.session import Session
+from infgen.rollout.simulate import simulate
+from infgen.rollout.trace import NOBODY, collect
+from infgen.scene import AgentKind
+from infgen.tokens.scene_tokens import Presence
+
+VARIANTS = {
+    "full": {},
+    "smart": {"life_cycle": False},
+    "no leave token": {"leave_token": False},
+    "no cell token": {"cell_token": False},
+    "no heading token": {"heading_token": False},
+    "no leave, no cell token": {"leave_token": False, "cell_token": False},
+    "patterns": {"pattern_tokens": True},
+}
+FASTEST_M = 20.0
+"""The longest move of the codebook of these tests."""
+
+
+def play(player, starts):
+    return collect(starts, list(simulate(player, starts)), "weights")
+
+
+def check_session(session, frames, grid):
+    """What must hold of every frame of a session, and between frames."""
+    gone, ids = set(), set()
+    for _ in range(frames):
+        before = session.population
+        frame = session.step()
+        after = session.population
+        lives = {(r, n) for r, row in enumerate(frame.life) for n in row if n != NOBODY}
+        rows = (frame.life != NOBODY).sum()
+        assert len(lives) == rows, "an agent has one row"
+        assert not lives & gone, "who has left never returns"
+        same = (before.life == frame.life) & (frame.life != NOBODY)
+        assert same.sum() == rows, "who is there was there, in the same row"
+        gap_m = np.linalg.norm(frame.path[:, :, -1, :2] - before.pose[..., :2], axis=-1)
+        assert gap_m[same].max() <= FASTEST_M + 1e-3
+        gone |= {(r, frame.life[r, row]) for r, row in np.argwhere(frame.leaving)}
+        born = {(r, frame.born[r, row]) for r, row in np.argwhere(frame.born != NOBODY)}
+        assert not born & (ids | lives), "every newcomer is a new agent"
+        ids |= lives | born
+        entering = after.presence == Presence.ENTERING
+        assert (after.cells(grid)[entering] >= 0).all(), "newcomers are in the grid"
+        assert (after.presence[:, EGO_ROW] == Presence.PRESENT).all()
+    return ids
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_variant_plays_and_keeps_the_rules(
+    variant, crossing, parked, start, player, force
+):
+    playing = player(
+        VARIANTS[variant], max_agents=9, max_entries=2, entry_tries=2, leave_radius_m=80.0
+    )
+    add = 1.0 if playing.stepper.life_cycle else None
+    force(playing, add=add, leave=-1.0 if playing.stepper.leaves else None)
+    session = Session(playing, [start(crossing()), start(parked(4))])
+
+    ids = check_session(session, 5, playing.grid)
+
+    newcomers = len(ids) - (3 + 5)
+    assert newcomers > 3 if playing.stepper.life_cycle else newcomers == 0
+
+
+@settings(
+    max_examples=5,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+    add=st.floats(-2, 4),
+    leave=st.floats(-4, 2),
+    rows=st.integers(5, 9),
+    index=st.integers(0, 1000),
+    mask=st.booleans(),
+)
+def test_the_rules_hold_whatever_comes_and_goes(
+    crossing, start, player, force, add, leave, rows, index, mask
+):
+    playing = player(
+        max_agents=rows, entry_mask=mask, max_entries=3, top_moves=0, top_cells=0
+    )
+    force(playing, add=add, leave=leave)
+    session = Session(playing, start(crossing(), index))
+
+    check_session(session, 5, playing.grid)
+
+    assert session.population.life.shape == (1, rows)
+
+
+def test_rows_that_are_freed_are_used_again(crossing, start, player, force):
+    playing = player(max_agents=5, max_entries=2)
+    force(playing, add=20.0, leave=2.0)
+    session = Session(playing, start(crossing()))
+
+    ids = check_session(session, 12, playing.grid)
+
+    assert len(ids) > 2 * 5
+
+
+def test_motion_only_weights_say_what_they_play_and_ignore_the_rest(
+    crossing, start, player
+):
+    playing = player({"life_cycle": False}, insert=True, remove=True)
+
+    (rollout,) = play(playing, [start(crossing())])
+
+    assert playing.plays == "motion only"
+    assert rollout.logged.all()
+    assert (rollout.exit_step == NEVER).all()
+    assert player().plays == "motion, entries, exits"
+    assert player({"leave_token": False}).plays == "motion, entries"
+    assert player(mode="wosac", seconds=None).plays == "motion only"
+
+
+@pytest.fixture
+def passing(build_scene, start):
+    """The ego stands; one car drives away from 20 m, one comes from 140 m, one is near."""
+    away_m = np.arange(91) * 1.0
+    path = np.zeros((4, 91, 3))
+    path[1, :, 0], path[2, :, 0], path[3, :, 1] = 20 + away_m, 140 - away_m, 10
+    path[2, :, 2] = np.pi
+    return start(build_scene(path, [0] * 4))
+
+
+def test_smart_with_the_radius_heuristic_enters_and_leaves_as_the_paper_says(
+    passing, player
+):
+    playing = player(VARIANTS["smart"], seconds=8.0)
+    keep_speed(playing)
+    (rollout,) = play(playing, [passing])
+
+    found = live_within(rollout, radius_m=80.0)
+
+    # At ends of half seconds 20 + 65 m is the first beyond, 140 - 60 m the first within.
+    np.testing.assert_array_equal(found.exit_step, [NEVER, 60, NEVER, NEVER])
+    np.testing.assert_array_equal(found.entry_step, [0, 0, 60, 0])
+    assert not found.valid[2, :61].any()
+    assert found.valid[2, 61:].all()
+    assert not found.valid[1, 61:].any()
+
+
+@pytest.mark.parametrize("variant", ["smart", "no leave token"])
+def test_without_leave_tokens_agents_leave_by_distance_alone(variant, passing, player):
+    playing = player(VARIANTS[variant], seconds=4.0, insert=False, leave_radius_m=60.0)
+    keep_speed(playing)
+
+    (rollout,) = play(playing, [passing])
+
+    # Beyond 60 m for the first time at the end of a half second at step 45 (65 m).
+    np.testing.assert_array_equal(rollout.exit_step, [NEVER, 45, NEVER, NEVER])
+    (stays,) = play(player(VARIANTS[variant], seconds=1.0, insert=False), [passing])
+    assert (stays.exit_step == NEVER).all()
+
+
+def keep_speed(playing):
+    """Let everyone repeat the move that led to where it is."""
+    step = playing.stepper.motion_step
+
+    def again(memory, column):
+        said = step(memory, column)
+        wanted = torch.nn.functional.one_hot(column.move.clamp(min=0), 61).float()
+        said.move_logits.copy_(100 * wanted)
+        return said
+
+    playing.stepper.motion_step = again
+
+
+def test_newcomers_are_kept_off_others_and_near_lanes(parked, start, player, force):
+    playing = player(
+        entry_lane_m=6.0, entry_tries=5, top_cells=0, max_agents=40, max_entries=5
+    )
+    force(playing, add=3.0, leave=-20.0)
+    session = Session(playing, [start(parked(6), at) for at in range(4)])
+    entered = vehicles = 0
+    for _ in range(3):
+        session.step()
+        now = session.population
+        entering = now.presence == Presence.ENTERING
+        entered += entering.sum()
+        vehicles += (entering & (now.kind == AgentKind.VEHICLE)).sum()
+        for rollout, row in np.argwhere(entering):
+            assert_has_room(now, rollout, row)
+    assert entered > 20
+    assert vehicles > 3
+
+
+def assert_has_room(now, rollout, row):
+    others = (now.presence[rollout] != Presence.ABSENT) & (
+        np.arange(now.life.shape[1]) != row
+    )
+    if now.kind[rollout, row] == AgentKind.PEDESTRIAN:
+        others &= now.kind[rollout] != AgentKind.PEDESTRIAN
+    elif now.kind[rollout, row] == AgentKind.VEHICLE:
+        assert abs(now.pose[rollout, row, 1]) < 6.1, "the lane is y = 0"
+    overlap = boxes_overlap(
+        now.pose[rollout, row][None],
+        now.size_lwh_m[rollout, row, :2],
+        now.pose[rollout, others],
+        now.size_lwh_m[rollout, others, :2],
+    )
+    assert not overlap.any()
+
+
+def test_with_a_mask_that_refuses_nobody_rollouts_are_as_without(crossing, start, player):
+    scene = crossing()
+
+    few = {"seconds": 2.0, "max_entries": 2}
+    (masked,) = play(player(entry_lane_m=1e6, entry_tries=1, **few), [start(scene)])
+    (free,) = play(player(entry_mask=False, **few), [start(scene)])
+
+    same = min(len(masked.id), len(free.id))
+    first = int(np.argmax(masked.entry_step[:same] != free.entry_step[:same]) or same)
+    steps = int(masked.entry_step[first]) if first < same else masked.num_steps
+    np.testing.assert_array_equal(masked.xyz_m[:3, :steps], free.xyz_m[:3, :steps])
+
+
+def test_patterns_make_agents_flicker_and_nothing_else(crossing, start, player, force):
+    model = {"pattern_tokens": True}
+    seen, flickering = (
+        player(model, patterns=patterns, max_entries=2, seconds=3.0)
+        for patterns in (False, True)
+    )
+    for playing in (seen, flickering):
+        force(playing, add=0.0, leave=-2.0)
+    begin = start(crossing())
+
+    (steady,), (rollout,) = play(seen, [begin]), play(flickering, [begin])
+
+    np.testing.assert_array_equal(rollout.id, steady.id)
+    np.testing.assert_array_equal(rollout.exit_step, steady.exit_step)
+    assert not (rollout.valid & ~steady.valid).any()
+    assert rollout.valid[:, 11:].sum() < 0.8 * steady.valid[:, 11:].sum()
+    shown = rollout.valid
+    np.testing.assert_array_equal(rollout.xyz_m[shown], steady.xyz_m[shown])
+    assert not rollout.xyz_m[~shown].any()
+    assert shown[rollout.ego].all()
+    left = rollout.exit_step != NEVER
+    assert shown[left, rollout.exit_step[left]].all()
+    later = ~rollout.logged & (rollout.entry_step < rollout.num_steps - 1)
+    assert later.any()
+    assert shown[later, rollout.entry_step[later] + 1].all()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("add_bias", -30.0), ("add_bias", 30.0), ("leave_bias", 30.0), ("leave_bias", -30.0)],
+)
+def test_biases_decide_where_the_network_is_undecided(crossing, start, player, name, value):
+    kept = {"add_bias": -30.0, "leave_bias": -30.0, name: value}
+
+    (rollout,) = play(player(seconds=1.0, max_entries=2, **kept), [start(crossing())])
+
+    assert (~rollout.logged).any() == (kept["add_bias"] > 0)
+    assert (rollout.exit_step != NEVER).any() == (kept["leave_bias"] > 0)
+
+
+def test_the_likeliest_alone_is_what_every_seed_plays(crossing, start, player):
+    scene = crossing()
+    few = {"insert": False, "remove": False, "seconds": 1.0}
+    certain = player(top_moves=1, **few)
+    cold = player(top_moves=0, move_temperature=1e-6, **few)
+    narrow = player(top_moves=0, move_nucleus=1e-6, **few)
+
+    one, other = play(certain, [start(scene, 0), start(scene, 1)])
+
+    np.testing.assert_array_equal(one.xyz_m, other.xyz_m)
+    for playing in (cold, narrow):
+        (same,) = play(playing, [start(scene, 2)])
+        np.testing.assert_allclose(same.xyz_m, one.xyz_m, atol=1e-4)

@@ -1,0 +1,221 @@
+"""Agents led astray, and the moves that lead them back.
+
+The codebook moves by decimetres straight ahead, and the agents by a metre each half second,
+so every expected number can be done in the head.
+"""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from infgen.config import ConfigError, TrainSettings
+from infgen.tokens.codebook import BOX_LW_M, MotionCodebook, RoadCodebook
+from infgen.tokens.moves import advance, make_move_table, nearest_moves
+from infgen.tokens.noise import FARTHEST_M, Noise, exchange_roads, lead_astray, make_noise
+from infgen.tokens.scene_tokens import NO_MOVE
+
+ITSELF = np.arange(9, dtype=np.int16)[:, None]
+
+
+def straight_moves(step_m=0.1, count=31):
+    """Row ``i`` goes ``i`` steps ahead."""
+    path = np.zeros((3, count, 6, 3), np.float32)
+    path[..., 0] = step_m * np.arange(count)[:, None] * np.linspace(0, 1, 6)
+    return MotionCodebook(BOX_LW_M, path, np.ones((3, count), bool))
+
+
+def noise_of(codebook, moves, share=1.0):
+    return Noise(make_move_table(codebook), moves, share, ITSELF)
+
+
+def metre_drives(agents=4, tokens=18):
+    """Kind, pose and move of agents that go a metre each token, and when they move."""
+    pose = np.zeros((agents, tokens, 3), np.float32)
+    pose[..., 0] = np.arange(tokens)
+    pose[..., 1] = 5.0 * np.arange(agents)[:, None]
+    move = np.full((agents, tokens), 10, np.int16)
+    move[:, 0] = NO_MOVE
+    moving = np.ones((agents, tokens), bool)
+    moving[:, 0] = False
+    return np.zeros(agents, np.int8), pose, move, moving
+
+
+def random_drives(codebook, seed, agents=20, tokens=10):
+    """Agents of all kinds on random moves, with gaps after which they start elsewhere."""
+    random = np.random.default_rng(seed)
+    kind = random.integers(3, size=agents).astype(np.int8)
+    move = random.integers(codebook.num_moves, size=(agents, tokens)).astype(np.int16)
+    moving = random.random((agents, tokens)) < 0.8
+    moving[:, 0] = False
+    pose = random.normal(size=(agents, tokens, 3)).astype(np.float32)
+    for token in range(1, tokens):
+        rows = np.flatnonzero(moving[:, token])
+        ends = advance(pose[rows, token - 1], kind[rows], move[rows, token], codebook)
+        pose[rows, token] = ends
+    return kind, pose, np.where(moving, move, NO_MOVE).astype(np.int16), moving
+
+
+def stray(drives, noise, seed=0):
+    return lead_astray(*drives, noise, np.random.default_rng(seed))
+
+
+def test_agents_stray_by_a_step_of_the_codebook_and_no_farther():
+    drives = metre_drives(agents=50)
+
+    strays = stray(drives, noise_of(straight_moves(), 3))
+
+    off_m = strays.pose[..., 0] - drives[1][..., 0]
+    assert np.abs(off_m).max() < 0.1001
+    for value_m in (-0.1, 0.0, 0.1):
+        share = np.isclose(off_m[:, 1:], value_m, atol=1e-3).mean()
+        assert 0.25 < share < 0.42
+
+
+def test_the_move_to_learn_makes_good_what_the_last_one_missed():
+    drives = metre_drives()
+
+    strays = stray(drives, noise_of(straight_moves(), 3))
+
+    missed_m = drives[1][:, :-1, 0] - strays.pose[:, :-1, 0]
+    wanted = 10 + np.rint(10 * missed_m)
+    np.testing.assert_array_equal(strays.label[:, 1:], wanted)
+    assert set(np.unique(strays.label[:, 1:])) == {9, 10, 11}
+    assert (strays.move != strays.label).any()
+
+
+@given(st.integers(0, 2**32), st.sampled_from([1, 2, 5, 31]))
+@settings(deadline=None, max_examples=25)
+def test_poses_follow_moves_and_labels_are_the_nearest_moves(seed, few):
+    codebook = straight_moves()
+    noise = noise_of(codebook, few)
+    kind, pose, move, moving = random_drives(codebook, seed)
+
+    strays = lead_astray(kind, pose, move, moving, noise, np.random.default_rng(seed))
+
+    for token in range(1, pose.shape[1]):
+        rows = np.flatnonzero(moving[:, token])
+        before, kinds = strays.pose[rows, token - 1], kind[rows]
+        ends = advance(before, kinds, strays.move[rows, token], codebook)
+        np.testing.assert_allclose(strays.pose[rows, token], ends, atol=1e-5)
+        best = nearest_moves(pose[rows, token], before, kinds, noise.table)
+        np.testing.assert_array_equal(strays.label[rows, token], best)
+
+
+@given(st.integers(0, 2**32))
+@settings(deadline=None, max_examples=25)
+def test_who_makes_no_move_is_where_it_should_be_and_starts_from_there(seed):
+    drives = _, pose, move, moving = random_drives(straight_moves(), seed)
+
+    strays = stray(drives, noise_of(straight_moves(), 5))
+
+    np.testing.assert_array_equal(strays.pose[~moving], pose[~moving])
+    np.testing.assert_array_equal(strays.move[~moving], move[~moving])
+    np.testing.assert_array_equal(strays.label[~moving], move[~moving])
+    assert not strays.off[~moving].any()
+    first = moving.copy()
+    first[:, 1:] &= ~moving[:, :-1]
+    np.testing.assert_array_equal(strays.label[first], move[first])
+
+
+@pytest.mark.parametrize(("moves", "share"), [(1, 1.0), (5, 0.0)])
+def test_without_a_choice_nothing_changes_to_the_last_bit(moves, share):
+    drives = random_drives(straight_moves(), 7)
+
+    strays = stray(drives, noise_of(straight_moves(), moves, share))
+
+    for found, logged in zip(strays, (drives[2], drives[1], drives[2]), strict=False):
+        assert found.tobytes() == logged.tobytes()
+    assert not strays.off.any()
+
+
+def test_only_a_share_of_the_moves_is_drawn():
+    drives = metre_drives(agents=200)
+
+    strays = stray(drives, noise_of(straight_moves(), 3, share=0.5))
+
+    drawn = (strays.move != strays.label)[:, 1:].mean()
+    assert 0.30 < drawn < 0.37  # Half of two in three: one in three is the nearest.
+
+
+def test_moves_that_end_far_off_are_not_taken():
+    # Moves of whole metres: all but the nearest end a metre off.
+    drives = metre_drives()
+    codebook = straight_moves(step_m=1.0, count=5)
+    drives[2][:, 1:] = 1
+    assert FARTHEST_M < 1
+
+    strays = stray(drives, noise_of(codebook, 3))
+
+    np.testing.assert_array_equal(strays.move, drives[2])
+
+
+def test_equal_draws_lead_equally_astray_and_others_otherwise():
+    drives, noise = metre_drives(), noise_of(straight_moves(), 5)
+
+    one, two, other = (stray(drives, noise, seed) for seed in (1, 1, 2))
+
+    assert all((a == b).all() for a, b in zip(one, two, strict=True))
+    assert (one.move != other.move).any()
+
+
+def test_nobody_is_led_nowhere():
+    strays = stray(metre_drives(agents=0), noise_of(straight_moves(), 5))
+
+    assert strays.move.shape == (0, 18)
+
+
+def test_settings_that_ask_for_no_noise_make_none(metre_moves, bent_roads):
+    assert make_noise(TrainSettings(), metre_moves, bent_roads) is None
+
+
+def test_road_tokens_are_drawn_from_the_nearest_shapes(metre_moves, bent_roads):
+    noise = make_noise(TrainSettings(noise_roads=3), metre_moves, bent_roads)
+
+    # Arcs that end 0, 5, 10, 20, 40 degrees to the left, then 5, 10, 20, 40 to the right.
+    near = [set(row) for row in noise.near_roads.tolist()]
+    assert near[0] == {0, 1, 5}
+    assert near[4] == {4, 3, 2}
+    np.testing.assert_array_equal(noise.near_roads[:, 0], np.arange(9))
+    assert noise.moves == 0
+
+
+def test_road_tokens_that_are_fixed_stay_and_others_become_what_is_near(
+    metre_moves, bent_roads
+):
+    noise = make_noise(TrainSettings(noise_roads=3), metre_moves, bent_roads)
+    random = np.random.default_rng(0)
+    token = random.integers(9, size=900).astype(np.int16)
+    fixed = random.random(900) < 0.3
+
+    drawn = exchange_roads(token, fixed, noise, random)
+
+    np.testing.assert_array_equal(drawn[fixed], token[fixed])
+    assert 0.25 < (drawn == token)[~fixed].mean() < 0.42
+    assert all(new in noise.near_roads[old] for old, new in zip(token, drawn, strict=True))
+
+
+def test_shapes_that_are_alike_stand_for_themselves_first(metre_moves):
+    curve_m = np.zeros((2, 11, 2), np.float32)
+    twins = RoadCodebook(curve_m, np.ones(2, bool))
+
+    noise = make_noise(TrainSettings(noise_roads=1), metre_moves, twins)
+
+    assert noise.near_roads.tolist() == [[0], [1]]
+
+
+@pytest.mark.parametrize("name", ["noise_moves", "noise_roads"])
+def test_more_tokens_than_the_codebook_has_are_refused(metre_moves, bent_roads, name):
+    with pytest.raises(ConfigError, match=rf"train\.{name} is 99; the codebook has"):
+        make_noise(TrainSettings(**{name: 99}), metre_moves, bent_roads)
+
+
+def test_agents_are_led_astray_in_one_way_only():
+    with pytest.raises(ConfigError, match="set one of them to 0"):
+        TrainSettings(noise_moves=5, closed_loop_top=32)
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1])
+def test_a_share_is_from_none_to_all(share):
+    with pytest.raises(ConfigError, match=r"train\.noise_share"):
+        TrainSettings(noise_share=share)
