@@ -1,7 +1,8 @@
 """Plain values, as YAML or the command line gave them, to settings of the right types."""
 
+import math
 import types
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import field, fields
 from difflib import get_close_matches
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -90,3 +91,23 @@ def coerce(value: Any, kind: Any, where: str) -> Any:
         return kind(number)
     except (TypeError, ValueError, OverflowError) as error:
         raise wrong from error
+
+
+def check_bounds(
+    settings: Any, stage: str, bounds: Iterable[tuple[str, int | float, int | float]]
+) -> None:
+    """Refuse numbers that are out of bounds.
+
+    Args:
+        settings: A settings' dataclass.
+        stage: What the settings are of, for the message.
+        bounds: Field, least and greatest value, infinity for none.
+
+    Raises:
+        ConfigError: naming the setting, its value and what was expected.
+    """
+    for name, least, most in bounds:
+        value = getattr(settings, name)
+        if not least <= value <= most:
+            wanted = f"{least:g} or more" if most == math.inf else f"{least:g} to {most:g}"
+            raise ConfigError(f"{stage}.{name} is {value}; expected {wanted}")

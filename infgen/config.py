@@ -4,12 +4,13 @@
 runs. A value that follows from others is a property, not a setting.
 """
 
+import math
 from dataclasses import dataclass
 
 from infgen.coerce import ConfigError as ConfigError
 from infgen.coerce import build as build
+from infgen.coerce import check_bounds, free
 from infgen.coerce import decisive as decisive
-from infgen.coerce import free
 from infgen.coerce import settle as settle
 from infgen.config_rollout import RolloutSettings as RolloutSettings
 from infgen.config_vocab import VocabSettings as VocabSettings
@@ -238,26 +239,23 @@ class TrainSettings:
             if value not in words:
                 expected = " or ".join(words)
                 raise ConfigError(f"train.{name} is {value!r}; expected {expected}")
-        for name, least in (
-            ("steps", 0),
-            ("batch_scenes", 1),
-            ("noise_moves", 0),
-            ("noise_roads", 0),
-            ("accumulate", 1),
-            ("bucket_batches", 1),
-            ("loader_workers", 0),
-            ("closed_loop_top", 0),
-        ):
-            value = getattr(self, name)
-            if value < least:
-                raise ConfigError(f"train.{name} is {value}; expected {least} or more")
+        bounds = (
+            ("steps", 0, math.inf),
+            ("batch_scenes", 1, math.inf),
+            ("noise_moves", 0, math.inf),
+            ("noise_roads", 0, math.inf),
+            ("noise_share", 0, 1),
+            ("accumulate", 1, math.inf),
+            ("bucket_batches", 1, math.inf),
+            ("loader_workers", 0, math.inf),
+            ("closed_loop_top", 0, math.inf),
+        )
+        check_bounds(self, "train", bounds)
         if self.closed_loop_top and self.noise_moves:
             raise ConfigError(
                 "train.closed_loop_top and train.noise_moves both lead agents off their "
                 "ways; set one of them to 0"
             )
-        if not 0 <= self.noise_share <= 1:
-            raise ConfigError(f"train.noise_share is {self.noise_share}; expected 0 to 1")
         if self.accumulate > self.batch_scenes:
             raise ConfigError(
                 f"train.accumulate is {self.accumulate}, more than the "

@@ -1,8 +1,9 @@
 """Settings of rollouts: what is played, how choices are sampled, and who may enter."""
 
+import math
 from dataclasses import dataclass
 
-from infgen.coerce import ConfigError
+from infgen.coerce import ConfigError, check_bounds
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,23 +140,20 @@ class RolloutSettings:
                 raise ConfigError(
                     f"rollout.{name} is {getattr(self, name)}; expected up to 1, above 0"
                 )
-        for name, least in (
-            ("count", 1),
-            ("scenes", 0),
-            ("scenes_per_task", 1),
-            ("batch", 1),
-            ("leave_radius_m", 0),
-            ("top_moves", 0),
-            ("top_cells", 0),
-            ("entry_lane_m", 0),
-            ("entry_tries", 1),
-            ("max_entries", 0),
-            ("max_agents", 1),
-        ):
-            if not getattr(self, name) >= least:
-                raise ConfigError(
-                    f"rollout.{name} is {getattr(self, name)}; expected {least} or more"
-                )
+        bounds = (
+            ("count", 1, math.inf),
+            ("scenes", 0, math.inf),
+            ("scenes_per_task", 1, math.inf),
+            ("batch", 1, math.inf),
+            ("leave_radius_m", 0, math.inf),
+            ("top_moves", 0, math.inf),
+            ("top_cells", 0, math.inf),
+            ("entry_lane_m", 0, math.inf),
+            ("entry_tries", 1, math.inf),
+            ("max_entries", 0, math.inf),
+            ("max_agents", 1, math.inf),
+        )
+        check_bounds(self, "rollout", bounds)
 
     @property
     def length_s(self) -> float:

@@ -1,8 +1,9 @@
 """Settings of the stage ``build-vocab``; a part of ``infgen.config``."""
 
+import math
 from dataclasses import dataclass
 
-from infgen.coerce import ConfigError
+from infgen.coerce import check_bounds
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,21 +51,17 @@ class VocabSettings:
         Raises:
             ConfigError: naming the setting.
         """
-        for name, least, most in (
+        bounds = (
             ("num_moves", 2, 2**15 - 1),
             ("num_roads", 1, 2**15 - 1),
             ("tolerance_m", 0.001, 2.0),
             ("road_tolerance_m", 0.0, 2.0),
-            ("segments_per_shard", 1, float("inf")),
-            ("segments_per_kind", 1, float("inf")),
+            ("segments_per_shard", 1, math.inf),
+            ("segments_per_kind", 1, math.inf),
             ("vehicle_max_speed_mps", 1.0, 100.0),
             ("cyclist_max_speed_mps", 1.0, 100.0),
             ("pedestrian_max_speed_mps", 1.0, 100.0),
             ("max_accel_mps2", 1.0, 1000.0),
             ("max_yaw_rate_rad_s", 0.1, 30.0),
-        ):
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise ConfigError(
-                    f"build-vocab.{name} is {value}; expected {least:g} to {most:g}"
-                )
+        )
+        check_bounds(self, "build-vocab", bounds)
