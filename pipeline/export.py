@@ -298,25 +298,26 @@ def _gpudrive_name(scenario_id: str, rollout: int) -> str:
     return f"tfrecord-{scenario_id}_{rollout:03d}.json"
 
 
-def _write_gpudrive(folder: Path, scene: Scene, rollouts: Sequence[Rollout]) -> None:
-    roads = gpudrive.map_text(scene)
-    for one in rollouts:
-        name = f"{one.scenario_id}_{one.index:03d}"
-        text = gpudrive.scene_text(one, scene, name, roads)
-        write_file(folder / _gpudrive_name(one.scenario_id, one.index), text.encode())
-
-
 def _scenarionet_name(scenario_id: str, rollout: int) -> str:
     """Name a file as ScenarioNet does, but for its ending."""
     return f"sd_{scenarionet.DATASET}_{scenario_id}_{rollout:03d}.json"
 
 
-def _write_scenarionet(folder: Path, scene: Scene, rollouts: Sequence[Rollout]) -> None:
-    roads = scenarionet.map_text(scene)
-    for one in rollouts:
-        name = f"{one.scenario_id}_{one.index:03d}"
-        text = scenarionet.scene_text(one, scene, name, roads)
-        write_file(folder / _scenarionet_name(one.scenario_id, one.index), text.encode())
+def _json_form(
+    file_name: Callable[[str, int], str],
+    map_text: Callable[[Scene], str],
+    scene_text: Callable[[Rollout, Scene, str, str], str],
+) -> Form:
+    """Write a file per rollout, the map made once for all of a scene."""
+
+    def write(folder: Path, scene: Scene, rollouts: Sequence[Rollout]) -> None:
+        roads = map_text(scene)
+        for one in rollouts:
+            name = f"{one.scenario_id}_{one.index:03d}"
+            text = scene_text(one, scene, name, roads)
+            write_file(folder / file_name(one.scenario_id, one.index), text.encode())
+
+    return Form(file_name, write)
 
 
 def _parquet_name(scenario_id: str, rollout: int) -> str:
@@ -336,8 +337,10 @@ def _write_parquet(folder: Path, scene: Scene, rollouts: Sequence[Rollout]) -> N
 
 
 _FOLDERS = {
-    "gpudrive": Form(_gpudrive_name, _write_gpudrive),
-    "scenarionet": Form(_scenarionet_name, _write_scenarionet),
+    "gpudrive": _json_form(_gpudrive_name, gpudrive.map_text, gpudrive.scene_text),
+    "scenarionet": _json_form(
+        _scenarionet_name, scenarionet.map_text, scenarionet.scene_text
+    ),
     "parquet": Form(_parquet_name, _write_parquet),
 }
 FORMATS = (WOSAC, *_FOLDERS)

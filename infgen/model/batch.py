@@ -10,7 +10,7 @@ A batch is a function of its records, their draws and the limits: nothing is ran
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float32, Int16, Int64, Integer
 from torch import Tensor
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.model.tensors import map_tensors
 from infgen.model.window import SceneWindow, cut_window, disturb
 from infgen.tokens.grid import Grid, encode_heading, make_grid, to_grid
 from infgen.tokens.noise import Noise, exchange_roads
@@ -231,12 +232,7 @@ def describe(
 
 def to_device(batch: T, device: torch.device) -> T:
     """Move every tensor of a batch, or of a part of one."""
-    if isinstance(batch, Tensor):
-        return batch.to(device)  # type: ignore[return-value]
-    if not is_dataclass(batch):
-        return batch
-    parts = {f.name: to_device(getattr(batch, f.name), device) for f in fields(batch)}
-    return replace(batch, **parts)  # type: ignore[type-var]
+    return map_tensors(batch, lambda x: x.to(device))
 
 
 _Arrays = dict[str, np.ndarray]

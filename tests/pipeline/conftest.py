@@ -3,11 +3,14 @@
 import os
 import sys
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import pytest
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.sources.towns import builtin_records
+from infgen.sources.womd import iter_scenes
 from infgen.tokens.codebook import MotionCodebook, RoadCodebook
 from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
@@ -33,6 +36,18 @@ params:
 profiles:
   short: {count: {longest: 3}}
 """
+
+
+@pytest.fixture(scope="session")
+def source():
+    """The smallest file of built-in records."""
+    return min(builtin_records(), key=lambda path: path.stat().st_size)
+
+
+@pytest.fixture(scope="session")
+def scenes(source):
+    """Its first three scenes."""
+    return list(islice(iter_scenes(source), 3))
 
 
 @dataclass

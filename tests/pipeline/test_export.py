@@ -19,8 +19,7 @@ from infgen.metrics.submission import read_submission
 from infgen.rollout.rollout import Rollout
 from infgen.scene import AgentKind, Scene
 from infgen.sources.tfrecord import iter_records
-from infgen.sources.towns import builtin_records
-from infgen.sources.womd import decode_scene, iter_scenes
+from infgen.sources.womd import decode_scene
 from infgen.sources.womd_write import encode_scenario, write_tfrecord
 from pipeline import ingest, rollout
 from pipeline.export import FORMATS, ExportError, Order, export
@@ -48,16 +47,6 @@ num_model_parameters: 11M
 
 def silent(done, total, note=""):
     pass
-
-
-@pytest.fixture(scope="module")
-def source():
-    return min(builtin_records(), key=lambda path: path.stat().st_size)
-
-
-@pytest.fixture(scope="module")
-def scenes(source):
-    return [scene for scene, _ in zip(iter_scenes(source), range(SCENES), strict=False)]
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,6 @@ from infgen.config import ConfigError, IngestSettings
 from infgen.metrics import wosac as metric
 from infgen.metrics.submission import Refused
 from infgen.rollout.rollout import Rollout
-from infgen.sources.towns import builtin_records
-from infgen.sources.womd import iter_scenes
 from pipeline import ingest, rollout
 from pipeline.stage import Unit
 from pipeline.store import write_records
@@ -34,16 +32,6 @@ GOLDEN_SET = "637f20cafde22ff8/test_submission"
 
 def silent(done, total, note=""):
     pass
-
-
-@pytest.fixture(scope="module")
-def source():
-    return min(builtin_records(), key=lambda path: path.stat().st_size)
-
-
-@pytest.fixture(scope="module")
-def scenes(source):
-    return [scene for scene, _ in zip(iter_scenes(source), range(SCENES), strict=False)]
 
 
 @pytest.fixture(scope="module")
