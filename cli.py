@@ -5,7 +5,6 @@ settings; 3 something is stale (``status --check``), or too many records were qu
 75 another run is at it; 130 and 143 stopped by SIGINT and SIGTERM.
 """
 
-import json
 import os
 import shutil
 import sys
@@ -13,30 +12,35 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from infgen.config import ConfigError
 from pipeline import lookup, ranks, stopping, tables
 from pipeline.doctor import examine
-from pipeline.events import Events
 from pipeline.folders import StoreError
 from pipeline.locks import LockedError
 from pipeline.manifest import verify as find_damage
 from pipeline.options import Asked, Building, Exporting, Running, Scoring, gathers
 from pipeline.plan import PlanError
-from pipeline.request import Request
 from pipeline.root import Root
-from pipeline.runner import Result
-from pipeline.runner import run as make
 from pipeline.screen import Screen, show_table
 from pipeline.settings import DEFAULT_FILE
-from pipeline.status import Standing, standings
 from pipeline.sweep import find_garbage
 from pipeline.sweep import sweep as remove_garbage
+from pipeline.verbs import (
+    FAILED,
+    LOCKED,
+    STALE,
+    WRONG,
+    find_standings,
+    print_json,
+    run_stages,
+    show_plan,
+    tell_standings,
+)
 
-FAILED, WRONG, STALE, LOCKED = 1, 2, 3, 75
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 WATCH_S = 2.0
 
@@ -68,7 +72,7 @@ def run(
 
     Example: infgen run report --root R --records '../data/*.tfrecord*' --profile small
     """
-    _run(asked.request(), stages or [], running, as_json=json_)
+    run_stages(asked.request(), stages or [], running, as_json=json_)
 
 
 @app.command()
@@ -84,13 +88,13 @@ def ingest(
 
     Example: infgen ingest '../data/*.tfrecord*' --root R --dask local:2
     """
-    _run(asked.request(files or ()), ["ingest"], running, as_json=json_)
+    run_stages(asked.request(files or ()), ["ingest"], running, as_json=json_)
 
 
 def _stage_verb(stage: str, what: str) -> None:
     @gathers(asked=Asked, running=Running)
     def verb(json_: Json = False, *, asked: Asked, running: Running) -> None:
-        _run(asked.request(), [stage], running, as_json=json_)
+        run_stages(asked.request(), [stage], running, as_json=json_)
 
     app.command(stage, help=f"{what}\n\nExample: infgen {stage} --root R")(verb)
 
@@ -111,7 +115,7 @@ def plan(json_: Json = False, *, asked: Asked, running: Running) -> None:
 
     Example: infgen plan --root R -s tokenize.max_gap_s=2
     """
-    _dry(asked.request(), [], running, as_json=json_)
+    show_plan(asked.request(), [], running, as_json=json_)
 
 
 @app.command()
@@ -132,8 +136,8 @@ def status(
     """
     request = asked.request()
     while True:
-        found = _standings(request, [], strict_code=strict_code)
-        _tell_standings(found, as_json=json_)
+        found = find_standings(request, [], strict_code=strict_code)
+        tell_standings(found, as_json=json_)
         if not watch:
             break
         time.sleep(WATCH_S)
@@ -168,7 +172,7 @@ def gc(
     """
     garbage = (remove_garbage if yes else find_garbage)(Root(root.absolute()))
     if json_:
-        _print_json({"removed": yes, "garbage": [asdict(each) for each in garbage]})
+        print_json({"removed": yes, "garbage": [asdict(each) for each in garbage]})
         return
     tables.show_garbage(garbage, removed=yes)
 
@@ -187,7 +191,7 @@ def verify(
     """
     damage = list(find_damage(Root(root.absolute()), full=full))
     if json_:
-        _print_json({"damage": damage})
+        print_json({"damage": damage})
     else:
         typer.echo("\n".join(damage) if damage else "all files are as their manifests say")
     if damage:
@@ -200,7 +204,7 @@ def show(key: Key, root: RootFolder = WORK) -> None:
 
     Example: infgen show tokenize --root R
     """
-    _print_json(lookup.describe(lookup.find(Root(root.absolute()), key)))
+    print_json(lookup.describe(lookup.find(Root(root.absolute()), key)))
 
 
 @app.command()
@@ -212,7 +216,7 @@ def diff(one: Key, other: Key, root: RootFolder = WORK, json_: Json = False) -> 
     folders = [lookup.find(Root(root.absolute()), key) for key in (one, other)]
     found = list(lookup.differences(*folders))
     if json_:
-        _print_json({"differences": [list(each) for each in found]})
+        print_json({"differences": [list(each) for each in found]})
     else:
         show_table(f"{len(found)} differences", ("what", one, other), found)
 
@@ -237,7 +241,7 @@ def doctor(root: RootFolder = WORK, json_: Json = False) -> None:
     """
     checks = list(examine(Root(root.absolute())))
     if json_:
-        _print_json({"checks": [asdict(check) for check in checks]})
+        print_json({"checks": [asdict(check) for check in checks]})
     else:
         tables.show_checks(checks)
     if any(check.state == "bad" for check in checks):
@@ -250,7 +254,7 @@ def demo(root: RootFolder = WORK / "demo", json_: Json = False) -> None:
 
     Example: infgen demo
     """
-    _run(Asked(root=root, profile="demo").request(), [], Running(), as_json=json_)
+    run_stages(Asked(root=root, profile="demo").request(), [], Running(), as_json=json_)
 
 
 @app.command()
@@ -274,7 +278,7 @@ def wosac(json_: Json = False, *, scoring: Scoring) -> None:
     with stopping.listening(), Screen() as screen:
         found = scoring.official(screen)
     if json_:
-        _print_json(found.to_json())
+        print_json(found.to_json())
     else:
         tables.show_official(found, per_scene=scoring.per_scene)
     if found.refused:
@@ -296,73 +300,9 @@ def export(json_: Json = False, *, exporting: Exporting) -> None:
     with stopping.listening(), Screen() as screen:
         found = exporting.write(screen)
     if json_:
-        _print_json(found.to_json())
+        print_json(found.to_json())
     else:
         tables.show_exported(found)
-
-
-def _run(
-    request: Request, targets: Sequence[str], running: Running, *, as_json: bool
-) -> None:
-    """Run, show what became of it, and leave with the exit code that says so."""
-    if running.dry_run:
-        _dry(request, targets, running, as_json=as_json)
-        return
-    plan = request.plan(targets, os.environ)
-    orders = running.orders(targets, plan)
-    request.remember(plan)
-    with stopping.listening(), Screen() as screen:
-        events = Events(request.root, (screen,))
-        results = make(plan, orders, events)
-    if as_json:
-        log = str(events.log)
-        _print_json({"stages": [asdict(each) for each in results], "log": log})
-    else:
-        tables.show_results(request.root, results, events.log)
-    if any(result.errors for result in results):
-        raise typer.Exit(FAILED)
-    _check_quarantine(request, results, running.max_bad)
-
-
-def _dry(
-    request: Request, targets: Sequence[str], running: Running, *, as_json: bool
-) -> None:
-    found = _standings(request, targets, strict_code=running.strict_code)
-    _tell_standings(found, as_json=as_json)
-
-
-def _tell_standings(found: Sequence[Standing], *, as_json: bool) -> None:
-    if as_json:
-        _print_json({"stages": [asdict(standing) for standing in found]})
-    else:
-        tables.show_standings(found)
-
-
-def _standings(
-    request: Request, targets: Sequence[str], *, strict_code: bool
-) -> list[Standing]:
-    plan = request.plan(targets, os.environ)
-    return standings(plan, request.made(), strict_code=strict_code)
-
-
-def _check_quarantine(request: Request, results: Sequence[Result], max_bad: float) -> None:
-    for result in results:
-        bad, good = result.report.get("quarantined", 0), result.report.get("scenes", 0)
-        if result.stage != "ingest" or not bad:
-            continue
-        share = bad / (bad + good)
-        where = request.root.folder("ingest", result.key) / "quarantine.parquet"
-        typer.echo(
-            f"{bad} of {bad + good} records ({share:.2%}) are quarantined: {where}",
-            err=True,
-        )
-        if share > max_bad:
-            typer.echo(f"that is more than --max-bad {max_bad:g}", err=True)
-            raise typer.Exit(STALE)
-
-
-def _print_json(value: Any) -> None:
-    typer.echo(json.dumps(value, indent=1, default=str))
 
 
 def _exit_code(error: BaseException) -> int:
