@@ -13,25 +13,26 @@ of large matrices in the same process. On a GPU seconds are the clock's.
 
 import argparse
 import json
-import resource
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 from made_codebooks import made_codebooks
-from records import SHARED, read_split
-from torch import Tensor
+from measuring import (
+    SIZES,
+    in_own_process,
+    peak_flops,
+    peak_mib,
+    read_scene,
+    seconds,
+)
 from torch.utils.flop_counter import FlopCounterMode
 
-from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.config import TokenSettings, TrainSettings
 from infgen.model.batch import Batch, Limits, collate, to_device
 from infgen.model.network import Network
-from infgen.scene import Scene
-from infgen.sources.womd import iter_scenes
 from infgen.tokens.tokenizer import tokenize_scene
 from pipeline.checkpoint import Training
 from pipeline.course import repeatable
@@ -39,18 +40,9 @@ from pipeline.descent import Descent
 from pipeline.distributed import Team
 from pipeline.screen import show_table
 
-SCENE = "637f20cafde22ff8"
-RECORD = SHARED.parents[1] / "golden" / "wosac" / SCENE / "scenario.tfrecord"
-SIZES = {
-    "paper": ModelSettings(),
-    "small": ModelSettings(
-        width=48, heads=4, map_blocks=1, motion_blocks=2, scene_blocks=1, fourier_bands=16
-    ),
-}
 FEW_NEIGHBOURS = 5
 """Map tokens per agent that the public reference sees."""
 STEPS = 3
-PEAK_SIDE = 2048
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,13 +64,6 @@ class Case:
     threads: int
 
 
-def read_scene() -> Scene:
-    """Read the scene that figures are about, or the largest built-in one."""
-    if RECORD.is_file():
-        return next(s for s in iter_scenes(RECORD) if isinstance(s, Scene))
-    return max(read_split("training"), key=lambda scene: len(scene.tracks.id))
-
-
 def prepare(case: Case) -> tuple[Descent, Batch, Training]:
     """Make the network, its optimiser, and a batch of one scene several times."""
     model = SIZES[case.size]
@@ -98,41 +83,6 @@ def prepare(case: Case) -> tuple[Descent, Batch, Training]:
     return descent, to_device(batch, device), training
 
 
-def used_s(device: str) -> float:
-    """Seconds used so far: of the processor, or of the clock for a GPU."""
-    if device != "cpu":
-        torch.cuda.synchronize()
-        return time.perf_counter()
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
-
-
-def seconds(work: Callable[[], object], times: int, device: str) -> float:
-    """Mean seconds that a call uses."""
-    start = used_s(device)
-    for _ in range(times):
-        work()
-    return (used_s(device) - start) / times
-
-
-def peak_flops(device: str) -> float:
-    """Operations a second (of the clock) of a product of large matrices."""
-    low = device != "cpu" and torch.cuda.is_bf16_supported()
-    kind = torch.bfloat16 if low else torch.float32
-    one = torch.randn(PEAK_SIDE, PEAK_SIDE, device=device, dtype=kind)
-    other, best = one.clone(), 0.0
-
-    def product() -> Tensor:
-        return one @ other
-
-    product()
-    for _ in range(5):
-        start = time.perf_counter()
-        seconds(product, 4, device)
-        best = max(best, 4 * 2 * PEAK_SIDE**3 / (time.perf_counter() - start))
-    return best
-
-
 def measure(case: Case) -> dict[str, float]:
     """Measure one row, in this process."""
     torch.set_num_threads(case.threads)
@@ -143,9 +93,6 @@ def measure(case: Case) -> dict[str, float]:
         start = time.perf_counter()
         used = seconds(lambda: descent.step([batch], range(1), 1), STEPS, case.device)
         passed_s = (time.perf_counter() - start) / STEPS
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    if case.device != "cpu":
-        memory = torch.cuda.max_memory_allocated() / 2**20
     flops = float(counter.get_total_flops())
     return {
         "agents": float(batch.agents.visible.sum()) / case.scenes,
@@ -153,18 +100,10 @@ def measure(case: Case) -> dict[str, float]:
         "parameters": float(sum(p.numel() for p in training.network.parameters())),
         "used_s_per_scene": used / case.scenes,
         "clock_s_per_scene": passed_s / case.scenes,
-        "peak_rss_mib": memory,
+        "peak_rss_mib": peak_mib(case.device),
         "gflop_per_scene": flops / case.scenes / 1e9,
         "flops_over_peak": flops / passed_s / peak_flops(case.device),
     }
-
-
-def in_own_process(case: Case) -> dict[str, float]:
-    """Measure one row in a fresh process."""
-    command = [sys.executable, str(Path(__file__)), "--case", json.dumps(asdict(case))]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
-    return found
 
 
 def report(size: str, device: str, threads: int) -> None:
@@ -176,7 +115,9 @@ def report(size: str, device: str, threads: int) -> None:
             size, 1, FEW_NEIGHBOURS, device, threads
         ),
     }
-    found = {name: in_own_process(case) for name, case in cases.items()}
+    found = {
+        name: in_own_process(Path(__file__), asdict(case)) for name, case in cases.items()
+    }
     first = next(iter(found.values()))
     used = "CPU-s" if device == "cpu" else "s"
     show_table(

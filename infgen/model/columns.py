@@ -3,7 +3,7 @@
 Dims as in ``steps``. What a network has no head for is None in its answers.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
@@ -38,6 +38,10 @@ class Column:
         """Who can be seen: who is observed, or just entering."""
         return self.observed | (self.presence == Presence.ENTERING)
 
+    def take(self, rollouts: Int64[Tensor, " kept"]) -> "Column":
+        """Go on with some rollouts only."""
+        return Column(*(getattr(self, each.name)[rollouts] for each in fields(self)))
+
 
 @dataclass(frozen=True, slots=True)
 class MotionStep:
@@ -67,6 +71,15 @@ class EntryQuery:
     add_logit: Float32[Tensor, " rollout"]
     cell_logits: Float32[Tensor, "rollout cell"] | None
     place_m: Float32[Tensor, "rollout 2"] | None
+
+    def take(self, rollouts: Int64[Tensor, " kept"]) -> "EntryQuery":
+        """Go on with some rollouts only."""
+        cell, place = self.cell_logits, self.place_m
+        return EntryQuery(
+            self.add_logit[rollouts],
+            None if cell is None else cell[rollouts],
+            None if place is None else place[rollouts],
+        )
 
 
 @dataclass(frozen=True, slots=True)

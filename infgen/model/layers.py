@@ -132,6 +132,11 @@ class Seen:
         index = torch.arange(count, device=present.device).view(features_NKD.shape[:2])
         return cls(features_NKD.flatten(0, 1), index, relation, present)
 
+    def take(self, targets: Tensor) -> "Seen":
+        """Go on with some targets only; gradients end here."""
+        relation = Shared.of(self.relation.values[targets])
+        return Seen(self.features, self.index[targets], relation, self.present[targets])
+
 
 class Attention(nn.Module):
     """Let targets look at their neighbours; gated update and feed-forward (SPEC 4.1).
@@ -190,7 +195,9 @@ class Attention(nn.Module):
         query = self.query(normal_NSD).view(*heads, width // self.heads)
         source, relation = self._folded()
         query = query * query.shape[-1] ** -0.5
-        hidden = (~seen.present)[:, :, None].expand(*heads, -1).flatten(1, 2)
+        hidden = ~seen.present
+        if slots > 1:
+            hidden = hidden[:, :, None].expand(*heads, -1).flatten(1, 2)
         looked = look_at_pairs(
             _per_head(query, source[0]),
             _per_head(query, relation[0]),
@@ -198,7 +205,7 @@ class Attention(nn.Module):
             seen.index,
             seen.relation,
             hidden,
-            self._kept(hidden),
+            self._kept(query.flatten(1, 2), hidden.shape[-1]),
         )
         from_source = looked.features.view(*heads, width)
         from_relation = looked.relation.view(*heads, width)
@@ -207,10 +214,11 @@ class Attention(nn.Module):
         bias = self._value_bias().view(self.heads, -1)  # [H, C]
         return (value + looked.weight.view(*heads, 1) * bias).flatten(2)
 
-    def _kept(self, like: Tensor) -> Tensor | None:
+    def _kept(self, query_NQC: Tensor, neighbours: int) -> Tensor | None:
         """Factors of dropout on the weights of pairs, if there is any."""
         if not (self.training and self.dropout):
             return None
+        like = query_NQC.new_empty((*query_NQC.shape[:2], neighbours))
         return dropout_factors(like, self.dropout)
 
     def source_norm(self) -> nn.LayerNorm:

@@ -99,7 +99,7 @@ def look_at_pairs(
         features: Of all sources [M, D].
         index: Row of each neighbour among them [N, K].
         relation: Of the neighbours [N, K, D].
-        hidden: Which neighbours there are not [N, Q, K].
+        hidden: Which neighbours there are not [N, Q, K], or [N, 1, K] for all queries.
         kept: Factor on each weight for dropout [N, Q, K], or None.
     """
     kind = by_features.dtype  # The queries' own: low precision under autocast.
@@ -108,6 +108,27 @@ def look_at_pairs(
     pairs = (by_features, by_relation, features.to(kind), index, *shared, hidden, kept)
     with torch.autocast(by_features.device.type, enabled=False):
         return Looked(*_Pairs.apply(*pairs))  # type: ignore[no-untyped-call]
+
+
+@dataclass(frozen=True, slots=True)
+class _Cover:
+    """What hides neighbours from queries: added to scores, and what is left of weights."""
+
+    score: Tensor
+    blind: Tensor | None
+
+    @classmethod
+    def of(cls, hidden: Tensor, like: Tensor) -> "_Cover":
+        score = like.new_zeros(hidden.shape).masked_fill_(hidden, HIDDEN_SCORE)
+        blind = hidden.all(dim=-1, keepdim=True)
+        # Looking whether anybody is blind saves a pass, but would make a GPU wait.
+        needed = blind.device.type != "cpu" or bool(blind.any())
+        return cls(score, blind if needed else None)
+
+    def weigh(self, score: Tensor, part: slice) -> Tensor:
+        """Turn scores into weights: who sees nobody has no weights at all."""
+        weight = score.softmax(dim=-1)
+        return weight if self.blind is None else weight.masked_fill_(self.blind[part], 0.0)
 
 
 class _Pairs(torch.autograd.Function):
@@ -124,15 +145,20 @@ class _Pairs(torch.autograd.Function):
         hidden: Tensor,
         kept: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        weight = by_features.new_empty(hidden.shape)
-        total = by_features.new_empty(hidden.shape[:2])
+        shape = (*by_features.shape[:2], index.shape[1])
+        learns = any(ctx.needs_input_grad)
+        weight = by_features.new_empty(shape if learns else (0, *shape[1:]))
+        total = by_features.new_empty(shape[:2])
         saw, related = torch.empty_like(by_features), torch.empty_like(by_features)
+        cover = _Cover.of(hidden, by_features)
         for part, near in _parts(features, index):
-            score = torch.bmm(by_features[part], near.transpose(1, 2))
+            score = torch.baddbmm(
+                cover.score[part], by_features[part], near.transpose(1, 2)
+            )
             score.baddbmm_(by_relation[part], relation[part].transpose(1, 2))
-            score.masked_fill_(hidden[part], HIDDEN_SCORE)
-            used = score.softmax(dim=-1).masked_fill_(hidden[part], 0.0)
-            weight[part] = used
+            used = cover.weigh(score, part)
+            if learns:
+                weight[part] = used
             used = used if kept is None else used.mul_(kept[part])
             torch.bmm(used, near, out=saw[part])
             torch.bmm(used, relation[part], out=related[part])

@@ -70,23 +70,18 @@ class Memory:
         place = (self.columns - 1) % self.window
         return self.pose[:, :, place], self.visible[:, :, place]
 
-    def keep(self, rollouts: Tensor) -> "Memory":
-        """Go on with some rollouts only, given by their numbers."""
-        return replace(
-            self,
-            scene=self.scene[rollouts],
-            pose=self.pose[rollouts],
-            visible=self.visible[rollouts],
-            features=self.features[:, rollouts],
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class Entries:
     """One half second as the entry stage sees it.
 
     Attributes:
-        memory: The past it follows.
+        token: The half second.
+        rollout: Rollouts that still ask for newcomers, by their place in the batch.
+        map: Encoded maps.
+        scene: Map of each of those rollouts.
+        before: Poses [rollout, row, 3] half a second earlier ...
+        known: ... and who was seen then [rollout, row].
         column: The agents so far.
         raw: Normed embeddings of all rows, zero where nobody is [rollout, row, D].
         relation: How all rows stand to the ego [rollout, row, D].
@@ -94,12 +89,32 @@ class Entries:
         roads: Road tokens around the ego.
     """
 
-    memory: Memory
+    token: int
+    rollout: Tensor
+    map: RoadFeatures
+    scene: Tensor
+    before: Tensor
+    known: Tensor
     column: Column
     raw: Tensor
     relation: Tensor
     within: Tensor
     roads: Seen
+
+    def take(self, places: Int64[Tensor, " kept"]) -> "Entries":
+        """Go on with some of the rollouts only: nothing more is computed for the others."""
+        return replace(
+            self,
+            rollout=self.rollout[places],
+            scene=self.scene[places],
+            before=self.before[places],
+            known=self.known[places],
+            column=self.column.take(places),
+            raw=self.raw[places],
+            relation=self.relation[places],
+            within=self.within[places],
+            roads=self.roads.take(places),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +196,7 @@ class Stepper:
         visible = column.visible
         rows = Rows.where(visible)
         memory.visible &= (column.presence != Presence.ENTERING)[..., None]
-        x = self._embed(memory, column, rows)
+        x = self._embed(*memory.last(), column, rows)
         sight = self._sight(memory, column, rows)
         place = memory.columns % memory.window
         for block, past in zip(motion.blocks, memory.features, strict=True):
@@ -221,7 +236,20 @@ class Stepper:
         nobody = replace(
             column, presence=torch.zeros_like(column.presence), observed=within
         )
-        empty = Entries(memory, nobody, raw, torch.zeros_like(raw), within, roads)
+        before, known = memory.last()
+        empty = Entries(
+            token=memory.columns,
+            rollout=each,
+            map=memory.roads,
+            scene=memory.scene,
+            before=before,
+            known=known,
+            column=nobody,
+            raw=raw,
+            relation=torch.zeros_like(raw),
+            within=within,
+            roads=roads,
+        )
         return self.entry_add(empty, column)
 
     @torch.no_grad()
@@ -229,7 +257,8 @@ class Stepper:
         """Go on with newcomers as further visible rows of the same column."""
         fresh = Rows.where(column.visible & ~entries.column.visible)
         came = fresh.spread(torch.ones(len(fresh.at), device=fresh.at.device)) > 0
-        raw = fresh.spread(normed(self._embed(entries.memory, column, fresh)))
+        embedded = self._embed(entries.before, entries.known, column, fresh)
+        raw = fresh.spread(normed(embedded))
         ego_pose = column.pose[:, EGO, None].expand_as(column.pose)
         described = relations(fresh.pack(ego_pose), fresh.pack(column.pose)[:, None])
         reach = self._asked().cell_agents
@@ -270,7 +299,7 @@ class Stepper:
             place_m: Where in them, in the ego's grid frame; their centres if None.
         """
         asking, column = self._asked(), entries.column
-        details, memory = asking.details, entries.memory
+        details = asking.details
         place_m = details.centre_m[cell] if place_m is None else place_m
         pose = cell_pose(column.pose[:, EGO], place_m)[:, None]
         each = torch.arange(len(cell), device=cell.device)
@@ -284,7 +313,7 @@ class Stepper:
             source.view_as(column.presence),
             column.visible[:, None],
         )
-        roads = see_roads(asking.detail_roads, rows, pose, memory.roads, memory.scene)
+        roads = see_roads(asking.detail_roads, rows, pose, entries.map, entries.scene)
         x = details(cell, roads, around.seen(entries.raw.flatten(0, 1)))
         kinds = torch.arange(details.given_kind.num_embeddings, device=cell.device)
         said = details.answer(rows, x[:, None], kinds)
@@ -304,9 +333,8 @@ class Stepper:
             )
         return self._asking
 
-    def _embed(self, memory: Memory, column: Column, rows: Rows) -> Tensor:
-        """Embed some rows of a column that follows the memory's last."""
-        before, known = memory.last()
+    def _embed(self, before: Tensor, known: Tensor, column: Column, rows: Rows) -> Tensor:
+        """Embed some rows of a column, given where who was known to be before it."""
         agents = AgentRows(
             kind=rows.pack(column.kind),
             size_lwh_m=rows.pack(column.size_lwh_m),

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from infgen.model.columns import EntryDetails, EntryQuery
@@ -39,100 +39,138 @@ class Asking:
     streams: Sequence[Stream]
     room: Room | None
 
-    def tries(self, token: int, turn: int) -> list[Luck]:
-        """Random numbers of a newcomer of each rollout, try by try."""
-        count = 1 if self.room is None else self.player.settings.entry_tries
+    @property
+    def tries(self) -> int:
+        """How often a newcomer may be asked for."""
+        return 1 if self.room is None else self.player.settings.entry_tries
 
-        def of_try(at: int) -> Luck:
-            # A longer draw starts with the shorter one: the first try is always the same.
-            return lambda purpose: self.player.luck(
-                self.streams, token, purpose, at + 1, turn
-            )[:, at]
+    def luck(self, token: int, turn: int, attempt: int = 0) -> Luck:
+        """Random numbers of a newcomer of each rollout."""
+        # A longer draw starts with the shorter one: the first try is always the same.
+        return lambda purpose: self.player.luck(
+            self.streams, token, purpose, attempt + 1, turn
+        )[:, attempt]
 
-        return [of_try(at) for at in range(count)]
+    def take(self, places: Int64[np.ndarray, " kept"]) -> "Asking":
+        """Go on with some rollouts only."""
+        room = None if self.room is None else self.room.take(places)
+        return replace(self, streams=[self.streams[at] for at in places], room=room)
+
+
+@dataclass(frozen=True, slots=True)
+class _Party:
+    """Rollouts that still ask for newcomers; the others cost nothing more.
+
+    Attributes:
+        asking: Whom they ask.
+        entries: The half second, as the network sees it.
+        population: Everyone in them, newcomers so far among them.
+        rollout: Their places in the batch.
+    """
+
+    asking: Asking
+    entries: Entries
+    population: Population
+    rollout: Int64[np.ndarray, " rollout"]
+
+    def __len__(self) -> int:
+        return len(self.rollout)
+
+    def take(self, which: Bool[np.ndarray, " rollout"]) -> "_Party":
+        """Go on with some of them."""
+        if which.all():
+            return self
+        places = np.flatnonzero(which)
+        return _Party(
+            asking=self.asking.take(places),
+            entries=self.entries.take(self.asking.player.tensor(places)),
+            population=self.population.take(places),
+            rollout=self.rollout[places],
+        )
+
+    def enter(self, newcomers: Newcomers) -> "_Party":
+        """Let the newcomers in, where the others and the network see them."""
+        player, (population, _) = self.asking.player, enter(self.population, newcomers)
+        entries = player.stepper.entry_add(self.entries, player.column(population))
+        return replace(self, entries=entries, population=population)
 
 
 def add_newcomers(
     asking: Asking, memory: Memory, population: Population, token: int
 ) -> Population:
     """Let newcomers enter every rollout until the network says that motion begins."""
-    player = asking.player
+    player, everyone = asking.player, np.arange(len(asking.streams))
     entries = player.stepper.entry_begin(memory, player.column(population))
-    going_on = np.ones(len(asking.streams), dtype=bool)
+    party = _Party(asking, entries, population, everyone)
     for turn in range(player.settings.max_entries):
-        newcomers = _next_newcomers(asking, entries, population, token, turn, going_on)
-        going_on = newcomers.who & (population.life == NOBODY).any(axis=1)
-        if not going_on.any():
+        party, newcomers = _next_newcomers(party, token, turn)
+        if newcomers is None:
             break
-        population, _ = enter(population, newcomers)
-        entries = player.stepper.entry_add(entries, player.column(population))
+        party = party.enter(newcomers)
+        population = population.put(party.rollout, party.population)
     return population
 
 
 def _next_newcomers(
-    asking: Asking,
-    entries: Entries,
-    population: Population,
-    token: int,
-    turn: int,
-    going_on: Bool[np.ndarray, " rollout"],
-) -> Newcomers:
-    """Ask every rollout that still goes on for its next newcomer.
+    party: _Party, token: int, turn: int
+) -> tuple[_Party, Newcomers | None]:
+    """Ask every rollout of a party for its next newcomer, if it has room for one.
+
+    Returns:
+        Those who have one, and the newcomers; None if there are none.
+    """
+    player, luck = party.asking.player, party.asking.luck(token, turn)
+    query = player.stepper.entry_query(party.entries)
+    add = happens(query.add_logit, luck(Purpose.ADD), player.settings.add_bias)
+    wanted = add.cpu().numpy() & (party.population.life == NOBODY).any(axis=1)
+    party, query = party.take(wanted), query.take(player.tensor(np.flatnonzero(wanted)))
+    found = _find_places(party, query, token, turn) if len(party) else None
+    if found is None or not found.who.any():
+        return party, None
+    return party.take(found.who), found.take(np.flatnonzero(found.who))
+
+
+def _find_places(party: _Party, query: EntryQuery, token: int, turn: int) -> Newcomers:
+    """Sample a newcomer of every rollout, and whether there is a place for it.
 
     Who may not stand where it is to enter is asked for again, in another cell: the choice
     is that of the network, given that it is allowed. After some tries there is none.
     """
-    player, room = asking.player, asking.room
-    query = player.stepper.entry_query(entries)
-    tries = asking.tries(token, turn)
-    add = happens(query.add_logit, tries[0](Purpose.ADD), player.settings.add_bias)
-    wanted = add.cpu().numpy() & going_on
-    taken = _taken(population.cells(player.grid), player.grid.num_cells)
-    chosen = None
-    for luck in tries:
-        found, cell = _describe(player, entries, query, taken, luck)
-        allowed = wanted.copy()
-        if room is not None and wanted.any():
-            allowed &= room.allows(population, found)
-        chosen = _merge(chosen, replace(found, who=allowed))
-        wanted &= ~allowed
-        if not wanted.any():
+    player, found = party.asking.player, None
+    taken = _taken(party.population.cells(player.grid), player.grid.num_cells)
+    left = np.ones(len(party), dtype=bool)
+    for attempt in range(party.asking.tries):
+        asked, places = party.take(left), np.flatnonzero(left)
+        newcomers, cell = _describe(
+            asked,
+            query.take(player.tensor(places)),
+            taken[places],
+            asked.asking.luck(token, turn, attempt),
+        )
+        room = asked.asking.room
+        if room is not None:
+            newcomers = replace(newcomers, who=room.allows(asked.population, newcomers))
+        found = newcomers if found is None else found.put(places, newcomers)
+        taken[places, cell] = True
+        left = ~found.who
+        if not left.any():
             break
-        taken[wanted, cell[wanted]] = True
-    assert chosen is not None
-    return chosen
-
-
-def _merge(chosen: Newcomers | None, more: Newcomers) -> Newcomers:
-    """Add the newcomers of further rollouts to those chosen so far."""
-    if chosen is None:
-        return more
-
-    def either(mine: np.ndarray, new: np.ndarray) -> np.ndarray:
-        who = more.who.reshape(-1, *(1,) * (new.ndim - 1))
-        return np.where(who, new, mine)
-
-    return Newcomers(
-        who=chosen.who | more.who,
-        place_m=either(chosen.place_m, more.place_m),
-        turned_rad=either(chosen.turned_rad, more.turned_rad),
-        kind=either(chosen.kind, more.kind),
-        size_lwh_m=either(chosen.size_lwh_m, more.size_lwh_m),
-    )
+    assert found is not None
+    return found
 
 
 def _describe(
-    player: Player,
-    entries: Entries,
+    party: _Party,
     query: EntryQuery,
     taken: Bool[np.ndarray, "rollout cell"],
     luck: Luck,
 ) -> tuple[Newcomers, np.ndarray]:
-    """Sample who enters every rollout if anyone does, and its cell [rollout]."""
+    """Sample who enters every rollout, and its cell [rollout]."""
+    player = party.asking.player
     cell, place_m = _place(player, query, taken, luck)
     asked_at = None if query.cell_logits is not None else player.tensor(place_m)
     details = player.stepper.entry_details(
-        entries, player.tensor(cell.astype(np.int64)), asked_at
+        party.entries, player.tensor(cell.astype(np.int64)), asked_at
     )
     kind = choose(details.kind_logits, luck(Purpose.KIND))
     if details.offset_m is not None:

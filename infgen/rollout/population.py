@@ -6,7 +6,8 @@ the next newcomer. Row 0 is always the ego. Plain arrays; the network sees them 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int16, Int32, Int64
@@ -50,6 +51,16 @@ class Population:
         cell = encode_cell(to_grid(self.pose[..., :2], ego_pose), grid)
         return np.where(self.presence == Presence.ABSENT, np.int16(NO_CELL), cell)
 
+    def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "Population":
+        """Take some rollouts."""
+        return _take(self, rollouts)
+
+    def put(
+        self, rollouts: Int64[np.ndarray, " kept"], others: "Population"
+    ) -> "Population":
+        """Put others in the place of some rollouts. Inverse of ``take``."""
+        return _put(self, rollouts, others)
+
 
 @dataclass(frozen=True, slots=True)
 class Newcomers:
@@ -68,6 +79,30 @@ class Newcomers:
     turned_rad: Float32[np.ndarray, " rollout"]
     kind: Int8[np.ndarray, " rollout"]
     size_lwh_m: Float32[np.ndarray, "rollout 3"]
+
+    def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "Newcomers":
+        """Take some rollouts."""
+        return _take(self, rollouts)
+
+    def put(self, rollouts: Int64[np.ndarray, " kept"], others: "Newcomers") -> "Newcomers":
+        """Put others in the place of those of some rollouts. Inverse of ``take``."""
+        return _put(self, rollouts, others)
+
+
+R = TypeVar("R", Population, Newcomers)
+
+
+def _take(record: R, rollouts: np.ndarray) -> R:
+    return replace(
+        record, **{f.name: getattr(record, f.name)[rollouts] for f in fields(record)}
+    )
+
+
+def _put(record: R, rollouts: np.ndarray, others: R) -> R:
+    changed = {f.name: getattr(record, f.name).copy() for f in fields(record)}
+    for name, values in changed.items():
+        values[rollouts] = getattr(others, name)
+    return replace(record, **changed)
 
 
 def settle(starts: Sequence[Start], min_rows: int) -> list[Population]:
@@ -200,16 +235,8 @@ def enter(
     rollout = np.flatnonzero(fits)
     row = free.argmax(axis=1)[rollout]
 
-    new = Population(
-        life=population.life.copy(),
-        born=population.born + fits.astype(np.int32),
-        kind=population.kind.copy(),
-        size_lwh_m=population.size_lwh_m.copy(),
-        pose=population.pose.copy(),
-        move=population.move.copy(),
-        presence=population.presence.copy(),
-        observed=population.observed.copy(),
-    )
+    new = population.take(np.arange(len(fits)))  # A copy.
+    new.born[fits] += 1
     new.life[rollout, row] = population.born[rollout]
     new.kind[rollout, row] = newcomers.kind[rollout]
     new.size_lwh_m[rollout, row] = newcomers.size_lwh_m[rollout]

@@ -4,7 +4,7 @@ Pedestrians may stand on pedestrians: groups walk closer together than their box
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
@@ -35,6 +35,10 @@ class Room:
     along_m: Float32[np.ndarray, "scene lane 2"]
     scene: Int64[np.ndarray, " rollout"]
     lane_m: float
+
+    def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "Room":
+        """Go on with some rollouts only."""
+        return replace(self, scene=self.scene[rollouts])
 
     def allows(
         self, population: Population, newcomers: Newcomers

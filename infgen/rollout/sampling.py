@@ -27,8 +27,8 @@ def choose(
     """
     count = logits.shape[-1]
     keep = min(top, count) if top else count
-    best, index = (logits.double() / temperature).topk(keep, dim=-1)
-    share = best.softmax(dim=-1)
+    best, index = logits.topk(keep, dim=-1)
+    share = (best.double() / temperature).softmax(dim=-1)
     reached = share.cumsum(dim=-1)
     likely = share > 0
     if nucleus < 1:

@@ -147,7 +147,7 @@ class Session:
     ) -> tuple[Population, np.ndarray]:
         """Sample everyone's move, and who leaves; drive the egos that are driven."""
         player, settings = self._player, self._player.settings
-        move = self._moves(said, token)
+        move = self._moves(before, said, token)
         if ego_path is not None:
             target, pose = ego_path[:, -1], before.pose[:, EGO_ROW]
             kind = before.kind[:, EGO_ROW]
@@ -160,16 +160,21 @@ class Session:
             path[:, EGO_ROW] = ego_path
         return moved, path
 
-    def _moves(self, said: MotionStep, token: int) -> np.ndarray:
+    def _moves(self, before: Population, said: MotionStep, token: int) -> np.ndarray:
         settings, rows = self._player.settings, said.move_logits.shape[1]
+        luck = self._player.luck(self._streams, token, Purpose.MOVE, rows)
+        there = before.life != NOBODY
+        who = self._player.tensor(there)
         drawn = choose(
-            said.move_logits,
-            self._player.luck(self._streams, token, Purpose.MOVE, rows),
+            said.move_logits[who],
+            luck[who],
             settings.top_moves,
             nucleus=settings.move_nucleus,
             temperature=settings.move_temperature,
         )
-        return drawn.cpu().numpy()
+        move = np.zeros(there.shape, dtype=np.int64)
+        move[there] = drawn.cpu().numpy()
+        return move
 
     def _leaves(self, said: MotionStep, token: int) -> Bool[np.ndarray, "rollout row"]:
         settings, shape = self._player.settings, said.move_logits.shape[:2]

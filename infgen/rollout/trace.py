@@ -72,7 +72,10 @@ class Start:
 
 
 def collect(
-    starts: Sequence[Start], frames: Sequence[Frame], weights: str
+    starts: Sequence[Start],
+    frames: Sequence[Frame],
+    weights: str,
+    places: Sequence[int] | None = None,
 ) -> list[Rollout]:
     """Put the frames of a batch together to one rollout per start.
 
@@ -80,11 +83,11 @@ def collect(
         starts: What each rollout of the batch continues.
         frames: All frames, in order.
         weights: Fingerprint of the weights that played them.
+        places: Which rollouts of the batch; all of them if None. A rollout holds every
+            agent at every step, so long ones are better put together a few at a time.
     """
-    return [
-        _rollout(start, _lives(start, frames, at), weights)
-        for at, start in enumerate(starts)
-    ]
+    places = range(len(starts)) if places is None else places
+    return [_rollout(starts[at], _lives(starts[at], frames, at), weights) for at in places]
 
 
 @dataclass(frozen=True, slots=True)

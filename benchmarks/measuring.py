@@ -1,0 +1,85 @@
+"""What benchmarks of the network share: the scene, the sizes, and honest seconds."""
+
+import json
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from records import SHARED, read_split
+from torch import Tensor
+
+from infgen.config import ModelSettings
+from infgen.scene import Scene
+from infgen.sources.womd import iter_scenes
+
+SCENE = "637f20cafde22ff8"
+RECORD = SHARED.parents[1] / "golden" / "wosac" / SCENE / "scenario.tfrecord"
+SIZES = {
+    "paper": ModelSettings(),
+    "small": ModelSettings(
+        width=48, heads=4, map_blocks=1, motion_blocks=2, scene_blocks=1, fourier_bands=16
+    ),
+}
+PEAK_SIDE = 2048
+
+
+def read_scene() -> Scene:
+    """Read the scene that figures are about, or the largest built-in one."""
+    if RECORD.is_file():
+        return next(s for s in iter_scenes(RECORD) if isinstance(s, Scene))
+    return max(read_split("training"), key=lambda scene: len(scene.tracks.id))
+
+
+def used_s(device: str) -> float:
+    """Seconds used so far: of the processor, or of the clock for a GPU."""
+    if device != "cpu":
+        torch.cuda.synchronize()
+        return time.perf_counter()
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def seconds(work: Callable[[], object], times: int, device: str) -> float:
+    """Mean seconds that a call uses."""
+    start = used_s(device)
+    for _ in range(times):
+        work()
+    return (used_s(device) - start) / times
+
+
+def peak_mib(device: str) -> float:
+    """Most memory that this process has held: of the machine, or of the GPU."""
+    if device != "cpu":
+        return torch.cuda.max_memory_allocated() / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def peak_flops(device: str) -> float:
+    """Operations a second (of the clock) of a product of large matrices."""
+    low = device != "cpu" and torch.cuda.is_bf16_supported()
+    kind = torch.bfloat16 if low else torch.float32
+    one = torch.randn(PEAK_SIDE, PEAK_SIDE, device=device, dtype=kind)
+    other, best = one.clone(), 0.0
+
+    def product() -> Tensor:
+        return one @ other
+
+    product()
+    for _ in range(5):
+        start = time.perf_counter()
+        seconds(product, 4, device)
+        best = max(best, 4 * 2 * PEAK_SIDE**3 / (time.perf_counter() - start))
+    return best
+
+
+def in_own_process(script: Path, case: Mapping[str, Any]) -> dict[str, float]:
+    """Measure one row of a script in a fresh process, which prints it as JSON at last."""
+    command = [sys.executable, str(script), "--case", json.dumps(case)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return found
