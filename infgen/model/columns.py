@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
+from infgen.model.outputs import MotionOutputs
 from infgen.tokens.scene_tokens import Presence
 
 
@@ -45,17 +46,31 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class MotionStep:
-    """What follows a column; rows that are not visible hold zeros.
+    """What follows a column.
 
     Attributes:
-        move_logits: Next move, by the row's own kind's codebook.
-        leave_logit: Log-odds that the next token is the agent's last (LEAVING).
-        pattern_logits: When within the next token a log would show the agent.
+        packed: Of the visible rows, one after the other; below, rows that are not visible
+            hold zeros.
     """
 
-    move_logits: Float32[Tensor, "rollout row move"]
-    leave_logit: Float32[Tensor, "rollout row"] | None
-    pattern_logits: Float32[Tensor, "rollout row pattern"] | None
+    packed: MotionOutputs
+
+    @property
+    def move_logits(self) -> Float32[Tensor, "rollout row move"]:
+        """Next move, by the row's own kind's codebook."""
+        return self.packed.rows.spread(self.packed.move_logits)
+
+    @property
+    def leave_logit(self) -> Float32[Tensor, "rollout row"] | None:
+        """Log-odds that the next token is the agent's last (LEAVING)."""
+        logit = self.packed.leave_logit
+        return None if logit is None else self.packed.rows.spread(logit)
+
+    @property
+    def pattern_logits(self) -> Float32[Tensor, "rollout row pattern"] | None:
+        """When within the next token a log would show the agent."""
+        logits = self.packed.pattern_logits
+        return None if logits is None else self.packed.rows.spread(logits)
 
 
 @dataclass(frozen=True, slots=True)

@@ -207,13 +207,7 @@ class Stepper:
         memory.pose[:, :, place] = column.pose
         memory.visible[:, :, place] = visible
         memory.columns += 1
-        said = motion.foretell(rows, x)
-        leave, pattern = said.leave_logit, said.pattern_logits
-        return MotionStep(
-            rows.spread(said.move_logits),
-            None if leave is None else rows.spread(leave),
-            None if pattern is None else rows.spread(pattern),
-        )
+        return MotionStep(motion.foretell(rows, x))
 
     @torch.no_grad()
     def entry_begin(self, memory: Memory, column: Column) -> Entries:

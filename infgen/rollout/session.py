@@ -15,12 +15,14 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor
 
 from infgen.clock import CLOCK
 from infgen.geometry import wrap_angle
 from infgen.model.batch import collate_roads
 from infgen.model.columns import MotionStep
+from infgen.model.relations import Rows
 from infgen.model.steps import Memory
 from infgen.rollout.newcomers import Asking, add_newcomers
 from infgen.rollout.player import Player
@@ -147,7 +149,7 @@ class Session:
     ) -> tuple[Population, np.ndarray]:
         """Sample everyone's move, and who leaves; drive the egos that are driven."""
         player, settings = self._player, self._player.settings
-        move = self._moves(before, said, token)
+        move = self._moves(said, token)
         if ego_path is not None:
             target, pose = ego_path[:, -1], before.pose[:, EGO_ROW]
             kind = before.kind[:, EGO_ROW]
@@ -160,28 +162,29 @@ class Session:
             path[:, EGO_ROW] = ego_path
         return moved, path
 
-    def _moves(self, before: Population, said: MotionStep, token: int) -> np.ndarray:
-        settings, rows = self._player.settings, said.move_logits.shape[1]
-        luck = self._player.luck(self._streams, token, Purpose.MOVE, rows)
-        there = before.life != NOBODY
-        who = self._player.tensor(there)
+    def _moves(self, said: MotionStep, token: int) -> Int64[np.ndarray, "rollout row"]:
+        settings, packed = self._player.settings, said.packed
         drawn = choose(
-            said.move_logits[who],
-            luck[who],
+            packed.move_logits,
+            self._luck(packed.rows, token, Purpose.MOVE),
             settings.top_moves,
             nucleus=settings.move_nucleus,
             temperature=settings.move_temperature,
         )
-        move = np.zeros(there.shape, dtype=np.int64)
-        move[there] = drawn.cpu().numpy()
-        return move
+        return packed.rows.spread(drawn).cpu().numpy()
 
     def _leaves(self, said: MotionStep, token: int) -> Bool[np.ndarray, "rollout row"]:
-        settings, shape = self._player.settings, said.move_logits.shape[:2]
-        if said.leave_logit is None or not settings.removes:
-            return np.zeros(shape, dtype=bool)
-        luck = self._player.luck(self._streams, token, Purpose.LEAVE, shape[1])
-        return happens(said.leave_logit, luck, settings.leave_bias).cpu().numpy()
+        settings, packed = self._player.settings, said.packed
+        if packed.leave_logit is None or not settings.removes:
+            return np.zeros(self.population.life.shape, dtype=bool)
+        luck = self._luck(packed.rows, token, Purpose.LEAVE)
+        leave = happens(packed.leave_logit, luck, settings.leave_bias)
+        return packed.rows.spread(leave).cpu().numpy()
+
+    def _luck(self, rows: Rows, token: int, purpose: Purpose) -> Tensor:
+        """Draw a number for each of some rows; it does not depend on the others."""
+        each = self.population.life.shape[1]
+        return rows.pack(self._player.luck(self._streams, token, purpose, each))
 
     def _shown(
         self, before: Population, moved: Population, said: MotionStep, token: int
@@ -193,11 +196,12 @@ class Session:
         """
         steps = CLOCK.steps_per_token
         shown = np.ones((*moved.life.shape, steps), dtype=bool)
-        if said.pattern_logits is None or not self._player.settings.patterns:
+        packed = said.packed
+        if packed.pattern_logits is None or not self._player.settings.patterns:
             return shown
-        rows = moved.life.shape[1]
-        luck = self._player.luck(self._streams, token, Purpose.PATTERN, rows)
-        pattern = choose(said.pattern_logits, luck).cpu().numpy()
+        luck = self._luck(packed.rows, token, Purpose.PATTERN)
+        drawn = choose(packed.pattern_logits, luck)
+        pattern = packed.rows.spread(drawn).cpu().numpy()
         shown &= (pattern[..., None] >> np.arange(steps) & 1).astype(bool)
         shown[:, EGO_ROW] = True
         shown[..., 0] |= before.presence == Presence.ENTERING

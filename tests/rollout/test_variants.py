@@ -173,7 +173,7 @@ def keep_speed(playing):
     def again(memory, column):
         said = step(memory, column)
         wanted = torch.nn.functional.one_hot(column.move.clamp(min=0), 61).float()
-        said.move_logits.copy_(100 * wanted)
+        said.packed.move_logits.copy_(100 * said.packed.rows.pack(wanted))
         return said
 
     playing.stepper.motion_step = again
