@@ -2,12 +2,13 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+RUNS := $(VENV)/runs
 INSTALLED := $(VENV)/installed
-CODE := cli.py infgen pipeline benchmarks examples tests
+CODE := cli.py infgen pipeline benchmarks examples docs/hooks tests
 
-.PHONY: demo test check format bench clean
+.PHONY: demo test check format bench docs clean
 
-demo: $(INSTALLED)
+demo: $(RUNS)
 	$(BIN)/infgen demo
 
 # Two workers share the cores; more threads would only wait for each other.
@@ -20,6 +21,7 @@ check: $(INSTALLED)
 	$(BIN)/ruff format --check $(CODE)
 	$(BIN)/codespell $(CODE) docs README.md CHANGELOG.md CONTRIBUTING.md stages.yaml
 	$(BIN)/mypy
+	$(BIN)/mkdocs build --quiet --strict
 
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix $(CODE)
@@ -28,10 +30,19 @@ format: $(INSTALLED)
 bench: $(INSTALLED)
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
 
-clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache
+# The site of docs/, in site/. Nothing is fetched; a dead link is an error.
+docs: $(INSTALLED)
+	$(BIN)/mkdocs build --strict
 
-$(INSTALLED): pyproject.toml
+clean:
+	rm -rf $(VENV) site .mypy_cache .ruff_cache .pytest_cache
+
+# What is needed to run it, and on top of that what is needed to work on it.
+$(RUNS): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --editable .
+	touch $@
+
+$(INSTALLED): $(RUNS)
+	$(BIN)/python -m pip install --quiet --editable '.[dev,docs]'
 	touch $@

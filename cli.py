@@ -8,7 +8,6 @@ settings; 3 something is stale (``status --check``), or too many records were qu
 import os
 import shutil
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -22,7 +21,15 @@ from pipeline.doctor import examine
 from pipeline.folders import StoreError
 from pipeline.locks import LockedError
 from pipeline.manifest import verify as find_damage
-from pipeline.options import Asked, Building, Exporting, Running, Scoring, gathers
+from pipeline.options import (
+    Asked,
+    Building,
+    Exporting,
+    Running,
+    Scoring,
+    Viewing,
+    gathers,
+)
 from pipeline.plan import PlanError
 from pipeline.root import Root
 from pipeline.screen import Screen, show_table
@@ -39,10 +46,10 @@ from pipeline.verbs import (
     run_stages,
     show_plan,
     tell_standings,
+    watch_stages,
 )
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-WATCH_S = 2.0
 
 app = typer.Typer(
     name="infgen",
@@ -91,18 +98,23 @@ def ingest(
     run_stages(asked.request(files or ()), ["ingest"], running, as_json=json_)
 
 
-def _stage_verb(stage: str, what: str) -> None:
+def _stage_verb(stage: str, what: str, *examples: str) -> None:
     @gathers(asked=Asked, running=Running)
     def verb(json_: Json = False, *, asked: Asked, running: Running) -> None:
         run_stages(asked.request(), [stage], running, as_json=json_)
 
-    app.command(stage, help=f"{what}\n\nExample: infgen {stage} --root R")(verb)
+    lines = [f"Example: infgen {stage} --root R{more}" for more in ("", *examples)]
+    app.command(stage, help="\n\n".join([what, *lines]))(verb)
 
 
 _stage_verb("build-vocab", "Cluster the vocabularies of moves and road pieces.")
 _stage_verb("tokenize", "Write scenes as tokens.")
 _stage_verb("train", "Train the network; goes on where a killed run stopped.")
-_stage_verb("rollout", "Play futures of the held-out scenes.")
+_stage_verb(
+    "rollout",
+    "Play futures of the held-out scenes; settings are those of rollout.* in stages.yaml.",
+    " --dask local:8 -s rollout.mode=wosac -s rollout.count=32",
+)
 _stage_verb("reference", "Count what the logs of the scored split do.")
 _stage_verb("score", "Score the futures against the logs.")
 _stage_verb("report", "Gather tables and figures in one page.")
@@ -124,8 +136,11 @@ def status(
     check: Annotated[bool, typer.Option("--check", help="Exit 3 if any is stale.")] = False,
     json_: Json = False,
     watch: Annotated[
-        bool, typer.Option("--watch", help="Again every two seconds.")
+        bool, typer.Option("--watch", help="Go on looking; with --check while it runs.")
     ] = False,
+    every: Annotated[
+        float, typer.Option(help="Seconds between two looks of --watch.", min=0.1)
+    ] = 2.0,
     strict_code: Annotated[bool, typer.Option(help="Other code makes stale.")] = False,
     *,
     asked: Asked,
@@ -133,14 +148,14 @@ def status(
     """Say how every stage stands to what is asked for, and why.
 
     Example: infgen status --root R -s tokenize.max_gap_s=2
+
+    Example: infgen status --root R --watch
     """
-    request = asked.request()
-    while True:
-        found = find_standings(request, [], strict_code=strict_code)
-        tell_standings(found, as_json=json_)
-        if not watch:
-            break
-        time.sleep(WATCH_S)
+    if watch:
+        watch_stages(asked, every, as_json=json_, check=check)
+        return
+    found = find_standings(asked.request(), [], strict_code=strict_code)
+    tell_standings(found, as_json=json_)
     if check and any(standing.state != "cached" for standing in found):
         raise typer.Exit(STALE)
 
@@ -259,13 +274,19 @@ def demo(root: RootFolder = WORK / "demo", json_: Json = False) -> None:
 
 @app.command()
 @gathers(building=Building)
-def towns(*, building: Building) -> None:
-    """Write synthetic driving logs as WOMD records.
+def towns(json_: Json = False, *, building: Building) -> None:
+    """Write synthetic driving logs as WOMD records (needs SUMO: the extra towns).
 
-    Example: infgen towns --out towns --scenes 20
+    Example: infgen towns --out towns --scenes 200 --seconds 31.1 --split validation
+
+    A run that was killed goes on where it stopped, if the same is asked for again.
     """
-    for path in building.write():
-        typer.echo(path)
+    with stopping.listening(), Screen() as screen:
+        found = building.write(screen)
+    if json_:
+        print_json(found.to_json())
+    else:
+        tables.show_towns(found)
 
 
 @app.command()
@@ -303,6 +324,25 @@ def export(json_: Json = False, *, exporting: Exporting) -> None:
         print_json(found.to_json())
     else:
         tables.show_exported(found)
+
+
+@app.command()
+@gathers(viewing=Viewing)
+def view(json_: Json = False, *, viewing: Viewing) -> None:
+    """Write a page that plays a scene: its rollouts and its log, side by side.
+
+    Example: infgen view R --scene 637f20 --rollouts 0,1,2
+
+    Example: infgen view validation.tfrecord-00000-of-00150
+
+    Example: infgen view R --video scene.mp4 --strip scene.svg
+    """
+    with stopping.listening(), Screen() as screen:
+        found = viewing.write(screen)
+    if json_:
+        print_json(found.to_json())
+    else:
+        typer.echo("\n".join(path for path, _ in found.files))
 
 
 def _exit_code(error: BaseException) -> int:

@@ -17,14 +17,17 @@ LANES_Y_M = (0.0, 3.5)
 NOW = 10
 
 
-def street(speeds_mps: tuple[float, ...] = (8.0, 7.0, 9.0, 0.0)) -> Scene:
+def street(
+    speeds_mps: tuple[float, ...] = (8.0, 7.0, 9.0, 0.0), steps: int = NOW + 1
+) -> Scene:
     """Lay out a street of two lanes along +x.
 
     Args:
-        speeds_mps: Of the cars. The first is the ego, at the origin; the next drive 30 m
-            apart in front of it, every other one in the left lane.
+        speeds_mps: Of the cars. The first is the ego, at the origin now; the next drive
+            30 m apart in front of it, every other one in the left lane.
+        steps: Length of the log; without more, the history alone.
     """
-    cars, steps = len(speeds_mps), NOW + 1
+    cars = len(speeds_mps)
     number = np.arange(cars)
     seconds = CLOCK.step_s * (np.arange(steps) - NOW)
     xyz_m = np.zeros((cars, steps, 3), dtype=np.float32)

@@ -305,6 +305,17 @@ class ReportSettings:
 
     Attributes:
         title: Heading of the report.
+        players: Of so many of the rollouts with the lowest scores there is a page that
+            plays them.
     """
 
     title: str = "InfGen"
+    players: int = 3
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be written.
+
+        Raises:
+            ConfigError: naming the setting.
+        """
+        check_bounds(self, "report", (("players", 0, math.inf),))

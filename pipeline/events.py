@@ -2,6 +2,7 @@
 
 import json
 import os
+import time
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,10 +14,15 @@ Event = Mapping[str, Any]
 """``event`` says which; the rest are its figures.
 
 ``run-started``, ``stage-cached``, ``stage-started`` (units, made), ``unit-done``,
-``unit-failed`` (error, trace), ``finish-started``, ``progress`` (done, total, note; not
-logged), ``stage-done`` (report), ``stage-failed``, ``stage-skipped``,
-``run-ended`` or ``run-stopped`` (why).
+``unit-failed`` (error, trace), ``finish-started``, ``progress`` (done, total, note; logged
+where nothing was for some seconds), ``worker-full`` (worker, memory_gib: restarted, as it
+fills its memory), ``worker-lost`` (worker, units that begin again), ``workers-missing``
+(patience_min), ``stage-done`` (report), ``stage-failed``, ``stage-skipped``, ``run-ended``
+or ``run-stopped`` (why).
 """
+
+QUIET_S = 5.0
+"""How long a log may be silent before progress is told there too, for who watches it."""
 
 
 @runtime_checkable
@@ -37,11 +43,12 @@ class Events:
     def __init__(self, root: Root, listeners: tuple[Listener, ...] = ()) -> None:
         self.log = root.logs / f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{os.getpid()}.jsonl"
         self._listeners = listeners
+        self._wrote_at = time.monotonic()
 
     def emit(self, event: str, **figures: Any) -> None:
         """Tell one event. A line of the log is written whole and at once."""
         about = {"event": event, **figures}
-        if event != "progress":
+        if event != "progress" or time.monotonic() - self._wrote_at >= QUIET_S:
             self._write(about)
         for listener in self._listeners:
             listener(about)
@@ -51,6 +58,7 @@ class Events:
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
         line = json.dumps({"time": now, **about}, default=str) + "\n"
         _append(self.log, line.encode())
+        self._wrote_at = time.monotonic()
 
 
 def _append(path: Path, data: bytes) -> None:

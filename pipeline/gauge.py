@@ -1,6 +1,7 @@
 """How far a stage is, how fast it goes, and how long it will take."""
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,14 +9,17 @@ from typing import Any
 from pipeline.events import Event
 
 LONGEST_WORD = 36
+RECENT_S = 120.0
+"""Rates are those of about the last two minutes."""
+MARK_S = 1.0
 
 
 @dataclass
 class Gauge:
     """Reads the events of one stage.
 
-    Units count one each; what a unit says of itself counts as a part of one. A stage that
-    is all one unit (training) is told in that unit's own steps.
+    Units count one each; what units under way say of themselves counts as parts of them. A
+    stage that is all one unit (training) is told in that unit's own steps.
 
     Attributes:
         stage: Its name.
@@ -34,11 +38,11 @@ class Gauge:
     _done: int = 0
     _part: tuple[float, float] = (0.0, 1.0)
     _first_part: float | None = None
-    _begun: float = field(init=False)
+    _marks: deque[tuple[float, float]] = field(default_factory=deque)
 
     def __post_init__(self) -> None:
         """Start the clock."""
-        self._begun = self.clock()
+        self._marks.append((self.clock(), 0.0))
 
     def take(self, event: Event) -> None:
         """Note a unit's end, or how far it is."""
@@ -52,6 +56,17 @@ class Gauge:
             self.note = str(event["note"])
             if self._first_part is None:
                 self._first_part = self._part[0]
+        self._mark()
+
+    def _mark(self) -> None:
+        """Note how much is done by now, and forget what no longer counts for the rate."""
+        now, marks = self.clock(), self._marks
+        if len(marks) > 1 and now - marks[-1][0] < MARK_S:
+            marks[-1] = (marks[-1][0], self._made)
+        else:
+            marks.append((now, self._made))
+        while len(marks) > 2 and now - marks[1][0] > RECENT_S:
+            marks.popleft()
 
     @property
     def in_steps(self) -> bool:
@@ -65,7 +80,7 @@ class Gauge:
             return self.total
         if self.in_steps:
             return self._part[0]
-        return self.before + self._done + self._fraction
+        return min(float(self.units), self.before + self._done + self._fraction)
 
     @property
     def total(self) -> float:
@@ -74,7 +89,7 @@ class Gauge:
 
     @property
     def _fraction(self) -> float:
-        return min(1.0, self._part[0] / self._part[1])
+        return self._part[0] / self._part[1]
 
     @property
     def _made(self) -> float:
@@ -83,9 +98,10 @@ class Gauge:
 
     @property
     def per_s(self) -> float | None:
-        """Units, or steps, per second; None as long as nothing is done."""
-        taken = self.clock() - self._begun
-        return self._made / taken if self._made > 0 and taken > 0 else None
+        """Units, or steps, per second of late; None as long as nothing is done."""
+        since, before = self._marks[0]
+        taken, made = self.clock() - since, self._made - before
+        return made / taken if made > 0 and taken > 0 else None
 
     @property
     def left_s(self) -> float | None:
@@ -96,19 +112,31 @@ class Gauge:
     def words(self) -> str:
         """Say it in one line: ``12 of 27 units, 0.8/s, 0:19 left, note``."""
         if self.finishing:
-            return ", ".join([f"gathering {self._fraction:.0%}", *self._notes])
+            return self.remark
         what = self.what if self.in_steps else "units"
-        parts = [f"{self.done:.4g} of {self.total:g} {what}"]
+        parts = [f"{amount(self.done)} of {amount(self.total)} {what}"]
         if self.per_s is not None and self.left_s is not None:
-            parts += [_rate(self.per_s), f"{clock_time(self.left_s)} left"]
+            parts += [rate(self.per_s), f"{clock_time(self.left_s)} left"]
         return ", ".join([*parts, *self._notes])
+
+    @property
+    def remark(self) -> str:
+        """What there is to say besides numbers."""
+        gathering = [f"gathering {self._fraction:.0%}"] if self.finishing else []
+        return ", ".join([*gathering, *self._notes])
 
     @property
     def _notes(self) -> list[str]:
         return [self.note] if self.note else []
 
 
-def _rate(per_s: float) -> str:
+def amount(count: float | int) -> str:
+    """Write how many: ``1.5``, ``12``, ``20000``."""
+    return f"{count:.4g}" if count < 1000 else f"{count:.0f}"
+
+
+def rate(per_s: float) -> str:
+    """Write a rate as ``0.8/s``, or the slow ones as ``40 s each``."""
     return f"{per_s:.3g}/s" if per_s >= 0.1 else f"{1 / per_s:.3g} s each"
 
 

@@ -53,7 +53,7 @@ def is_locked(path: Path) -> bool:
     """Whether some process holds a lock."""
     if not path.is_file():
         return False
-    handle = os.open(path, os.O_RDWR)
+    handle = os.open(path, os.O_RDONLY)  # Whoever may read may look.
     try:
         return not _try(handle, fcntl.LOCK_SH)
     finally:

@@ -17,6 +17,7 @@ from typing import Any
 
 import google_crc32c
 
+from pipeline import machine
 from pipeline.folders import StoreError, write_json
 from pipeline.root import MANIFEST, RUN, RUN_FOLDER, Root, read_json
 from pipeline.stage import Report
@@ -38,6 +39,7 @@ class Run:
         """Write ``run.json``."""
         about = {
             "host": socket.gethostname(),
+            "machine": machine.describe(),
             "started": self.started,
             "seconds": round(self.seconds, 3),
             "report": dict(self.varying),

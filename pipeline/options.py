@@ -3,13 +3,14 @@
 import inspect
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from infgen.config import ConfigError
 from pipeline.events import Event
 from pipeline.plan import Plan, PlanError
 from pipeline.request import Request, complete
@@ -18,6 +19,8 @@ from pipeline.runner import Orders
 
 if TYPE_CHECKING:
     from pipeline.export import Exported
+    from pipeline.towns import Written
+    from pipeline.view import Shown
     from pipeline.wosac import Official
 
 
@@ -104,6 +107,7 @@ class Running:
             wait=self.wait,
             strict_code=self.strict_code,
             workers=self.dask,
+            visible_devices=os.environ.get("CUDA_VISIBLE_DEVICES"),
         )
 
 
@@ -138,22 +142,20 @@ class Building:
     """Which towns are built, and where to."""
 
     out: Annotated[Path, typer.Option(help="Folder to write to.")]
-    scenes: Annotated[int, typer.Option(help="How many scenes.")] = 8
+    scenes: Annotated[int, typer.Option(help="How many scenes.")] = 20
+    seconds: Annotated[
+        float, typer.Option(help="Length of each: 9.1 as WOMD's, or 31.1, or 311.")
+    ] = 9.1
     seed: Annotated[int, typer.Option(help="Other towns for another seed.")] = 0
     split: Annotated[str, typer.Option(help="Start of the file names.")] = "training"
     scenes_per_file: Annotated[int, typer.Option(help="Most scenes of a file.")] = 20
+    jobs: Annotated[int, typer.Option(help="Processes; 0: one per core.")] = 0
 
-    def write(self) -> Sequence[Path]:
-        """Write their records."""
-        from infgen.sources.towns import write_towns  # noqa: PLC0415
+    def write(self, tell: Callable[[Event], None]) -> "Written":
+        """Write their records; tells how far it is."""
+        from pipeline.towns import Order, write_towns  # noqa: PLC0415
 
-        return write_towns(
-            self.out,
-            self.scenes,
-            self.seed,
-            split=self.split,
-            scenes_per_file=self.scenes_per_file,
-        )
+        return write_towns(Order(**asdict(self)), tell)
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +197,80 @@ class Exporting:
             scenes_per_shard=self.scenes_per_shard,
         )
         return export(order, tell)
+
+
+@dataclass(frozen=True, slots=True)
+class Viewing:
+    """What is watched, and what is written of it."""
+
+    source: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[ROOT | RECORDS...]", help="A root, or TFRecords to see a log of."
+        ),
+    ] = None
+    root: Annotated[Path, typer.Option(help="Folder of the experiment.")] = Path("work")
+    scene: Annotated[str, typer.Option(help="Start of its id; default: the first.")] = ""
+    rollouts: Annotated[
+        str | None, typer.Option(help="E.g. 0,1,2, or none; default: the first three.")
+    ] = None
+    log: Annotated[bool, typer.Option(help="Show the log beside the rollouts.")] = True
+    out: Annotated[
+        Path | None, typer.Option(help="Page to write; default: SCENE.html here.")
+    ] = None
+    video: Annotated[Path | None, typer.Option(help="MP4 or GIF to write.")] = None
+    strip: Annotated[
+        Path | None, typer.Option(help="SVG or PNG to write: moments side by side.")
+    ] = None
+    size: Annotated[str, typer.Option(help="Of the video.")] = "1920x1080"
+    fps: Annotated[
+        int | None, typer.Option(help="Of the video; default: 25, of a GIF 10.")
+    ] = None
+    every: Annotated[float, typer.Option(help="Seconds between moments of a strip.")] = 6.0
+    theme: Annotated[str, typer.Option(help="light or dark: video and strip.")] = "light"
+
+    def write(self, tell: Callable[[Event], None]) -> "Shown":
+        """Write it; tells how far it is."""
+        from pipeline.view import Wanted, is_root, view  # noqa: PLC0415
+
+        words = [part for word in self.source or () for part in split_names(word)]
+        root = Path(words[0]) if len(words) == 1 and is_root(Path(words[0])) else None
+        width_px, height_px = _size(self.size)
+        wanted = Wanted(
+            root=Root((root or self.root).absolute()),
+            records=() if root else tuple(words),
+            scene=self.scene,
+            rollouts=_indices(self.rollouts),
+            log=self.log,
+            page=self.out,
+            video=self.video,
+            strip=self.strip,
+            width_px=width_px,
+            height_px=height_px,
+            fps=self.fps,
+            theme=self.theme,
+            every_s=self.every,
+        )
+        return view(wanted, tell)
+
+
+def _indices(word: str | None) -> tuple[int, ...] | None:
+    """Read indices of rollouts: ``0,2``, or ``none``."""
+    if word is None or word == "none":
+        return None if word is None else ()
+    try:
+        return tuple(int(part) for part in word.split(","))
+    except ValueError as error:
+        raise ConfigError(f"--rollouts {word}: expected e.g. 0,1,2, or none") from error
+
+
+def _size(word: str) -> tuple[int, int]:
+    """Read a size of pictures: ``1280x720``."""
+    try:
+        width, height = word.lower().split("x")
+        return int(width), int(height)
+    except ValueError as error:
+        raise ConfigError(f"--size {word}: expected e.g. 1280x720") from error
 
 
 def split_names(word: str) -> list[str]:

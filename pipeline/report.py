@@ -1,25 +1,28 @@
 """Stage ``report``: everything before it to tables, figures and one page.
 
-All is done in ``finish``; there are no units. What is written depends on the inputs alone:
-times and machines are in the engine's ``run.json``.
+All is done in ``finish``; there are no units. What is written depends on the inputs alone,
+but for the page of machines and times below ``run``.
 """
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infgen.config import ReportSettings, RolloutSettings
 from pipeline.manifest import read_manifest
+from pipeline.root import RUN_FOLDER
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
 if TYPE_CHECKING:
+    from infgen.metrics.reference import Counts
     from infgen.views.tables import Table
 
-STAGES = ("ingest", "build-vocab", "tokenize", "train", "rollout", "score")
+STAGES = ("ingest", "build-vocab", "tokenize", "train", "rollout", "reference", "score")
 LOWEST = 10
-MAX_QUARANTINED = 20
-_KEY_DIGITS = 16
+TABLES = "tables"
+PASSPORT = "passport.html"
 
 
 def plan(inputs: Inputs, settings: ReportSettings) -> list[Unit]:
@@ -43,18 +46,31 @@ def finish(
     settings: ReportSettings,
     progress: Progress,
 ) -> Report:
-    """Write the table of scores in five forms, and the page."""
+    """Write every table in three forms, the table of scores as JSON too, and the page."""
     from infgen.views.page import page  # noqa: PLC0415
+    from pipeline import report_histograms as histograms  # noqa: PLC0415
     from pipeline.folders import write_file, write_json  # noqa: PLC0415
+    from pipeline.report_figures import find_lowest  # noqa: PLC0415
+    from pipeline.report_passport import passport  # noqa: PLC0415
+    from pipeline.report_players import write_players  # noqa: PLC0415
+    from pipeline.report_tables import worst_table  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
     summary = json.loads((inputs.folder("score") / "summary.json").read_text())
     manifests = {stage: read_manifest(inputs.folder(stage)) for stage in STAGES}
-    scores, *more = _score_tables(inputs, summary, manifests)
-    about = _passport(inputs, manifests)
+    lowest = find_lowest(inputs.folder("score") / "scores.parquet", LOWEST)
+    pages = write_players(inputs, target, lowest, settings.players)
+    scores, *more = [
+        *_score_tables(summary, manifests),
+        worst_table(lowest, pages),
+    ]
+    about = passport(inputs, manifests)
+    counts = histograms.read_both(inputs)
     progress(1, 3, "tables")
-    parts = _page(inputs, summary, manifests, [scores, *more], about)
+    parts = _page(inputs, summary, manifests, [scores, *more], about, counts)
     progress(2, 3, "figures")
+    _write_tables(target / TABLES, [scores, *more, *about, histograms.table(*counts)])
+    _write_passport(inputs, target / RUN_FOLDER, settings.title)
     write_json(target / "table.json", scores.to_json())
     texts = {
         "table.csv": scores.to_csv(),
@@ -72,16 +88,41 @@ def finish(
     }
 
 
+def _write_tables(folder: Path, tables: "Sequence[Table]") -> None:
+    """Write each table as Markdown, LaTeX and CSV, named after its title."""
+    from pipeline.folders import write_file  # noqa: PLC0415
+
+    folder.mkdir(exist_ok=True)
+    for table in tables:
+        name = re.sub(r"[^a-z0-9]+", "-", table.title.lower()).strip("-")
+        for suffix, text in (
+            ("md", table.to_markdown()),
+            ("tex", table.to_latex()),
+            ("csv", table.to_csv()),
+        ):
+            write_file(folder / f"{name}.{suffix}", text.encode())
+
+
+def _write_passport(inputs: Inputs, folder: Path, title: str) -> None:
+    """Write the page of machines and times."""
+    from infgen.views.page import page  # noqa: PLC0415
+    from pipeline.folders import write_file  # noqa: PLC0415
+    from pipeline.report_passport import times  # noqa: PLC0415
+
+    folder.mkdir(exist_ok=True)
+    parts = [table.to_html() for table in times(inputs, STAGES)]
+    write_file(folder / PASSPORT, page(f"{title}: machines and times", parts).encode())
+
+
 def _composite(summary: Mapping[str, Any], protocol: str) -> float | None:
     value: float | None = summary["protocols"][protocol]["scores"]["composite"]["mean"]
     return value
 
 
 def _score_tables(
-    inputs: Inputs, summary: Mapping[str, Any], manifests: Mapping[str, Any]
+    summary: Mapping[str, Any], manifests: Mapping[str, Any]
 ) -> "list[Table]":
     from pipeline import report_tables as tables  # noqa: PLC0415
-    from pipeline.report_figures import lowest  # noqa: PLC0415
 
     rollout = RolloutSettings(**_section(manifests["rollout"], "rollout"))
     motion_only = not (rollout.inserts or rollout.removes)
@@ -90,72 +131,7 @@ def _score_tables(
         tables.long_term_table(summary, motion_only=motion_only),
         tables.short_term_table(summary),
         tables.divergence_table(summary),
-        tables.worst_table(lowest(inputs.folder("score") / "scores.parquet", LOWEST)),
     ]
-
-
-def _passport(inputs: Inputs, manifests: Mapping[str, Any]) -> "list[Table]":
-    """What was run on what: keys, settings, versions, counts and what was left out."""
-    from infgen.views.tables import Table, flatten  # noqa: PLC0415
-
-    stages = [
-        [
-            name,
-            found["key"][:_KEY_DIGITS],
-            found["version"],
-            found["code"][:_KEY_DIGITS],
-            len(found["units"]),
-        ]
-        for name, found in manifests.items()
-    ]
-    settings = [
-        [f"{name}: {setting}", value]
-        for name, found in manifests.items()
-        for setting, value in flatten(found["settings"])
-    ]
-    figures = [
-        [f"{name}: {figure}", value]
-        for name, found in manifests.items()
-        for figure, value in flatten(found["report"])
-    ]
-    packages = flatten(manifests["score"]["packages"])
-    sources = [
-        [name, mark] for name, mark in sorted(manifests["ingest"]["sources"].items())
-    ]
-    return [
-        Table("Stages", ["stage", "key", "version", "code", "units"], stages),
-        Table("Counts", ["figure", "value"], figures),
-        *_vocabulary(inputs),
-        _quarantine(inputs),
-        Table("Sources", ["file", "fingerprint"], sources),
-        Table("Settings", ["setting", "value"], settings),
-        Table("Versions", ["package", "version"], packages),
-    ]
-
-
-def _vocabulary(inputs: Inputs) -> "list[Table]":
-    from infgen.views.tables import Table, flatten  # noqa: PLC0415
-
-    path = inputs.folder("build-vocab") / "report.json"
-    if not path.is_file():
-        return []
-    rows = flatten(json.loads(path.read_text()))
-    return [Table("Vocabularies", ["figure", "value"], rows)]
-
-
-def _quarantine(inputs: Inputs) -> "Table":
-    import polars as pl  # noqa: PLC0415
-
-    from infgen.views.tables import Table  # noqa: PLC0415
-
-    found = pl.read_parquet(inputs.folder("ingest") / "quarantine.parquet")
-    shown = min(MAX_QUARANTINED, len(found))
-    return Table(
-        "Quarantined records",
-        found.columns,
-        list(found.head(shown).iter_rows()),
-        note=f"{shown} of {len(found)}; all are in quarantine.parquet of stage ingest.",
-    )
 
 
 def _page(
@@ -164,9 +140,11 @@ def _page(
     manifests: Mapping[str, Any],
     tables: "Sequence[Table]",
     about: "Sequence[Table]",
+    counts: "tuple[Counts, Counts]",
 ) -> list[str]:
-    from infgen.views.page import figures, heading, paragraph  # noqa: PLC0415
+    from infgen.views.page import figures, heading, inset, paragraph  # noqa: PLC0415
     from pipeline import report_figures as drawings  # noqa: PLC0415
+    from pipeline import report_histograms as histograms  # noqa: PLC0415
     from pipeline.report_training import LOG, training_figures  # noqa: PLC0415
 
     curves = drawings.read_curves(inputs.folder("score") / "curves.parquet", summary)
@@ -189,11 +167,17 @@ def _page(
         heading("A rollout"),
         figures(drawings.strips(played) if played else []),
         heading("Features and scenes"),
+        figures(histograms.charts(*counts)),
         *more,
         heading("Training"),
         figures(training),
         heading("Run passport"),
         *(table.to_html() for table in about),
+        heading("Machines and times"),
+        inset(
+            f"{RUN_FOLDER}/{PASSPORT}",
+            "Machines and times differ from run to run, so they stand beside this page:",
+        ),
     ]
 
 
@@ -212,7 +196,7 @@ def _section(manifest: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 STAGE = Stage(
     name="report",
-    version=2,
+    version=3,
     settings={"report": ReportSettings},
     plan=plan,
     work=work,
@@ -222,12 +206,16 @@ STAGE = Stage(
         "infgen.views.calibration",
         "infgen.views.figures",
         "infgen.views.page",
+        "infgen.views.player",
         "infgen.views.published",
         "infgen.views.scene_picture",
         "infgen.views.tables",
         "infgen.views.training",
         "pipeline.report",
         "pipeline.report_figures",
+        "pipeline.report_histograms",
+        "pipeline.report_passport",
+        "pipeline.report_players",
         "pipeline.report_tables",
         "pipeline.report_training",
         "pipeline.train_log",

@@ -152,7 +152,7 @@ def _nan(value: float | None) -> float:
     return float("nan") if value is None else value
 
 
-def lowest(path: Path, count: int) -> Sequence[tuple[str, int, float]]:
+def find_lowest(path: Path, count: int) -> Sequence[tuple[str, int, float]]:
     """Read the rollouts with the lowest composite."""
     import polars as pl  # noqa: PLC0415
 

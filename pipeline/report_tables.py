@@ -152,12 +152,13 @@ def divergence_table(summary: Mapping[str, Any]) -> Table:
     )
 
 
-def worst_table(rows: Sequence[tuple[str, int, float]]) -> Table:
-    """The rollouts with the lowest scores."""
+def worst_table(rows: Sequence[tuple[str, int, float]], pages: Sequence[str]) -> Table:
+    """The rollouts with the lowest scores, and the pages that play them."""
     return Table(
         title="Lowest composites (corrected)",
         columns=["scene", "rollout", "composite"],
         rows=[list(row) for row in rows],
+        links=pages,
     )
 
 

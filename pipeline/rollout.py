@@ -5,10 +5,11 @@ overhead. What a rollout does depends on its scene, its index and the seed alone
 """
 
 import math
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from itertools import groupby, islice
+from itertools import groupby, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from infgen.rollout.trace import Start
 
 SCHEMA = "infgen.rollouts/1"
+TOGETHER_S = 1000.0
+"""Seconds of rollouts that one group holds: 33 of 30 s, or one of ten minutes."""
 INDEX: Fields = {
     "scenario_id": str,
     "rollout": int,
@@ -38,7 +41,7 @@ INDEX: Fields = {
 
 
 def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
-    """Cut the split into units of ``scenes_per_task`` scenes."""
+    """Cut the split into units of up to ``scenes_per_task`` scenes, about equally many."""
     weights = inputs.folder("train")
     identity = inputs.content("train", "model.safetensors", "model.json")
     shards = [
@@ -49,8 +52,7 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
     for done in shards:
         scenes = min(left, int(done.report["scenes"]))
         left -= scenes
-        for first in range(0, scenes, settings.scenes_per_task):
-            count = min(settings.scenes_per_task, scenes - first)
+        for first, after in pairwise(_edges(scenes, settings.scenes_per_task)):
             units.append(
                 Unit(
                     name=f"{done.name}-{first:05d}",
@@ -59,11 +61,17 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
                         "scenes": str(done.path),
                         "weights": str(weights),
                         "first": first,
-                        "count": count,
+                        "count": after - first,
                     },
                 )
             )
     return units
+
+
+def _edges(scenes: int, most: int) -> list[int]:
+    """Cut scenes into as few parts as may be: where each begins, and the end."""
+    parts = math.ceil(scenes / most)
+    return [math.ceil(scenes * at / parts) for at in range(parts)] + [scenes]
 
 
 def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress) -> Report:
@@ -73,21 +81,34 @@ def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
     from infgen.rollout.trace import Frame, collect  # noqa: PLC0415
     from pipeline.store import write_records  # noqa: PLC0415
 
-    player, weights = _player(Path(unit.task["weights"]), settings)
+    folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
+    player, weights = _player(folder, identity, settings)
     starts, refused = _starts(unit, player, settings)
+    begun = time.monotonic()
     rows: list[dict[str, Any]] = []
-    for group, batch in enumerate(_batches(starts, settings.batch)):
+    group = 0
+    for batch in _batches(starts, settings.batch):
         frames: list[Frame] = []
         for frame in simulate(player, batch):
             frames.append(frame)
             share = len(frames) * CLOCK.token_s / settings.length_s
-            progress(len(rows) + len(batch) * share, len(starts), "rollouts")
-        rollouts = collect(batch, frames, weights)
-        path = target / f"rollouts-{group:03d}.zarr"
-        write_records(path, rollouts, Rollout, SCHEMA, compress=True)
-        rows += [_row(unit.name, group, at, played) for at, played in enumerate(rollouts)]
+            played = len(rows) + len(batch) * share
+            progress(played, len(starts), f"{_rate(played, begun):.3g} rollouts/s")
+        few = max(1, int(TOGETHER_S / settings.length_s))
+        for first in range(0, len(batch), few):
+            places = range(len(batch))[first : first + few]
+            rollouts = collect(batch, frames, weights, places)
+            path = target / f"rollouts-{group:03d}.zarr"
+            write_records(path, rollouts, Rollout, SCHEMA, compress=True)
+            rows += [_row(unit.name, group, at, done) for at, done in enumerate(rollouts)]
+            group += 1
     table(rows, INDEX).write_parquet(target / "index.parquet")
-    return {**_report(rows, refused), "plays": player.plays}
+    pace = {"rollouts_per_s": round(_rate(len(rows), begun), 4)}
+    return {**_report(rows, refused), "plays": player.plays, "run": pace}
+
+
+def _rate(played: float | int, begun: float) -> float:
+    return played / max(time.monotonic() - begun, 1e-9)
 
 
 def read_rollouts(folder: Path) -> "Iterator[Rollout]":
@@ -124,8 +145,10 @@ def finish(
 
 
 @lru_cache(maxsize=2)
-def _player(weights: Path, settings: RolloutSettings) -> "tuple[Player, str]":
-    """Load the weights once per process."""
+def _player(
+    weights: Path, identity: str, settings: RolloutSettings
+) -> "tuple[Player, str]":
+    """Load weights once per process: it may outlive what was at a path when it began."""
     import torch  # noqa: PLC0415
 
     from infgen.model.steps import Stepper  # noqa: PLC0415

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from pipeline import stopping
 from pipeline.cluster import Workers
+from pipeline.dispatch import WorkersLostError
 from pipeline.events import Events
 from pipeline.folders import PARTIAL, publish, write_json
 from pipeline.gauge import figures
@@ -49,6 +50,7 @@ class Orders:
         wait: Queue behind a run that holds a lock.
         strict_code: Make again what other code made.
         workers: Who does the units (``--dask``).
+        visible_devices: ``CUDA_VISIBLE_DEVICES`` of this process, if it is set.
     """
 
     force: frozenset[str] = frozenset()
@@ -56,6 +58,7 @@ class Orders:
     wait: bool = False
     strict_code: bool = False
     workers: str = "none"
+    visible_devices: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,11 +98,12 @@ def run(plan: Plan, orders: Orders, events: Events) -> list[Result]:
         LockedError: if another run is making one of them.
         PlanError: if a stage breaks its contract.
         StoreError: if what a stage should read is damaged.
+        WorkersLostError: if the workers are gone, with what they had under way.
     """
     events.emit("run-started", stages=list(plan.stages), workers=orders.workers)
     try:
         results = _make_all(plan, orders, events)
-    except (stopping.Stopped, LockedError) as error:
+    except (stopping.Stopped, LockedError, WorkersLostError) as error:
         events.emit("run-stopped", why=str(error))
         raise
     failed = [result.stage for result in results if result.state == "failed"]
@@ -110,7 +114,7 @@ def run(plan: Plan, orders: Orders, events: Events) -> list[Result]:
 def _make_all(plan: Plan, orders: Orders, events: Events) -> list[Result]:
     force = plan.after(orders.force | _made_by_other_code(plan, orders))
     results: list[Result] = []
-    with Workers(orders.workers) as workers:
+    with Workers(orders.workers, orders.visible_devices) as workers:
         for planned in plan.stages.values():
             unmet = {result.stage for result in results if result.state in _NOT_MADE}
             if unmet and (not orders.keep_going or unmet & planned.inputs.keys()):
@@ -221,7 +225,7 @@ class _Making:
 
         self.root.units(self.name).mkdir(parents=True, exist_ok=True)
         executor = workers.executor(here=self.planned.stage.in_driver)
-        for outcome in executor.run(todo, go_on, self._progress()):
+        for outcome in executor.run(todo, go_on, self._progress(), self._tell_more):
             outcomes.append(outcome)
             self._tell(outcome)
         return outcomes
@@ -239,6 +243,9 @@ class _Making:
             )
         else:
             self.events.emit("unit-done", **about, report=outcome.report)
+
+    def _tell_more(self, event: str, **figures: Any) -> None:
+        self.events.emit(event, stage=self.name, **figures)
 
     def _finish(
         self, inputs: FinishedInputs, tasks: Sequence[Task]

@@ -9,9 +9,12 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from rich.console import Console
+from rich import box
+from rich.console import Console, Group
+from rich.live import Live
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
+from rich.text import Text
 
 from pipeline.events import Event
 from pipeline.gauge import Gauge, figures
@@ -28,10 +31,14 @@ def console(*, stderr: bool = False) -> Console:
 
 def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print a table to standard output."""
+    console().print(_table(title, columns, rows))
+
+
+def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
     table = Table(*columns, title=title, title_justify="left")
     for row in rows:
         table.add_row(*[_cell(value) for value in row])
-    console().print(table)
+    return table
 
 
 def gibibytes(count: int) -> str:
@@ -44,6 +51,63 @@ def _cell(value: Any) -> str:
         return ""
     text = f"{value:.4g}" if isinstance(value, float) else str(value)
     return text.replace("[", r"\[")
+
+
+class LiveTable:
+    """A table on standard output that changes in place.
+
+    Without a terminal there are lines: at once where a state changes, and else, of what
+    changes, one every ten seconds.
+
+    Attributes:
+        alive: Whether there is a terminal to draw on.
+    """
+
+    def __init__(self) -> None:
+        self._console = console()
+        self.alive = self._console.is_terminal
+        self._live: Live | None = None
+        self._said: dict[str, tuple[float, str, str]] = {}
+
+    def __enter__(self) -> "LiveTable":
+        if self.alive:
+            self._live = Live(console=self._console, auto_refresh=False)
+            self._live.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def draw(
+        self, title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], words: str
+    ) -> None:
+        """Show a table, and words below it, in the place of what was shown before."""
+        if self._live is None:
+            return
+        table = Table(
+            title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0)
+        )
+        cells = [[_cell(value) for value in row] for row in rows]
+        for place, name in enumerate(columns):
+            widest = max([len(name), *(len(row[place]) for row in cells)])
+            last = place == len(columns) - 1  # Where it is narrow, this one is cut.
+            table.add_column(name, no_wrap=True, min_width=None if last else widest)
+        for row in cells:
+            table.add_row(*row)
+        self._live.update(Group(table, Text(words)), refresh=True)
+
+    def tell(self, name: str, state: str, words: str) -> None:
+        """Say how one thing stands, in a line; nothing if there is no news worth it."""
+        said_at, said_state, said = self._said.get(name, (-QUIET_S, "", ""))
+        now = time.monotonic()
+        if words == said or (state == said_state and now - said_at < QUIET_S):
+            return
+        self._said[name] = (now, state, words)
+        if words:
+            line = f"{name}: {words}" if name else words
+            sys.stdout.write(f"{time.strftime('%H:%M:%S')} {line}\n")
+            sys.stdout.flush()
 
 
 class Screen:
@@ -114,6 +178,11 @@ _LINES = {
     "stage-cached": "{stage}: cached ({units} units)",
     "stage-started": "{stage}: {units} units, {made} of them made before",
     "unit-failed": "{stage}: unit {unit} failed: {error}",
+    "worker-full": "{stage}: worker {worker} is restarted, as it fills its memory "
+    "({memory_gib} GiB)",
+    "worker-lost": "{stage}: worker {worker} is lost; what it had under way begins again",
+    "workers-missing": "{stage}: there are no workers; waiting {patience_min:g} minutes "
+    "for one",
     "stage-done": "{stage}: made; {figures}",
     "stage-failed": "{stage}: failed; the log tells more, and the next run tries again",
     "stage-skipped": "{stage}: skipped, as what it needs is not made",

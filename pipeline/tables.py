@@ -1,19 +1,23 @@
 """What is printed of stages, their scores, exports, and the state of a root."""
 
+import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.doctor import Check
+from pipeline.gauge import amount, clock_time, rate
 from pipeline.root import KEY_DIGITS, Root, read_json
 from pipeline.runner import Result
-from pipeline.screen import console, gibibytes, show_table
+from pipeline.screen import LiveTable, console, gibibytes, show_table
 from pipeline.settings import StageEntry
 from pipeline.status import Standing
 from pipeline.sweep import Garbage
+from pipeline.watch import Look, Row
 
 if TYPE_CHECKING:
     from pipeline.export import Exported
+    from pipeline.towns import Written
     from pipeline.wosac import Official
 
 SCENES_PER_TABLE = 5
@@ -28,6 +32,62 @@ def show_standings(found: Sequence[Standing]) -> None:
         for each in found
     ]
     show_table("stages", ("stage", "state", "units", "key", "why"), rows)
+
+
+_WATCHED = (
+    *("stage", "state", "done", "rate", "left", "memory", "at work"),
+    *("quarantined", "failed", "note"),
+)
+
+
+def show_look(table: LiveTable, look: Look) -> None:
+    """Show how stages stand at one moment, in place or in lines."""
+    runs = dict.fromkeys(row.run for row in look.rows if row.run)
+    words = "\n".join([*runs, look.trouble]).strip()
+    rows = [_watched(row) for row in look.rows]
+    if not table.alive:
+        for row, (name, state, *cells) in zip(look.rows, rows, strict=True):
+            told = ", ".join([str(state), *_said(cells)])
+            table.tell(str(name), f"{state} {row.failed}", told)
+        table.tell("", words, words)
+        return
+    # Columns that would be empty are left out.
+    used = [at for at in range(len(_WATCHED)) if any(row[at] is not None for row in rows)]
+    title = time.strftime("stages at %H:%M:%S", time.localtime(look.time_s))
+    columns = [_WATCHED[at] for at in used]
+    table.draw(title, columns, [[row[at] for at in used] for row in rows], words)
+
+
+def _watched(row: Row) -> tuple[str | int | None, ...]:
+    return (
+        row.stage,
+        row.state,
+        _done(row),
+        rate(row.per_s) if row.per_s is not None else None,
+        clock_time(row.left_s) if row.left_s is not None else None,
+        gibibytes(row.memory_bytes) if row.memory_bytes is not None else None,
+        row.at_work or None,
+        row.quarantined,
+        row.failed or None,
+        row.note or None,
+    )
+
+
+def _done(row: Row) -> str | None:
+    if row.done is None or row.units is None:
+        return None
+    what = "" if row.what == "units" else f" {row.what}"
+    return f"{amount(row.done)} of {amount(row.units)}{what}"
+
+
+def _said(cells: Sequence[str | int | None]) -> list[str]:
+    """The cells after name and state, in words."""
+    forms = ("{}", "{}", "{} left", "{}", "{} at work", "{} quarantined", "{} failed", "{}")
+    return [
+        form.format(cell)
+        for form, cell in zip(forms, cells, strict=True)
+        if cell is not None
+    ]
 
 
 def graph_text(stages: Iterable[StageEntry], *, mermaid: bool) -> str:
@@ -79,6 +139,19 @@ def show_checks(checks: Sequence[Check]) -> None:
     """Print what was looked at, and how it is."""
     rows = [(check.what, check.state, check.note) for check in checks]
     show_table("doctor", ("what", "state", "note"), rows)
+
+
+def show_towns(found: "Written") -> None:
+    """Print what was written."""
+    rows = [
+        ("written", found.out),
+        ("scenes", found.scenes),
+        ("files", len(found.files)),
+        ("size", gibibytes(found.bytes)),
+    ]
+    if found.before:
+        rows.append(("files written before", found.before))
+    show_table("towns", ("what", "value"), rows)
 
 
 def show_exported(found: "Exported") -> None:

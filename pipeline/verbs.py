@@ -2,23 +2,28 @@
 
 import json
 import os
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import typer
 
 from pipeline import stopping, tables
 from pipeline.events import Events
-from pipeline.options import Running
+from pipeline.options import Asked, Running
 from pipeline.request import Request
 from pipeline.runner import Result
 from pipeline.runner import run as make
-from pipeline.screen import Screen
+from pipeline.screen import LiveTable, Screen
 from pipeline.status import Standing, standings
+from pipeline.watch import Look, Watcher
 
 FAILED, WRONG, STALE, LOCKED = 1, 2, 3, 75
 """Exit codes, as ``cli.py`` tells them."""
+IDLE_LOOKS = 2
 
 
 def run_stages(
@@ -66,6 +71,40 @@ def find_standings(
     """Find how the stages stand that the targets need; all of them without targets."""
     plan = request.plan(targets, os.environ)
     return standings(plan, request.made(), strict_code=strict_code)
+
+
+def watch_stages(asked: Asked, every_s: float, *, as_json: bool, check: bool) -> None:
+    """Show how stages stand, again and again: until a signal comes, or nothing runs.
+
+    Args:
+        asked: What is watched.
+        every_s: Seconds between two looks.
+        as_json: One line of JSON per look.
+        check: End when nothing runs (any more), with the code that says if any is stale.
+    """
+    watcher = Watcher(asked.request, os.environ)
+    show, shown = _lookers(as_json=as_json)
+    with stopping.listening(), shown:
+        idle = 0  # Looks in a row. Between two stages, too, nothing runs for a moment.
+        while True:
+            look = watcher.look()
+            show(look)
+            idle = 0 if look.running else idle + 1
+            if check and idle == IDLE_LOOKS:
+                break
+            time.sleep(every_s)
+    if not look.rows or any(row.state != "cached" for row in look.rows):
+        raise typer.Exit(STALE)
+
+
+def _lookers(
+    *, as_json: bool
+) -> tuple[Callable[[Look], None], AbstractContextManager[object]]:
+    """Who shows a look, and what is to be left when there is no more to show."""
+    if as_json:
+        return lambda look: typer.echo(json.dumps(asdict(look))), nullcontext()
+    table = LiveTable()
+    return partial(tables.show_look, table), table
 
 
 def _check_quarantine(request: Request, results: Sequence[Result], max_bad: float) -> None:

@@ -55,12 +55,20 @@ class Outcome:
     trace: str = ""
 
 
+Tell = Callable[..., None]
+"""``tell(event, **figures)``: of what happens to workers."""
+
+
 @runtime_checkable
 class Executor(Protocol):
     """Does tasks, and yields what became of each as it is known."""
 
     def run(
-        self, tasks: Sequence[Task], go_on: Callable[[], bool], progress: Progress
+        self,
+        tasks: Sequence[Task],
+        go_on: Callable[[], bool],
+        progress: Progress,
+        tell: Tell,
     ) -> Iterator[Outcome]:
         """Do all tasks; begin no more once ``go_on()`` is False."""
 
@@ -69,7 +77,11 @@ class InProcess:
     """Does one task after the other, here."""
 
     def run(
-        self, tasks: Sequence[Task], go_on: Callable[[], bool], progress: Progress
+        self,
+        tasks: Sequence[Task],
+        go_on: Callable[[], bool],
+        progress: Progress,
+        tell: Tell,
     ) -> Iterator[Outcome]:
         """Do all tasks; begin no more once ``go_on()`` is False."""
         for task in tasks:

@@ -2,11 +2,17 @@
 
     python tests/kill_and_resume.py --kills 20 --records '../data/*.tfrecord*'
     python tests/kill_and_resume.py --kills 20 --profile tiny --stages train --workers
+    python tests/kill_and_resume.py --kills 10 --profile tiny --stages rollout \\
+        --set ingest.limit=6 rollout.scenes=6 rollout.count=2 \\
+        --victims run worker scheduler
 
-For each stage and kill: start the stage in a process group of its own, wait until it is at
-work, SIGKILL the group at a random (seeded) moment, check that all that looks whole is
-whole, run again, and compare what was made with what an uninterrupted run made. At last
-compare the in-process executor with one, two and four workers.
+For each stage and kill: start the stage, wait until it is at work, SIGKILL a victim at a
+random (seeded) moment, check that all that looks whole is whole, run again, check that only
+what was not done is done again, and compare what was made with what an uninterrupted run
+made. The victim is the whole run (its process group) or, of a Dask cluster of processes of
+their own, a worker or the scheduler. A run must survive the loss of a worker, and end with
+exit code 1 and one line about it when the scheduler is lost. At last compare the in-process
+executor with one, two and four workers.
 """
 
 import argparse
@@ -20,22 +26,30 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(HERE))
 
 from pipeline.manifest import verify  # noqa: E402
-from pipeline.root import Root  # noqa: E402
+from pipeline.root import MANIFEST, Root  # noqa: E402
+from tests.clusters import Cluster  # noqa: E402
 
 STAGES = ("ingest", "build-vocab", "tokenize")
+VICTIMS = ("run", "worker", "scheduler")
 WORKERS = ("local:1", "local:2", "local:4")
 PER_RUN = {"run.json", "lock", "attempt.json", "pace.jsonl"}
 POLL_S = 0.005
 TRIES = 4
 """A kill that comes when all is done does not count; the next draws another moment."""
 LONGEST_S = 600
+CLUSTER_WORKERS = 2
+LOST = "the Dask scheduler"
+FAILED = 1
 
 
 @dataclass(frozen=True)
@@ -78,18 +92,56 @@ class Trial:
                 return times[-1] - times[0]
         raise SystemExit(f"no log says that {stage} was made")
 
-    def kill_once(self, stage: str, root: Path, delay_s: float) -> bool:
-        """Start a stage and kill it so long after it began; False if it was done before."""
-        running = self.start(stage, root)
-        attempt = Root(root).attempt(stage)
-        while running.poll() is None and not attempt.exists():
-            time.sleep(POLL_S)
-        time.sleep(delay_s)
-        killed = running.poll() is None
-        if killed:
-            os.killpg(running.pid, signal.SIGKILL)
-        running.communicate()
-        return killed
+    def kill_once(
+        self, stage: str, root: Path, victim: str, delay_s: float, number: int
+    ) -> bool:
+        """Start a stage and kill so long after it began; False if it was done before."""
+        if victim == "run":
+            running = self.start(stage, root)
+            kill = partial(os.killpg, running.pid, signal.SIGKILL)
+            return _kill(running, stage, root, delay_s, kill)[0]
+        folder = self.folder / "cluster"
+        folder.mkdir(exist_ok=True)
+        cluster = Cluster(folder, [str(HERE)])
+        kills = {
+            "worker": partial(cluster.kill_worker, number),
+            "scheduler": cluster.kill_scheduler,
+        }
+        try:
+            cluster.start(CLUSTER_WORKERS)
+            running = self.start(stage, root, "--dask", cluster.words)
+            in_time, said = _kill(running, stage, root, delay_s, kills[victim])
+        finally:
+            cluster.stop()
+        lost = victim == "scheduler" and LOST in said.splitlines()[-1]
+        if running.returncode and not (lost and running.returncode == FAILED):
+            raise SystemExit(f"{stage} left with {running.returncode}:\n{said}")
+        return in_time
+
+
+def _kill(
+    running: subprocess.Popen,
+    stage: str,
+    root: Path,
+    delay_s: float,
+    kill: Callable[[], None],
+) -> tuple[bool, str]:
+    """Kill at a moment of a stage; tell if it was in time, and all the run said."""
+    attempt = Root(root).attempt(stage)
+    while running.poll() is None and not attempt.exists():
+        time.sleep(POLL_S)
+    time.sleep(delay_s)
+    in_time = running.poll() is None
+    if in_time:
+        kill()
+    said, _ = running.communicate(timeout=LONGEST_S)
+    return in_time, said
+
+
+def done_units(root: Path, stage: str) -> dict[str, int]:
+    """When each unit that is there was made, in the file system's own time."""
+    manifests = Root(root).units(stage).glob(f"*/{MANIFEST}")
+    return {path.parent.name: path.stat().st_mtime_ns for path in manifests}
 
 
 def digest(root: Path, stages: tuple[str, ...] = STAGES) -> dict[str, str]:
@@ -110,25 +162,50 @@ def compare(found: dict[str, str], expected: dict[str, str], what: str) -> None:
         raise SystemExit(f"{what}: {len(differ)} files differ: {differ[:5]}")
 
 
-def kill_stage(trial: Trial, stage: str, quiet: Path, kills: int, seed: int) -> None:
-    """Kill a stage so often, and check what is there after each kill and each new run."""
-    root = trial.folder / f"killed-{stage}"
+def kill_stage(
+    trial: Trial, stage: str, quiet: Path, kills: int, seed: int, victim: str = "run"
+) -> int:
+    """Kill a stage so often, and check what is there after each kill and each new run.
+
+    Returns:
+        Units that were done before kills, and stayed as they were.
+    """
+    root = trial.folder / f"killed-{stage}-{victim}"
     shutil.copytree(quiet, root, symlinks=True)
     expected, length_s = digest(quiet, (stage,)), trial.seconds(stage, quiet)
-    draw = random.Random(f"{seed} {stage}")
-    in_time = number = 0
+    draw = random.Random(f"{seed} {stage} {victim}")
+    in_time = number = kept = 0
     while in_time < kills:
         number += 1
         if number > TRIES * kills:
             raise SystemExit(f"{stage}: only {in_time} of {number} kills came in time")
         shutil.rmtree(Root(root).stage(stage))
         delay_s = draw.uniform(0, length_s)
-        in_time += trial.kill_once(stage, root, delay_s)
+        in_time += trial.kill_once(stage, root, victim, delay_s, number)
+        what = f"{stage}, kill {number} of a {victim} after {delay_s:.3f} s"
         damage = list(verify(Root(root), full=True))
         if damage:
-            raise SystemExit(f"{stage}, kill {number} after {delay_s:.3f} s: {damage}")
+            raise SystemExit(f"{what}: {damage}")
+        before = done_units(root, stage)
+        kept += len(before)
         trial.make(stage, root)
-        compare(digest(root, (stage,)), expected, f"{stage}, kill {number}")
+        compare(digest(root, (stage,)), expected, what)
+        if not before.items() <= done_units(root, stage).items():
+            raise SystemExit(f"{what}: units that were done were done again")
+    shutil.rmtree(root)
+    return kept
+
+
+def compare_workers(
+    trial: Trial, workers: str, quiet: Path, stages: tuple[str, ...]
+) -> None:
+    """Make some stages of a quiet run again, by some workers."""
+    root = trial.folder / workers.replace(":", "-")
+    shutil.copytree(quiet, root, symlinks=True)
+    for stage in stages:
+        shutil.rmtree(Root(root).stage(stage))
+    trial.make(stages[-1], root, "--dask", workers)
+    compare(digest(root, stages), digest(quiet, stages), f"--dask {workers}")
     shutil.rmtree(root)
 
 
@@ -147,20 +224,25 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--stages", nargs="*", default=list(STAGES))
     parser.add_argument("--workers", nargs="*", default=list(WORKERS))
+    parser.add_argument("--victims", nargs="*", default=["run"], choices=VICTIMS)
+    parser.add_argument("--set", nargs="*", default=[], help="stage.key=value")
     asked = parser.parse_args(arguments)
+    stages = tuple(asked.stages or STAGES)
     with tempfile.TemporaryDirectory() as folder:
         words = ("--records", asked.records, "--profile", asked.profile)
-        trial = Trial(words, Path(folder))
+        settings = [word for given in asked.set for word in ("-s", given)]
+        trial = Trial((*words, *settings), Path(folder))
         quiet = trial.folder / "quiet"
-        trial.make((asked.stages or STAGES)[-1], quiet)
-        say(f"quiet run: {len(digest(quiet))} files")
-        for stage in asked.stages:
-            kill_stage(trial, stage, quiet, asked.kills, asked.seed)
-            say(f"{stage}: killed {asked.kills} times, all bytes equal after a new run")
+        trial.make(stages[-1], quiet)
+        say(f"quiet run: {len(digest(quiet, stages))} files of {', '.join(stages)}")
+        for stage, victim in product(asked.stages, asked.victims):
+            kept = kill_stage(trial, stage, quiet, asked.kills, asked.seed, victim)
+            say(
+                f"{stage}: a {victim} killed {asked.kills} times, all bytes equal after a "
+                f"new run; {kept} units done before stayed as they were"
+            )
         for workers in asked.workers:
-            root = trial.folder / workers.replace(":", "-")
-            trial.make(STAGES[-1], root, "--dask", workers)
-            compare(digest(root), digest(quiet), f"--dask {workers}")
+            compare_workers(trial, workers, quiet, stages)
             say(f"--dask {workers}: all bytes equal to --dask none")
 
 

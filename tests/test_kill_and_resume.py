@@ -31,7 +31,28 @@ def test_a_killed_stage_comes_out_byte_for_byte_when_run_again(trial, quiet, sta
 
 
 def test_two_workers_write_the_bytes_of_one_process(trial, quiet):
-    root = trial.folder / "two-workers"
-    trial.make(script.STAGES[-1], root, "--dask", "local:2")
+    script.compare_workers(trial, "local:2", quiet, script.STAGES)
 
-    script.compare(script.digest(root), script.digest(quiet), "--dask local:2")
+
+PLAYED = ("ingest.limit=6", "rollout.scenes=6", "rollout.count=2")
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory):
+    """A job that plays six built-in scenes by weights of seconds, and its quiet root."""
+    settings = [word for given in PLAYED for word in ("-s", given)]
+    words = ("--records", "builtin", "--profile", "tiny", *settings)
+    trial = script.Trial(words, tmp_path_factory.mktemp("played"))
+    trial.make("rollout", trial.folder / "quiet")
+    return trial, trial.folder / "quiet"
+
+
+@pytest.mark.parametrize("victim", script.VICTIMS)
+def test_rollouts_come_out_byte_for_byte_whatever_is_killed(played, victim):
+    trial, quiet = played
+    script.kill_stage(trial, "rollout", quiet, kills=1, seed=1, victim=victim)
+
+
+def test_two_workers_play_the_bytes_of_one_process(played):
+    trial, quiet = played
+    script.compare_workers(trial, "local:2", quiet, ("rollout",))

@@ -17,7 +17,6 @@ _COLOURS = """
 @media print { :root { --paper: #fff; --ink: #000; } }
 """
 _PAGE = """
-@media print { figure, table { break-inside: avoid; } }
 body { background: var(--paper); color: var(--ink); font: 15px/1.5 system-ui, sans-serif;
   max-width: 1120px; margin: 2em auto; padding: 0 1em; }
 h2 { margin-top: 2em; border-bottom: 1px solid var(--faint); }
@@ -26,9 +25,20 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size
 th, td { padding: .15em .7em; border-bottom: 1px solid var(--faint); text-align: right; }
 th:first-child, td:first-child, td.text { text-align: left; }
 .note { color: var(--quiet); max-width: 72ch; }
+a { color: var(--c0); }
 .figures { display: flex; flex-wrap: wrap; gap: 1em; }
 figure { margin: 0; max-width: 100%; }
 svg { max-width: 100%; height: auto; }
+iframe { width: 100%; height: 40em; border: 1px solid var(--faint); }
+@media print {
+  @page { margin: 12mm; }
+  body { max-width: none; margin: 0; padding: 0; font-size: 11px; }
+  figure, tr { break-inside: avoid; }
+  h2, h3 { break-after: avoid; }
+  .wide { overflow: visible; }
+  table { font-size: 8.5px; }
+  th, td { padding: .1em .4em; overflow-wrap: anywhere; }
+}
 """
 _DRAWING = (
     """
@@ -97,6 +107,15 @@ def figures(drawings: Sequence[str]) -> str:
         '<div class="figures">'
         + "".join(f"<figure>{d}</figure>" for d in drawings)
         + "</div>"
+    )
+
+
+def inset(path: str, words: str) -> str:
+    """Show another page that lies beside this one, with words that name it."""
+    place = escape(path, quote=True)
+    return (
+        f'<p class="note">{escape(words)} <a href="{place}">{place}</a></p>'
+        f'<iframe title="{place}" src="{place}"></iframe>'
     )
 
 

@@ -28,17 +28,22 @@ class Table:
         columns: Names of the columns.
         rows: Cells; None where there is nothing.
         note: Below it.
+        links: Page that the first cell of each row leads to; empty for none. In HTML only.
     """
 
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     note: str = ""
+    links: Sequence[str] = ()
 
     def to_html(self) -> str:
         """Write it for a page."""
         head = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
         rows = ["".join(_html_cell(cell) for cell in row) for row in self.rows]
+        for at, page in enumerate(self.links):
+            if page:
+                rows[at] = _linked(rows[at], page)
         body = "".join(f"<tr>{row}</tr>" for row in rows)
         note = f'<p class="note">{escape(self.note)}</p>' if self.note else ""
         return (
@@ -113,6 +118,12 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Cell
 def _html_cell(cell: Cell) -> str:
     look = ' class="text"' if isinstance(cell, str) else ""
     return f"<td{look}>{escape(words(cell))}</td>"
+
+
+def _linked(row: str, page: str) -> str:
+    """Make a link of the first cell of a row of HTML."""
+    head, words, rest = re.split(r"(?<=>)([^<]*)(?=</td>)", row, maxsplit=1)
+    return f'{head}<a href="{escape(page, quote=True)}">{words}</a>{rest}'
 
 
 def markdown(text: str) -> str:

@@ -1,16 +1,21 @@
+import functools
 import os
-import subprocess
+import re
 import sys
 import threading
 import time
 
+import dask
+import distributed
 import pytest
 
 from infgen.config import ConfigError
-from pipeline.cluster import Workers, parse
+from pipeline.cluster import Workers, gpu_workers, parse, pick_gpus
+from pipeline.dispatch import WorkersLostError
 from pipeline.locks import LockedError
 from pipeline.runner import Orders
 from pipeline.work import InProcess
+from tests.clusters import Cluster
 
 # Dask leaves sockets and child processes to the garbage collector when it closes.
 pytestmark = [
@@ -55,6 +60,49 @@ def test_without_a_device_gpu_workers_are_refused():
         workers.executor(here=False)
 
 
+@pytest.mark.parametrize(
+    ("wanted", "visible", "names"),
+    [
+        ("", None, ["0", "1", "2"]),
+        ("0,2", None, ["0", "2"]),
+        ("", "5,6,7", ["5", "6", "7"]),
+        ("1", "5, GPU-ab12 ,7", ["GPU-ab12"]),
+    ],
+)
+def test_devices_are_named_as_this_process_sees_them(monkeypatch, wanted, visible, names):
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 3)
+
+    assert pick_gpus(wanted, visible) == names
+
+
+@pytest.mark.parametrize("wanted", ["3", "0,0"])
+def test_devices_that_are_not_there_are_refused(monkeypatch, wanted):
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 3)
+
+    with pytest.raises(ConfigError, match=f"--dask gpu:{wanted}: expected .* from 0 to 2"):
+        pick_gpus(wanted, None)
+
+
+def seen_by_this_process():
+    return os.environ["CUDA_VISIBLE_DEVICES"], "torch" in sys.modules
+
+
+@pytest.mark.slow
+def test_each_gpu_worker_sees_its_own_device_before_it_imports_anything():
+    options = {"host": "127.0.0.1", "dashboard": False}
+    scheduler = {"cls": distributed.Scheduler, "options": options}
+    workers = gpu_workers(["4", "GPU-ab12"])
+    assert workers["4"]["options"]["nthreads"] == 1
+
+    with (
+        distributed.SpecCluster(workers=workers, scheduler=scheduler) as started,
+        distributed.Client(started, set_as_default=False) as client,
+    ):
+        found = client.run(seen_by_this_process)
+
+    assert sorted(found.values()) == [("4", False), ("GPU-ab12", False)]
+
+
 @pytest.mark.slow
 def test_workers_write_the_same_bytes_as_this_process(workshop):
     for number in range(6):
@@ -84,33 +132,160 @@ def test_a_unit_that_fails_or_kills_its_worker_is_recorded_and_the_rest_goes_on(
     assert not list(workshop.root.store.rglob("c.txt*"))
 
 
-SCHEDULER = """
-import sys, time
-from distributed import LocalCluster
-if __name__ == "__main__":
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
-        print(cluster.scheduler_address, flush=True)
-        time.sleep(60)
-"""
+@pytest.fixture
+def cluster(tmp_path):
+    """``cluster(workers, **settings)``: how it is named to a run, and the cluster."""
+    started = []
+
+    def start(workers=1, **settings):
+        # One death of a worker is enough to suspect a unit.
+        once = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+        paths = [str(path) for path in sys.path if path]
+        started.append(Cluster(tmp_path, paths, environment=once, **settings))
+        started[-1].start(workers)
+        return started[-1].words, started[-1]
+
+    yield start
+    for cluster in started:
+        cluster.stop()
+
+
+def in_background(job):
+    """Run a job in a thread; what it returns or raises is put in a list."""
+    found = []
+
+    def run():
+        try:
+            found.append(job())
+        except Exception as error:
+            found.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread, found
+
+
+def wait_for(condition, limit_s=120):
+    begun = time.monotonic()
+    while not condition():
+        assert time.monotonic() - begun < limit_s
+        time.sleep(0.02)
+
+
+def done_units(workshop):
+    return {path.parent for path in workshop.root.units("count").glob("*/manifest.json")}
 
 
 @pytest.mark.slow
-def test_a_cluster_that_is_already_there_is_used(workshop):
-    path = os.pathsep.join([str(p) for p in sys.path if p])
-    process = subprocess.Popen(
-        [sys.executable, "-c", SCHEDULER],
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": path},
-    )
-    try:
-        address = process.stdout.readline().strip()
-        results = workshop.run(orders=Orders(workers=address))
-    finally:
-        process.kill()
-        process.communicate()
+def test_a_cluster_that_is_already_there_is_used(workshop, cluster):
+    words, _ = cluster()
+
+    results = workshop.run(orders=Orders(workers=words))
 
     assert results["count"].made == 2
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_told_of_and_its_unit_begins_again(workshop, cluster):
+    words, started = cluster(workers=1)
+    events = []
+    job = functools.partial(
+        workshop.run, "count.sleep_s=3", orders=Orders(workers=words), events=events
+    )
+
+    running, found = in_background(job)
+    wait_for(lambda: list(workshop.root.units("count").glob("*.partial")))
+    started.kill_worker(0)
+    running.join(timeout=120)
+
+    assert found[0]["count"].state == "made"
+    (lost,) = [event for event in events if event["event"] == "worker-lost"]
+    assert lost["units"]
+    assert {each["unit"] for each in events if each["event"] == "unit-done"} >= {"a.txt"}
+
+
+@pytest.mark.slow
+def test_a_worker_that_fills_its_memory_is_restarted_and_told_of(workshop, cluster):
+    words, _ = cluster(workers=1, memory_limit="400MiB")
+    workshop.text("c.txt", "hoard")
+    workshop.text("d.txt", "after it")
+    events = []
+    orders = Orders(workers=words, keep_going=True)
+
+    results = workshop.run(orders=orders, targets=("count",), events=events)
+
+    assert results["count"].made == 3
+    assert list(results["count"].errors) == ["c.txt"]
+    assert "KilledWorker" in results["count"].errors["c.txt"]
+    assert "filled its memory" in results["count"].errors["c.txt"]
+    told = [event["event"] for event in events]
+    assert told.count("worker-full") == 2, "it is tried again, alone, and no more"
+    assert 0.3 < next(e for e in events if e["event"] == "worker-full")["memory_gib"] < 1.1
+    assert "worker-lost" in told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("tcp://127.0.0.1:1", "scheduler tcp://127.0.0.1:1 does not answer"),
+        ("file:there/is/none.json", "no Dask scheduler has written there/is/none.json"),
+    ],
+)
+def test_a_scheduler_that_is_not_there_ends_the_run(workshop, monkeypatch, words, says):
+    monkeypatch.setattr("pipeline.cluster.SILENT_S", 0.3)
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
+        pytest.raises(WorkersLostError, match=says),
+    ):
+        workshop.run(orders=Orders(workers=words))
+
+
+@pytest.mark.slow
+def test_a_lost_scheduler_ends_the_run_and_the_next_one_goes_on(workshop, cluster):
+    for number in range(4):
+        workshop.text(f"{number}.txt", "word " * number)
+    words, started = cluster(workers=2)
+    orders = Orders(workers=words, keep_going=True)
+    running, found = in_background(
+        functools.partial(
+            workshop.run, "count.sleep_s=2", orders=orders, targets=("count",)
+        )
+    )
+    wait_for(lambda: done_units(workshop))
+
+    begun = time.monotonic()
+    started.kill_scheduler()
+    running.join(timeout=120)
+    taken_s = time.monotonic() - begun
+    kept = done_units(workshop)
+
+    assert isinstance(found[0], WorkersLostError)
+    assert re.fullmatch(
+        r"the Dask scheduler tcp://\S+ is lost; what is done is kept: run again when there "
+        r"is one",
+        str(found[0]),
+    )
+    assert taken_s < 45
+    result = workshop.run("count.sleep_s=2", targets=("count",))["count"]
+    assert result.state == "made"
+    assert result.made == 6 - len(kept)
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_hangs_ends_the_run(workshop, cluster, monkeypatch):
+    monkeypatch.setattr("pipeline.cluster.SILENT_S", 2.0)
+    monkeypatch.setattr("pipeline.cluster.CLOSE_S", 2.0)
+    words, started = cluster()
+    running, found = in_background(
+        functools.partial(workshop.run, "count.sleep_s=3", orders=Orders(workers=words))
+    )
+    wait_for(lambda: list(workshop.root.units("count").glob("*.partial")))
+
+    started.freeze_scheduler()
+    running.join(timeout=120)
+
+    assert isinstance(found[0], WorkersLostError)
 
 
 def test_a_second_run_queues_if_told_to(workshop):

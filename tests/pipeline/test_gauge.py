@@ -34,6 +34,36 @@ def test_units_are_counted_with_those_made_before(clock):
     assert gauge.words() == "7 of 10 units, 0.5/s, 0:06 left"
 
 
+def test_the_rate_is_that_of_the_last_two_minutes(clock):
+    gauge = Gauge("s", units=1000, before=0, clock=clock)
+    for _ in range(300):  # Five minutes, a unit a second ...
+        clock.now += 1
+        unit_done(gauge)
+    for _ in range(30):  # ... and five more at a tenth of that.
+        clock.now += 10
+        unit_done(gauge)
+
+    assert gauge.per_s == pytest.approx(0.1)
+    assert gauge.left_s == pytest.approx(6700)
+
+
+def test_units_of_several_minutes_that_end_together_have_a_rate_too(clock):
+    gauge = Gauge("s", units=100, before=0, clock=clock)
+    for _ in range(3):
+        clock.now += 300
+        for _ in range(8):  # Eight workers.
+            unit_done(gauge)
+
+    assert gauge.per_s == pytest.approx(8 / 300)
+
+
+def test_many_steps_are_written_in_full(clock):
+    gauge = Gauge("s", units=1, before=0, clock=clock)
+    progress(gauge, 12_345, 2_000_000)
+
+    assert gauge.words() == "12345 of 2000000 steps"
+
+
 def test_part_of_a_unit_counts_in_part(clock):
     gauge = Gauge("s", units=4, before=0, clock=clock)
     unit_done(gauge)

@@ -2,6 +2,7 @@ import csv
 import html
 import json
 import re
+import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import polars as pl
 import pytest
 
 from infgen.config import (
+    ConfigError,
     ReferenceSettings,
     ReportSettings,
     RolloutSettings,
@@ -22,12 +24,18 @@ from infgen.sources.towns import builtin_records
 from infgen.sources.womd import iter_scenes
 from pipeline import ingest, reference, report, rollout, score
 from pipeline.folders import write_json
+from pipeline.reference_files import read_counts
 from pipeline.stage import Done, Stage
 from pipeline.store import write_records
 
 SECONDS, SCENES = 12, 2
 SOURCE = "validation.tfrecord-00000-of-00001.gz"
 REFERENCE = {"tokenize": TokenSettings(), "reference": ReferenceSettings()}
+RUN = {
+    "host": "node<7>",
+    "started": "2026-01-01T00:00:00+00:00",
+    "machine": {"processor": "A CPU", "cores": 8, "memory_gib": 31.4, "gpus": ["A GPU"]},
+}
 SETTINGS = {"reference": ReferenceSettings(), "score": ScoreSettings(resamples=20)}
 
 
@@ -47,7 +55,7 @@ class Inputs:
         self._units[stage] = units
 
     def units(self, stage):
-        return self._units[stage]
+        return self._units.get(stage, [])
 
     def folder(self, stage):
         return self._root / stage
@@ -106,9 +114,13 @@ def manifest(root: Path, stage: Stage | str, settings, told, units=(), sources=(
         "sources": dict.fromkeys(sources, "f1nger"),
         "units": [{"name": unit.name, "key": unit.key} for unit in units],
         "report": told,
-        "files": {},
+        "files": {"x": [1000, "c4c"]},
     }
     write_json(root / name / "manifest.json", about)
+    for number, folder in enumerate([root / name, *[unit.path for unit in units]]):
+        if number:
+            write_json(folder / "manifest.json", {"files": {"y": [500, "c4c"]}})
+        write_json(folder / "run.json", {**RUN, "seconds": 2.5 * (number + 1)})
 
 
 def finished(root: Path) -> Inputs:
@@ -163,9 +175,11 @@ def finished(root: Path) -> Inputs:
 def _score(root: Path, inputs: Inputs) -> None:
     done = _do(reference, root, inputs, REFERENCE)
     inputs.add("reference", done)
-    reference.finish(inputs, done, root / "reference", REFERENCE, silent)
+    told = reference.finish(inputs, done, root / "reference", REFERENCE, silent)
+    manifest(root, "reference", {"reference": {"window_s": 8.0}}, told, done)
     done = _do(score, root, inputs, SETTINGS)
     (root / "score").mkdir()
+    inputs.add("score", done)
     told = score.finish(inputs, done, root / "score", SETTINGS, silent)
     settings = {name: asdict(value) for name, value in SETTINGS.items()}
     manifest(root, "score", settings, told, done)
@@ -189,7 +203,12 @@ def write(inputs, folder: Path, **changes):
     settings = replace(ReportSettings(), **changes)
     assert report.plan(inputs, settings) == []
     told = report.finish(inputs, [], folder, settings, silent)
-    return told, {path.name: path.read_text() for path in sorted(folder.iterdir())}
+    files = {path.name: path.read_text() for path in sorted(folder.glob("*.*"))}
+    below = {
+        f"{path.parent.name}/{path.name}": path.read_text()
+        for path in sorted(folder.glob("*/*"))
+    }
+    return told, {**files, **below}
 
 
 @pytest.fixture(scope="module")
@@ -205,7 +224,7 @@ def summary(inputs):
 def test_the_report_comes_in_five_forms(written):
     told, files = written
 
-    assert sorted(files) == [
+    assert sorted(name for name in files if "/" not in name) == [
         "report.html",
         "report.md",
         "table.csv",
@@ -260,9 +279,10 @@ def test_the_page_stands_alone(written):
     page = written[1]["report.html"]
 
     assert page.startswith("<!doctype html>")
-    assert not re.findall(
-        r"(?:src|href)\s*=|@import|url\(|<script|https?://(?!www\.w3)", page
-    )
+    linked = set(re.findall(r'(?:src|href)\s*=\s*"([^"]*)"', page))
+    assert "run/passport.html" in linked
+    assert linked <= written[1].keys()
+    assert not re.findall(r"@import|url\(|<script|https?://(?!www\.w3)", page)
     assert page.count("<svg") == page.count("</svg>")
     assert "nan" not in re.findall(r'd="([^"]*)"', page)
 
@@ -299,6 +319,89 @@ def test_the_passport_names_keys_settings_versions_weights_and_quarantine(writte
         "1 of 1; all are in quarantine.parquet",
     ):
         assert words in page
+
+
+def test_every_table_comes_as_markdown_latex_and_csv(written):
+    files = written[1]
+    titles = re.findall(r"<h3>([^<]*)</h3>", files["report.html"])
+    tables = {name for name in files if name.startswith("tables/")}
+
+    assert len(tables) == 3 * (len(titles) + 1)  # And the histograms, which are drawn.
+    assert files["tables/scores.csv"] == files["table.csv"]
+    assert files["tables/scores.md"] in files["report.md"]
+    assert files["tables/stages.tex"].startswith(r"\begin{table}")
+
+
+def test_histograms_of_logs_and_rollouts_are_drawn_and_listed(written, inputs):
+    page, listed = (written[1][name] for name in ("report.html", "tables/histograms.csv"))
+    rows = list(csv.DictReader(listed.splitlines()))
+
+    drawn = re.findall(r"<title>([^<]*)</title>", page)
+    assert {"Speed", "Collision", "Off-road", "Distance at entry"} <= set(drawn)
+    fast = [
+        row
+        for row in rows
+        if (row["feature"], row["protocol"]) == ("linear_speed", "corrected")
+    ]
+    assert [float(row["to"]) for row in fast] == [2.5 * i for i in range(1, 11)]
+    bins = read_counts(inputs.folder("reference")).bins[1, 0, :10]
+    assert [int(row["logs"]) for row in fast] == bins.tolist()
+    assert sum(int(row["rollouts"]) for row in fast) > 0
+
+
+def test_the_passport_counts_the_bytes_of_stages_and_their_units(written):
+    rows = {
+        row["stage"]: int(row["bytes"])
+        for row in csv.DictReader(written[1]["tables/stages.csv"].splitlines())
+    }
+
+    assert rows["train"] == 1000
+    assert rows["ingest"] == rows["rollout"] == 1000 + 500
+
+
+def test_machines_and_times_stand_on_a_page_beside_the_report(written):
+    page = written[1]["run/passport.html"]
+
+    assert "node&lt;7&gt;" in page
+    for words in ("A CPU", "A GPU", "31.40", "2026-01-01T00:00:00+00:00"):
+        assert words in page
+    assert re.search(r"ingest</td>.*?5.0000</td><td>5.0000</td><td>2.5000", page)
+
+
+def test_the_lowest_rollouts_are_linked_to_pages_that_play_them(written):
+    page = written[1]["report.html"]
+    players = {name for name in written[1] if name.startswith("players/")}
+    rows = list(
+        csv.reader(written[1]["tables/lowest-composites-corrected.csv"].splitlines())
+    )
+
+    assert len(players) == 3
+    for scene, index, _ in rows[1:4]:
+        name = f"players/{scene}-{index}.html"
+        assert f'<a href="{name}">{scene}</a>' in page
+        assert f"rollout {index}" in written[1][name]
+    assert page.count('<a href="players/') == 3
+
+
+def test_without_players_nothing_is_linked(inputs, tmp_path):
+    _, files = write(inputs, tmp_path / "out", players=0)
+
+    assert not [name for name in files if name.startswith("players/")]
+    assert '<a href="players/' not in files["report.html"]
+    with pytest.raises(ConfigError, match=r"report\.players is -1"):
+        ReportSettings(players=-1)
+
+
+def test_times_that_are_lost_are_left_out(inputs, tmp_path):
+    ((done, _),) = [(done, done.path / "run.json") for done in inputs.units("ingest")]
+    kept = (done.path / "run.json").read_text()
+    (done.path / "run.json").write_text("{")
+    try:
+        _, files = write(inputs, tmp_path / "out")
+    finally:
+        (done.path / "run.json").write_text(kept)
+
+    assert re.search(r"ingest</td>.*?<td>-</td><td>-</td>", files["run/passport.html"])
 
 
 def test_what_records_say_is_escaped_everywhere(written):
@@ -347,11 +450,8 @@ def test_a_report_without_any_score_still_says_so(tmp_path, inputs, summary):
             entry.update(mean=None, low=None, high=None, log=None)
     empty["numbers"], empty["wosac"]["scores"] = {}, {}
     root = tmp_path / "root"
-    for stage in ("ingest", "build-vocab", "tokenize", "train", "rollout", "score"):
-        (root / stage).mkdir(parents=True)
-        for path in inputs.folder(stage).iterdir():
-            if path.is_file():
-                (root / stage / path.name).write_bytes(path.read_bytes())
+    for stage in report.STAGES:
+        shutil.copytree(inputs.folder(stage), root / stage)
     write_json(root / "score" / "summary.json", empty)
     schema = {"metric": pl.String, "window": pl.Int32, "value": pl.Float64}
     pl.DataFrame(schema=schema).write_parquet(root / "score" / "curves.parquet")

@@ -94,6 +94,33 @@ def test_the_split_is_cut_into_units_of_a_few_scenes(inputs):
     }
 
 
+@pytest.mark.parametrize(
+    ("scenes", "most", "parts"),
+    [(9, 8, [5, 4]), (17, 8, [6, 6, 5]), (8, 8, [8]), (0, 8, [])],
+)
+def test_units_are_of_about_equal_work(inputs, scenes, most, parts):
+    shard = Done("validation.tfrecord-1", "key", inputs.scenes[1].path, {"scenes": scenes})
+    settings = dataclasses.replace(SETTINGS, scenes_per_task=most)
+
+    units = stage.STAGE.plan(Finished([shard], inputs.weights), settings)
+
+    assert [unit.task["count"] for unit in units] == parts
+    assert [unit.task["first"] for unit in units] == list(np.cumsum([0, *parts])[:-1])
+
+
+def test_the_pace_is_told_and_kept_apart_from_what_is_reproducible(inputs, tmp_path):
+    (unit,) = stage.STAGE.plan(inputs, dataclasses.replace(SETTINGS, scenes=1))
+    told, target = [], tmp_path / "out"
+    target.mkdir()
+
+    report = stage.STAGE.work(unit, target, SETTINGS, lambda *step: told.append(step))
+
+    assert told[-1][:2] == (2.0, 2)
+    assert [step[0] for step in told] == [0.5, 1.0, 1.5, 2.0]
+    assert all(step[2].endswith(" rollouts/s") for step in told)
+    assert report["run"]["rollouts_per_s"] > 0
+
+
 def test_scenes_may_be_limited(inputs):
     units = stage.STAGE.plan(inputs, dataclasses.replace(SETTINGS, scenes=3))
 

@@ -232,7 +232,8 @@ def test_what_varies_between_runs_is_kept_apart(workshop):
 
     about = json.loads((unit / "run.json").read_text())
 
-    assert set(about) == {"host", "report", "seconds", "started"}
+    assert set(about) == {"host", "machine", "report", "seconds", "started"}
+    assert about["machine"]["cores"] == os.cpu_count()
     assert "letters_per_s" in about["report"]
 
 
@@ -276,3 +277,14 @@ def test_every_event_is_a_line_of_the_log(workshop):
     assert names[-1] == "run-ended"
     assert names.count("unit-done") == 5
     assert "progress" not in names
+
+
+def test_progress_is_logged_where_the_log_was_silent_for_long(workshop, monkeypatch):
+    monkeypatch.setattr("pipeline.events.QUIET_S", 0.0)
+
+    workshop.run(targets=("count",))
+
+    (log,) = workshop.root.logs.glob("*.jsonl")
+    events = [json.loads(line) for line in log.read_text().splitlines()]
+    told = [(e["done"], e["total"]) for e in events if e["event"] == "progress"]
+    assert told == [(1, 3), (2, 3), (3, 3)] * 2

@@ -1,7 +1,9 @@
+import re
+
 import pytest
 from rich.console import Console
 
-from pipeline.screen import Screen, gibibytes, show_table
+from pipeline.screen import LiveTable, Screen, gibibytes, show_table
 
 STARTED = {"event": "stage-started", "stage": "count", "key": "k", "units": 3, "made": 1}
 DONE = {"event": "unit-done", "stage": "count", "unit": "a", "seconds": 1.0, "report": {}}
@@ -66,3 +68,47 @@ def test_tables_show_cells_as_they_are(capsys):
 @pytest.mark.parametrize(("count", "words"), [(1500, "0.0 MB"), (3 << 30, "3.00 GiB")])
 def test_bytes_are_written_for_people(count, words):
     assert gibibytes(count) == words
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    console = Console(force_terminal=True, width=60, record=True)
+    monkeypatch.setattr("pipeline.screen.Console", lambda **words: console)
+    return console
+
+
+def test_a_live_table_is_drawn_in_place_and_cuts_its_last_column(terminal):
+    with LiveTable() as table:
+        for done in (1, 2):
+            row = ("count", "running", f"{done} of 3", "[loss] " + 30 * "long ")
+            table.draw("stages", ("stage", "state", "done", "note"), [row], "process 1")
+
+    text = terminal.export_text()
+    assert table.alive
+    assert {"1 of 3", "2 of 3"} <= set(re.findall(r"\d of 3", text))
+    assert "[loss] long" in text
+    assert max(len(line) for line in text.splitlines() if "loss" in line) <= 60
+    assert "process 1" in text
+
+
+def test_without_a_terminal_states_are_told_at_once_and_figures_now_and_then(
+    capsys, monkeypatch
+):
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    with LiveTable() as table:
+        table.draw("stages", ("stage",), [("count",)], "")
+        for second in range(25):
+            now[0] = float(second)
+            table.tell("count", "running", f"running, {second} of 99")
+        table.tell("count", "cached", "cached")
+        table.tell("", "", "")
+
+    lines = [line[9:] for line in capsys.readouterr().out.splitlines()]
+    assert not table.alive
+    assert lines == [
+        "count: running, 0 of 99",
+        "count: running, 10 of 99",
+        "count: running, 20 of 99",
+        "count: cached",
+    ]

@@ -12,11 +12,13 @@ from infgen.scene import (
     RoadEdgeType,
     SignalState,
 )
-from infgen.sources.towns import builtin_records, write_towns
-from infgen.sources.towns.recording import BUILTIN, BUILTIN_SEED
-from infgen.sources.towns.scenes import draw_scene
+from infgen.sources.towns import builtin_records
+from infgen.sources.towns.builtin import BUILTIN, BUILTIN_SEED, NUM_STEPS, builtin_numbers
+from infgen.sources.towns.drawing import draw_scenes
 from infgen.sources.womd import iter_scenes
+from infgen.sources.womd_write import encode_scenario
 from tests.sources.test_womd_write import assert_same
+from tests.sources.towns.conftest import needs_sumo
 
 GRID_M = 75.0
 
@@ -37,53 +39,43 @@ def test_records_that_come_with_the_package_are_small_and_whole(scenes):
         "training.tfrecord-00001-of-00002.gz",
         "validation.tfrecord-00000-of-00001.gz",
     ]
-    assert sum(path.stat().st_size for path in paths) < 3e6
-    assert len(scenes) == sum(count for count, _ in BUILTIN.values()) == 32
+    assert sum(path.stat().st_size for path in paths) < 5e6
+    assert len(scenes) == 2 * sum(towns for towns, _ in BUILTIN.values()) == 32
     assert len({scene.scenario_id for scene in scenes}) == 32
 
 
-@pytest.mark.parametrize(
-    ("split", "number", "row"), [("training", 13, 13), ("validation", 2, 26)]
-)
-def test_built_in_records_are_what_their_seed_draws(scenes, split, number, row):
-    # Within a grid step: another processor may round a sine differently.
-    assert_same(scenes[row], draw_scene(BUILTIN_SEED, split, number), atol=2.0**-7)
-
-
+@needs_sumo
 @pytest.mark.slow
-def test_a_fifth_of_the_built_in_records_is_what_its_seed_draws(scenes):
-    names = [(split, at) for split, (count, _) in BUILTIN.items() for at in range(count)]
-    for scene, (split, number) in list(zip(scenes, names, strict=True))[::5]:
-        assert_same(scene, draw_scene(BUILTIN_SEED, split, number), atol=2.0**-7)
+def test_built_in_records_are_what_their_seed_draws(scenes):
+    row, number = 26, builtin_numbers("validation")[2]
+
+    drawn = list(draw_scenes(BUILTIN_SEED, "validation", NUM_STEPS, number, 2))
+
+    # Within a grid step: another processor may round a sine differently.
+    for at, scene in enumerate(drawn):
+        assert_same(scenes[row + at], scene, atol=2.0**-7)
 
 
-def test_a_seed_always_writes_the_same_bytes(tmp_path):
-    once, twice = (
-        write_towns(tmp_path / name, 2, 5, split="training", scenes_per_file=1)
-        for name in ("once", "twice")
-    )
+@needs_sumo
+@pytest.mark.slow
+def test_a_scene_is_the_same_whoever_draws_it_and_with_which_others():
+    both = list(draw_scenes(5, "training", 40, 3, 2))
+    (alone,) = draw_scenes(5, "training", 40, 4, 1)
 
-    assert [path.name for path in once] == [
-        "training.tfrecord-00000-of-00002.gz",
-        "training.tfrecord-00001-of-00002.gz",
-    ]
-    assert [a.read_bytes() for a in once] == [b.read_bytes() for b in twice]
-    # A scene depends on its number in the split, not on the file it is in.
-    assert_same(next(iter(iter_scenes(once[1]))), draw_scene(5, "training", 1))
+    assert encode_scenario(both[1]) == encode_scenario(alone)
+    assert both[0].scenario_id != alone.scenario_id
 
 
-def test_seed_and_split_change_the_scene(scenes):
-    other = draw_scene(BUILTIN_SEED + 1, "training", 0)
+@needs_sumo
+@pytest.mark.slow
+def test_scenes_may_be_longer_than_womds():
+    (scene,) = draw_scenes(2, "validation", 311, 0, 1)
 
-    ids = {scene.scenario_id for scene in (other, scenes[0], scenes[24])}
-    sizes = {len(scene.road_map.xyz_m) for scene in (other, scenes[0], scenes[24])}
-    assert len(ids) == len(sizes) == 3
-
-
-@pytest.mark.parametrize(("scenes", "per_file"), [(0, 1), (1, 0)])
-def test_nothing_to_write_is_an_error(tmp_path, scenes, per_file):
-    with pytest.raises(ValueError, match="expected 1 or more"):
-        write_towns(tmp_path, scenes, 1, split="training", scenes_per_file=per_file)
+    assert scene.tracks.num_steps == len(scene.timestamps_s) == 311
+    assert scene.tracks.valid[scene.ego].all()
+    # The truth goes on: agents come and go to the end.
+    last = scene.tracks.valid[:, 200:]
+    assert (~last[:, 0] & last.any(axis=1)).sum() > 3
 
 
 # Scenes
@@ -135,16 +127,22 @@ def test_values_of_steps_that_are_not_seen_are_the_records_zeros(scenes):
         assert not scene.tracks.velocity_mps[unseen].any()
 
 
-def test_vehicles_stay_on_the_road(scenes):
+def test_vehicles_that_move_stay_on_the_road(scenes):
     # The road lies to the left of a road edge.
-    outside = np.concatenate([_off_road_m(scene) > 0 for scene in scenes])
-    assert outside.mean() < 0.005
+    outside = np.concatenate([_off_road_m(scene) > 0.15 for scene in scenes])
+    assert outside.mean() < 0.01
 
 
-def _off_road_m(scene):
+def test_cars_are_parked_off_the_road_too(scenes):
+    outside = np.concatenate([_off_road_m(scene, moving=False) > 0 for scene in scenes])
+    assert 0.2 < outside.mean() < 0.8
+
+
+def _off_road_m(scene, *, moving=True):
     """Signed distance to the nearest road edge of each vehicle's most off-road corner."""
     tracks = scene.tracks
-    rows = tracks.kind == AgentKind.VEHICLE
+    moves = np.linalg.norm(tracks.velocity_mps, axis=-1).max(axis=1) > 0.5
+    rows = (tracks.kind == AgentKind.VEHICLE) & (moves == moving)
     pose = np.concatenate([tracks.xyz_m[..., :2], tracks.heading_rad[..., None]], axis=-1)
     shown = tracks.valid[rows][:, ::15]
     corners_m = box_corners(pose[rows][:, ::15], tracks.size_lwh_m[rows][:, ::15, :2])[
@@ -173,7 +171,9 @@ def _signed_m(points_m, start_m, way_m):
     return np.sign(right) * apart_m[rows, nearest]
 
 
-def test_vehicles_do_not_overlap(scenes):
+def test_vehicles_hardly_ever_overlap(scenes):
+    # Some cut a corner past who waits there.
+    shares = []
     for scene in scenes:
         tracks = scene.tracks
         cars = np.flatnonzero(tracks.kind == AgentKind.VEHICLE)
@@ -183,7 +183,8 @@ def test_vehicles_do_not_overlap(scenes):
                 [tracks.xyz_m[rows, step, :2], tracks.heading_rad[rows, step]]
             )
             corners_m = box_corners(pose, 0.97 * tracks.size_lwh_m[rows, step, :2])
-            assert not _overlaps(corners_m).any()
+            shares += _overlaps(corners_m).any(axis=1).tolist()
+    assert np.mean(shares) < 0.003
 
 
 def _overlaps(corners_m):
@@ -203,11 +204,14 @@ def test_motion_is_smooth(scenes):
         cars = tracks.kind == AgentKind.VEHICLE
         step_m = np.linalg.norm(np.diff(tracks.xyz_m[cars, :, :2], axis=1), axis=-1)
         both = tracks.valid[cars, 1:] & tracks.valid[cars, :-1]
-        accel_mps2 = np.diff(step_m / 0.1, axis=1) / 0.1
         turned_rad = wrap_angle(np.diff(tracks.heading_rad[cars], axis=1))
-        assert np.abs(accel_mps2[both[:, 1:] & both[:, :-1]]).max() < 8
-        assert np.abs(turned_rad[both]).max() < 0.1
-        assert step_m[both].max() < 2.2
+        # Half a second of it, so that the tracker's errors do not count.
+        later = tracks.velocity_mps[cars, 5:] - tracks.velocity_mps[cars, :-5]
+        whole = tracks.valid[cars, 5:] & tracks.valid[cars, :-5]
+        accel_mps2 = np.linalg.norm(later, axis=-1) / 0.5
+        assert accel_mps2[whole].max() < 8
+        assert np.abs(turned_rad[both]).max() < 0.15
+        assert step_m[both].max() < 3.0
 
 
 def test_velocity_is_the_change_of_position(scenes):
@@ -216,7 +220,7 @@ def test_velocity_is_the_change_of_position(scenes):
         moved_mps = (tracks.xyz_m[:, 2:, :2] - tracks.xyz_m[:, :-2, :2]) / 0.2
         seen_thrice = tracks.valid[:, 2:] & tracks.valid[:, 1:-1] & tracks.valid[:, :-2]
         off_mps = np.linalg.norm(moved_mps - tracks.velocity_mps[:, 1:-1], axis=-1)
-        assert np.percentile(off_mps[seen_thrice], 95) < 0.3
+        assert np.percentile(off_mps[seen_thrice], 95) < 0.4
         assert off_mps[seen_thrice].max() < 1.5
 
 
@@ -234,13 +238,15 @@ def _check_lane(scene, lane):
     path_m = road_map.points(int(np.flatnonzero(road_map.feature_id == lane)[0]))[:, :2]
     ahead = (path_m[1] - path_m[0]) / np.linalg.norm(path_m[1] - path_m[0])
     to_m = scene.tracks.xyz_m[..., :2] - signals.stop_xyz_m[rows[0], :2]
-    along_m = to_m @ ahead
+    along_m = to_m @ ahead + 0.5 * scene.tracks.size_lwh_m[..., 0]  # Of the front.
     aside_m = np.abs(to_m @ np.array([-ahead[1], ahead[0]]))
     seen_twice = scene.tracks.valid[:, 1:] & scene.tracks.valid[:, :-1]
     crossing = (
         seen_twice & (along_m[:, :-1] < 0) & (along_m[:, 1:] >= 0) & (aside_m[:, 1:] < 1.2)
     )
-    red = signals.state[rows[1:]] == SignalState.STOP
+    shown = np.zeros(91, np.int64)
+    shown[signals.step[rows]] = signals.state[rows]
+    red = np.isin(shown[1:], (SignalState.STOP, SignalState.ARROW_STOP))
     walking = scene.tracks.kind == AgentKind.PEDESTRIAN
     assert not (crossing & red & ~walking[:, None]).any()
     return len(rows)
@@ -317,39 +323,59 @@ def test_neighbours_and_boundaries_name_features_on_the_right_side(scenes):
             to_m = other_m[nearest] - path_m[middle]
             left = ahead[0] * to_m[1] - ahead[1] * to_m[0] > 0
             assert left == (side == 0)
-            assert np.linalg.norm(to_m) < 6
+            assert np.linalg.norm(to_m) < 6.5
 
 
-def test_roads_have_two_kerbs_and_named_types(scenes):
+def test_roads_have_kerbs_and_islands_and_named_types(scenes):
+    found = set()
     for scene in scenes:
         road_map = scene.road_map
         edges = road_map.rows(FeatureKind.ROAD_EDGE)
-        assert len(edges) in (2, 3, 4)
-        assert set(road_map.feature_type[edges]) == {RoadEdgeType.BOUNDARY}
+        assert len(edges) > 4
+        found |= set(road_map.feature_type[edges].tolist())
         lanes = road_map.rows(FeatureKind.LANE)
         assert set(road_map.feature_type[lanes]) <= {
             LaneType.SURFACE_STREET,
             LaneType.BIKE_LANE,
         }
+    assert found == {RoadEdgeType.BOUNDARY, RoadEdgeType.MEDIAN}
+
+
+def test_lanes_have_the_road_edge_on_their_right(scenes):
+    for scene in scenes[::4]:
+        road_map = scene.road_map
+        lanes = [road_map.points(int(row)) for row in road_map.rows(FeatureKind.LANE)]
+        middles_m = np.array([points[len(points) // 2, :2] for points in lanes])
+        edges = [
+            road_map.points(int(r))[:, :2] for r in road_map.rows(FeatureKind.ROAD_EDGE)
+        ]
+        start_m = np.concatenate([points[:-1] for points in edges])
+        way_m = np.concatenate([np.diff(points, axis=0) for points in edges])
+        near = (
+            np.linalg.norm(middles_m - scene.tracks.xyz_m[scene.ego, 10, :2], axis=1) < 90
+        )
+        assert (_signed_m(middles_m[near], start_m, way_m) < 0).mean() > 0.99
 
 
 def test_signals_stand_where_their_lane_begins_and_change_in_order(scenes):
     lit = [scene for scene in scenes if len(scene.signals.step)]
     assert len(lit) > 4
-    follows = {
-        SignalState.GO: SignalState.CAUTION,
-        SignalState.CAUTION: SignalState.STOP,
-        SignalState.STOP: SignalState.GO,
+    colours = {
+        **dict.fromkeys((SignalState.GO, SignalState.ARROW_GO), "green"),
+        **dict.fromkeys((SignalState.CAUTION, SignalState.ARROW_CAUTION), "yellow"),
+        **dict.fromkeys((SignalState.STOP, SignalState.ARROW_STOP), "red"),
     }
+    follows = {"green": "yellow", "yellow": "red", "red": "green"}
     for scene in lit:
         signals, road_map = scene.signals, scene.road_map
         for lane in np.unique(signals.lane_id):
             rows = np.flatnonzero(signals.lane_id == lane)
-            np.testing.assert_array_equal(signals.step[rows], np.arange(91))
             feature = int(np.flatnonzero(road_map.feature_id == lane)[0])
             np.testing.assert_allclose(
                 signals.stop_xyz_m[rows[0]], road_map.points(feature)[0]
             )
-            states = signals.state[rows]
-            for before, after in pairwise(states):
-                assert after in (before, follows[SignalState(before)])
+            shown = [colours[SignalState(state)] for state in signals.state[rows]]
+            for one, other in pairwise(range(len(rows))):
+                in_a_row = signals.step[rows[other]] == signals.step[rows[one]] + 1
+                allowed = (shown[one], follows[shown[one]])
+                assert not in_a_row or shown[other] in allowed

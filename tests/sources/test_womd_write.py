@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from infgen.scene import RoadMap, Signals, Tracks
 from infgen.sources.tfrecord import iter_records
-from infgen.sources.towns.scenes import draw_scene
+from infgen.sources.towns import builtin_records
 from infgen.sources.wire_write import varint
-from infgen.sources.womd import decode_scene
+from infgen.sources.womd import decode_scene, iter_scenes
 from infgen.sources.womd_write import encode_scenario, write_tfrecord
 from tests.sources.oracle import expected_scene
 from tests.sources.records import NOW, SHARED, changed, small_scenario
@@ -38,7 +38,7 @@ def small():
 
 @pytest.fixture(scope="module")
 def town():
-    return draw_scene(3, "training", 4)
+    return next(iter_scenes(builtin_records()[-1]))
 
 
 def test_protobuf_reads_back_the_scene_that_was_written(small):

@@ -102,3 +102,12 @@ def test_published_rows_are_those_of_the_paper():
         events = ("num_entries", "num_exits", "entry_distance", "exit_distance")
         mean = sum(each.long_term[name] for name in events) / 4
         assert mean == pytest.approx(each.long_term["placement"], abs=6e-5)
+
+
+def test_a_row_may_lead_to_a_page():
+    table = Table("t", ["a", "b"], [["<x>", 1], ["y", 2]], links=["p&q.html", ""])
+
+    page = table.to_html()
+    assert '<td class="text"><a href="p&amp;q.html">&lt;x&gt;</a></td><td>1</td>' in page
+    assert page.count("<a ") == 1
+    assert "p&q" not in table.to_markdown() + table.to_csv() + table.to_latex()

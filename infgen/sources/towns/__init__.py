@@ -1,9 +1,11 @@
 """Towns: synthetic WOMD records that anyone may use, and a few that come with the package.
 
-layout (``build``) -> strips (``town``) -> traffic (``traffic``) -> what one car sees
-(``sight``) -> ``Scene`` (``scenes``) -> records (``records``).
+Traffic is SUMO's. ``skeletons`` (where streets run) -> ``layouts`` (what streets they are)
+-> ``plain`` (SUMO's input) -> ``network`` (its net) -> ``demand`` (who sets out) ->
+``simulation`` (SUMO plays) -> ``motion`` (bodies) -> ``town`` (all of it) -> ``views`` (who
+records) -> ``sight`` (what they see) -> ``scenes`` (``Scene``) -> ``drawing`` (by number).
 """
 
-from infgen.sources.towns.recording import builtin_records, write_towns
+from infgen.sources.towns.builtin import builtin_records
 
-__all__ = ["builtin_records", "write_towns"]
+__all__ = ["builtin_records"]

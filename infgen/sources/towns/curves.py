@@ -32,12 +32,6 @@ def resample(xy_m: Points, spacing_m: float) -> Points:
     return points_at(xy_m, np.linspace(0.0, total_m, count + 1))
 
 
-def cut(xy_m: Points, from_m: float, to_m: float, spacing_m: float) -> Points:
-    """Cut out what lies between two distances along a curve."""
-    count = max(1, round((to_m - from_m) / spacing_m))
-    return points_at(xy_m, np.linspace(from_m, to_m, count + 1))
-
-
 def headings(xy_m: Points) -> Float64[np.ndarray, " point"]:
     """Direction at every point, in radians, without jumps of a whole turn."""
     tangent = np.gradient(xy_m, axis=0)
@@ -59,17 +53,6 @@ def start_pose(xy_m: Points) -> Float64[np.ndarray, "3"]:
 def end_pose(xy_m: Points) -> Float64[np.ndarray, "3"]:
     """Pose at the end of a curve, heading along it."""
     return np.array([*xy_m[-1], headings(xy_m[-2:])[0]])
-
-
-def bend(
-    pose: Float64[np.ndarray, "3"], length_m: float, curvature_1pm: float, spacing_m: float
-) -> Points:
-    """Draw a curve from a pose that turns ever more, up to a curvature halfway."""
-    along_m = np.arange(0.0, length_m + spacing_m / 2, spacing_m)
-    ramp = np.clip(2 * along_m / length_m, 0.0, 1.0)
-    heading_rad = pose[2] + np.cumsum(ramp * curvature_1pm) * spacing_m
-    steps_m = spacing_m * np.column_stack([np.cos(heading_rad), np.sin(heading_rad)])
-    return pose[:2] + np.concatenate([[[0.0, 0.0]], np.cumsum(steps_m[:-1], axis=0)])
 
 
 def join(
@@ -107,25 +90,3 @@ def chain(*parts: Points) -> Points:
         touches = np.linalg.norm(part[0] - kept[-1][-1]) < 1e-6
         kept.append(part[1:] if touches else part)
     return np.concatenate(kept)
-
-
-def smooth(xy_m: Points, reach_m: float, spacing_m: float) -> Points:
-    """Round the corners of an evenly spaced curve; its ends stay."""
-    half = max(1, round(reach_m / spacing_m))
-    total = np.cumsum(np.pad(xy_m, ((half + 1, half), (0, 0)), mode="edge"), axis=0)
-    mean = (total[2 * half + 1 :] - total[: -2 * half - 1]) / (2 * half + 1)
-    # Near an end average over what fits on both sides, or the end would creep inwards.
-    fits = np.minimum(np.arange(len(xy_m)), np.arange(len(xy_m))[::-1])
-    share = np.clip(fits / half, 0.0, 1.0)[:, None]
-    return share * mean + (1 - share) * xy_m
-
-
-def curvatures(
-    xy_m: Points, spacing_m: float, reach_m: float = 2.0
-) -> Float64[np.ndarray, " point"]:
-    """Absolute curvature in 1/m of an evenly spaced curve, over a reach of it."""
-    half = max(1, round(reach_m / spacing_m / 2))
-    heading_rad = np.pad(headings(xy_m), half, mode="edge")
-    return np.abs(heading_rad[2 * half :] - heading_rad[: -2 * half]) / (
-        2 * half * spacing_m
-    )

@@ -1,167 +1,191 @@
-"""Who sets out: road users, their routes, sizes and habits, from a random stream."""
+"""Who is under way in a town and when, as SUMO's route file."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
-from infgen.scene import AgentKind
-from infgen.sources.towns.routes import Routes
-from infgen.sources.towns.town import Town
+from infgen.sources.towns.bodies import (
+    Body,
+    Person,
+    draw_cyclist,
+    draw_motorist,
+    draw_walker,
+)
+from infgen.sources.towns.network import Network
+from infgen.sources.towns.trips import Ways, find_walks, find_ways
 
-TRUCK_SHARE = 0.07
+FASTEST_MPS = 14.0
+"""Routes are long enough to be under way all the time at this speed."""
+NUM_WANDERERS = 14
+"""Cars that never leave town: they make the trips."""
+LONGEST_WALK_M = 700.0
+REACTION_S = 0.4
+"""Drivers make up their minds so often: as people do, and at half the cost."""
 
 
 @dataclass(frozen=True, slots=True)
-class Users:
-    """Road users, in the order in which they set out from each source.
+class Level:
+    """How much is going on in a town.
 
     Attributes:
-        kind: ``AgentKind``.
-        route: Row of the routes.
-        start_s: When they appear; those of 0 are under way when time begins.
-        start_m: Where on the route.
-        size_lwh_m: Of their boxes.
-        haste: Their wished speed as a share of the limit.
-        headway_s: Time they keep to whoever is ahead.
-        accel_mps2: How hard they accelerate at most.
-        side_m: How far left of their path they keep.
-        sway_m: How far they weave about it.
-        sway_length_m: From one weave to the next, the first from ``sway_phase_rad`` on.
+        cars_per_km: On every kilometre of a collector's lane at the beginning.
+        cars_per_hour: That come from out of town on a collector's lane.
+        cyclists: How many for every hundred cars.
+        walkers_per_km: On every kilometre of pavement.
     """
 
-    kind: Int64[np.ndarray, " user"]
-    route: Int64[np.ndarray, " user"]
-    start_s: Float64[np.ndarray, " user"]
-    start_m: Float64[np.ndarray, " user"]
-    size_lwh_m: Float64[np.ndarray, "user 3"]
-    haste: Float64[np.ndarray, " user"]
-    headway_s: Float64[np.ndarray, " user"]
-    accel_mps2: Float64[np.ndarray, " user"]
-    side_m: Float64[np.ndarray, " user"]
-    sway_m: Float64[np.ndarray, " user"]
-    sway_length_m: Float64[np.ndarray, " user"]
-    sway_phase_rad: Float64[np.ndarray, " user"]
-
-    def __len__(self) -> int:
-        return len(self.kind)
-
-    def only(self, rows: np.ndarray) -> "Users":
-        """Keep some, in the given order."""
-        return Users(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+    cars_per_km: float
+    cars_per_hour: float
+    cyclists: float
+    walkers_per_km: float
 
 
 @dataclass(frozen=True, slots=True)
-class _Trip:
-    route: int
-    start_s: float
-    start_m: float
+class Trip:
+    """Somebody's way.
+
+    Attributes:
+        person: Who.
+        depart_s: When they set out.
+        route: Edges in a row.
+        anywhere: Whether they begin anywhere on the first edge, not at its start.
+    """
+
+    person: Person
+    depart_s: float
+    route: list[str]
+    anywhere: bool
 
 
-def draw_users(
-    town: Town, routes: Routes, seconds: float, rng: np.random.Generator
-) -> Users:
-    """Draw everyone who is under way at time 0 or sets out within so many seconds."""
-    pace_mps = {AgentKind.VEHICLE: 10.0, AgentKind.CYCLIST: 4.5, AgentKind.PEDESTRIAN: 1.3}
-    per_hour = {
-        AgentKind.VEHICLE: rng.uniform(180.0, 780.0),
-        AgentKind.CYCLIST: rng.uniform(60.0, 240.0),
-        AgentKind.PEDESTRIAN: rng.uniform(5.0, 70.0),
+def draw_level(rng: np.random.Generator) -> Level:
+    """Draw how much is going on, from next to nothing to dense."""
+    cars = float(np.exp(rng.uniform(np.log(2.5), np.log(14.0))))
+    return Level(
+        cars_per_km=cars,
+        cars_per_hour=cars * float(rng.uniform(14.0, 28.0)),
+        cyclists=float(rng.choice([1.0, 4.0, 10.0], p=[0.5, 0.35, 0.15])),
+        walkers_per_km=float(np.exp(rng.uniform(np.log(0.2), np.log(8.0)))),
+    )
+
+
+def draw_trips(
+    network: Network, level: Level, seconds: float, rng: np.random.Generator
+) -> list[Trip]:
+    """Draw everybody's way, by the time they set out."""
+    reach_m = FASTEST_MPS * seconds
+    driving, cycling = (find_ways(network, cycling=each) for each in (False, True))
+    trips = [
+        Trip(draw_motorist_of(Body.CAR, rng), 0.0, route, anywhere=True)
+        for route in _wanderings(driving, reach_m, rng)
+    ]
+    share = level.cyclists / 100.0
+    for ways, draw, part in (
+        (driving, draw_motorist, 1.0),
+        (cycling, draw_cyclist, share),
+    ):
+        starts = _starts(ways, level, part, seconds, rng)
+        trips += [
+            Trip(draw(rng), depart_s, ways.walk(edge, reach_m, rng), anywhere=anywhere)
+            for edge, depart_s, anywhere in starts
+        ]
+    total_m = sum(driving.length_m.values())
+    count = rng.poisson(level.walkers_per_km * total_m / 1000.0)
+    walks = find_walks(network, int(count), LONGEST_WALK_M, rng)
+    late = rng.random(len(walks)) < 0.4
+    depart_s = np.where(late, rng.uniform(0.0, seconds, len(walks)), 0.0)
+    trips += [
+        Trip(draw_walker(rng), float(time_s), list(walk), anywhere=True)
+        for time_s, walk in zip(depart_s, walks, strict=True)
+    ]
+    return sorted(trips, key=lambda trip: trip.depart_s)
+
+
+def draw_motorist_of(body: Body, rng: np.random.Generator) -> Person:
+    """Draw a driver of a kind of vehicle."""
+    while True:
+        person = draw_motorist(rng)
+        if person.body is body:
+            return person
+
+
+def _wanderings(ways: Ways, reach_m: float, rng: np.random.Generator) -> list[list[str]]:
+    starts = rng.choice(ways.inner, NUM_WANDERERS)
+    return [ways.walk(str(edge), reach_m, rng, leave=False) for edge in starts]
+
+
+def _starts(
+    ways: Ways, level: Level, part: float, seconds: float, rng: np.random.Generator
+) -> list[tuple[str, float, bool]]:
+    """Draw where and when people set out: on their way at time 0, or from out of town."""
+    found = []
+    for edge, length_m in ways.length_m.items():
+        if not ways.follows[edge][0]:
+            continue
+        cars = part * level.cars_per_km * ways.busy[edge]
+        there = rng.poisson(cars * length_m / 1000.0)
+        found += [(edge, 0.0, True)] * int(there)
+    for edge in ways.sources:
+        per_hour = part * level.cars_per_hour * ways.busy[edge]
+        count = rng.poisson(per_hour * seconds / 3600.0)
+        times_s = np.sort(rng.uniform(0.1, seconds, count))
+        found += [(edge, float(time_s), False) for time_s in times_s]
+    return found
+
+
+def write_routes(trips: list[Trip], path: Path) -> None:
+    """Write a route file. The position of a trip in the list is the name of its person."""
+    root = Element("routes")
+    for at, trip in enumerate(trips):
+        _write_type(root, f"t{at}", trip.person)
+        about = {"id": str(at), "type": f"t{at}", "depart": f"{trip.depart_s:.1f}"}
+        if trip.person.body is Body.WALKER:
+            person = SubElement(root, "person", about | {"departPos": "random"})
+            SubElement(person, "walk", {"edges": " ".join(trip.route)})
+            continue
+        start = {"departPos": "base", "departSpeed": "max", "departLane": "best"}
+        if trip.anywhere:
+            start = {"departPos": "random_free", "departSpeed": "max"}
+            start["departLane"] = "best"
+        vehicle = SubElement(root, "vehicle", about | start)
+        SubElement(vehicle, "route", {"edges": " ".join(trip.route)})
+    ElementTree.ElementTree(root).write(path)
+
+
+def _write_type(root: Element, name: str, person: Person) -> None:
+    length_m, width_m, height_m = person.size_lwh_m
+    about = {
+        "id": name,
+        "vClass": person.body.value,
+        "length": f"{length_m:.3f}",
+        "width": f"{width_m:.3f}",
+        "height": f"{height_m:.3f}",
     }
-    trips: list[_Trip] = []
-    for strip, lane in enumerate(town.strips):
-        gap_m = 3600 * pace_mps[lane.kind] / per_hour[lane.kind]
-        if lane.gate is None:
-            trips += _under_way(routes, strip, gap_m, rng)
-        if strip in town.sources:
-            gap_s = 3600 / per_hour[lane.kind]
-            trips += _arrivals(routes, strip, gap_s, seconds, rng)
-    return _people(routes, trips, rng)
+    if person.body is Body.WALKER:
+        about |= {"maxSpeed": f"{person.haste:.3f}", "speedDev": "0"}
+    else:
+        about |= _driving(person)
+    SubElement(root, "vType", about)
 
 
-def _under_way(
-    routes: Routes, strip: int, gap_m: float, rng: np.random.Generator
-) -> list[_Trip]:
-    """Spread users over a strip as they would be after long traffic."""
-    through = np.flatnonzero(np.isfinite(routes.start_m[:, strip]))
-    if not len(through):
-        return []
-    length_m = routes.end_m[through[0], strip] - routes.start_m[through[0], strip]
-    # Nobody starts so near the end that a red light could not stop them any more.
-    at_m, trips = rng.exponential(gap_m), []
-    walking = routes.kind[through[0]] == AgentKind.PEDESTRIAN
-    margin_m, room_m = (1.0, 2.0) if walking else (30.0, 14.0)
-    while at_m < length_m - margin_m:
-        route = _choose(routes, through, rng)
-        trips.append(_Trip(route, 0.0, routes.start_m[route, strip] + at_m))
-        at_m += room_m + rng.exponential(gap_m)
-    return trips
-
-
-def _arrivals(
-    routes: Routes, strip: int, gap_s: float, seconds: float, rng: np.random.Generator
-) -> list[_Trip]:
-    """Let users set out from the start of a strip at random times."""
-    starting = routes.starting_with(strip)
-    if not len(starting):
-        return []
-    trips, time_s = [], rng.exponential(gap_s)
-    while time_s < seconds:
-        trips.append(_Trip(_choose(routes, starting, rng), max(time_s, 0.1), 0.0))
-        time_s += 1.5 + rng.exponential(gap_s)
-    return trips
-
-
-def _choose(
-    routes: Routes, among: Int64[np.ndarray, " route"], rng: np.random.Generator
-) -> int:
-    """Choose a route, straighter ones rather."""
-    weight = 1 / (0.6 + np.abs(routes.turn_rad[among]))
-    return int(rng.choice(among, p=weight / weight.sum()))
-
-
-def _people(routes: Routes, trips: list[_Trip], rng: np.random.Generator) -> Users:
-    route = np.array([trip.route for trip in trips], np.int64)
-    kind = routes.kind[route]
-    size_lwh_m = _sizes(kind, rng)
-    start_s = np.array([trip.start_s for trip in trips])
-    start_m = np.array([trip.start_m for trip in trips])
-    start_m = np.maximum(start_m, size_lwh_m[:, 0] / 2 + 0.1)
-    count = len(trips)
-    walking, cycling = kind == AgentKind.PEDESTRIAN, kind == AgentKind.CYCLIST
-    return Users(
-        kind=kind,
-        route=route,
-        start_s=start_s,
-        start_m=start_m,
-        size_lwh_m=size_lwh_m,
-        haste=_by_kind(kind, rng, (0.78, 1.12), (0.42, 0.75), (0.3, 0.85)),
-        headway_s=_by_kind(kind, rng, (0.9, 1.9), (0.8, 1.4), (0.4, 0.8)),
-        accel_mps2=_by_kind(kind, rng, (1.1, 2.3), (0.6, 1.1), (0.6, 1.2)),
-        side_m=rng.normal(0.0, 1.0, count) * np.where(walking, 0.14, 0.12),
-        sway_m=_by_kind(kind, rng, (0.02, 0.12), (0.03, 0.1), (0.01, 0.04)),
-        sway_length_m=np.where(
-            walking, 1.4, np.where(cycling, 9.0, rng.uniform(60, 120, count))
-        ),
-        sway_phase_rad=rng.uniform(0.0, 2 * np.pi, count),
-    ).only(np.argsort(start_s, kind="stable"))
-
-
-def _by_kind(
-    kind: Int64[np.ndarray, " user"], rng: np.random.Generator, *ranges: tuple[float, float]
-) -> Float64[np.ndarray, " user"]:
-    """Draw uniformly from the range of each user's kind: vehicle, pedestrian, cyclist."""
-    lowest, highest = np.array([ranges[0], ranges[2], ranges[1]])[kind].T
-    return rng.uniform(lowest, highest)
-
-
-def _sizes(
-    kind: Int64[np.ndarray, " user"], rng: np.random.Generator
-) -> Float64[np.ndarray, "user 3"]:
-    """Draw boxes: length, width, height."""
-    mean = np.array([[4.7, 1.9, 1.65], [0.8, 0.72, 1.72], [1.8, 0.75, 1.75]])[kind]
-    spread = np.array([[0.3, 0.08, 0.15], [0.1, 0.08, 0.1], [0.1, 0.08, 0.08]])[kind]
-    size_lwh_m = mean + spread * np.clip(rng.normal(size=mean.shape), -2.0, 2.0)
-    truck = (kind == AgentKind.VEHICLE) & (rng.random(len(kind)) < TRUCK_SHARE)
-    long_m = rng.uniform([6.2, 2.2, 2.6], [7.6, 2.4, 3.3], size=mean.shape)
-    return np.where(truck[:, None], long_m, size_lwh_m)
+def _driving(person: Person) -> dict[str, str]:
+    cycling = person.body is Body.BICYCLE
+    limits = (
+        {"maxSpeed": f"{person.haste:.3f}", "speedDev": "0"}
+        if cycling
+        else {"speedFactor": f"{person.haste:.3f}", "speedDev": "0"}
+    )
+    return limits | {
+        "carFollowModel": "IDM",
+        "actionStepLength": f"{REACTION_S:g}",
+        "tau": f"{person.headway_s:.3f}",
+        "accel": f"{person.accel_mps2:.3f}",
+        "decel": f"{person.brake_mps2:.3f}",
+        "impatience": "0.5",
+        "minGap": "1.0" if cycling else "2.0",
+        "latAlignment": "right" if cycling else f"{person.aside_m:.3f}",
+        "maxSpeedLat": "0.8",
+        "minGapLat": "0.5",
+    }

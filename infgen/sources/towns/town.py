@@ -1,172 +1,135 @@
-"""A synthetic place: where road users go, what is painted, who must wait for whom.
+"""A town: streets, surroundings, and a stretch of its traffic as bodies."""
 
-Town frame: metres, the junction at the origin, headings counter-clockwise from +x, traffic
-on the right. A simulator needs only the strips; the map needs all of it.
-"""
-
-from dataclasses import dataclass
-from functools import cached_property
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
-from infgen.scene import AgentKind, LaneType, RoadLineType, SignalState
-from infgen.sources.towns.curves import Points, resample
+from infgen.clock import CLOCK
+from infgen.scene import RoadMap
+from infgen.sources.towns.bodies import Body
+from infgen.sources.towns.boxes import clear_way
+from infgen.sources.towns.demand import Trip, draw_level, draw_trips, write_routes
+from infgen.sources.towns.kerbs import draw_kerbs
+from infgen.sources.towns.layouts import draw_layout
+from infgen.sources.towns.markings import (
+    draw_bumps,
+    draw_crosswalks,
+    draw_lines,
+    draw_signs,
+)
+from infgen.sources.towns.motion import Bodies, follow
+from infgen.sources.towns.network import Network, read_network
+from infgen.sources.towns.plain import build_net
+from infgen.sources.towns.plots import draw_plenty
+from infgen.sources.towns.roads import Furniture, draw_map
+from infgen.sources.towns.simulation import play
+from infgen.sources.towns.skeletons import draw_skeleton
+from infgen.sources.towns.streets import Street
+from infgen.sources.towns.surroundings import Surroundings, surround
 
-NO_GROUP = -1
-"""Signal group of a gate without a signal."""
-
-STRIP_SPACING_M = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class Gate:
-    """The right to go onto a strip that others cross.
-
-    Attributes:
-        rank: Who goes first: a lower rank is never made to wait by a higher one.
-        group: Signal group that opens the gate, or ``NO_GROUP``.
-        stop: Whether one must stand still first.
-    """
-
-    rank: int
-    group: int = NO_GROUP
-    stop: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Strip:
-    """A path along which road users of one kind follow each other.
-
-    Attributes:
-        kind: Who uses it.
-        xy_m: Its middle, in the direction of travel.
-        width_m: What its users may take up.
-        limit_mps: Speed limit.
-        exits: Strips that follow.
-        lane_type: As a lane of the map; None for what maps do not show.
-        left: Strip beside it in the same direction, or -1; ``right`` likewise.
-        left_line: Painted line along its left, or -1; ``right_line`` likewise.
-        gate: What opens it; None if nobody crosses it.
-    """
-
-    kind: AgentKind
-    xy_m: Points
-    width_m: float
-    limit_mps: float
-    exits: tuple[int, ...] = ()
-    lane_type: LaneType | None = None
-    left: int = -1
-    right: int = -1
-    left_line: int = -1
-    right_line: int = -1
-    gate: Gate | None = None
+WARM_UP_S = 35.0
+"""Traffic runs so long before anyone records it."""
+_MOST_SEED = 1 << 31
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
-    """A painted line."""
-
-    kind: RoadLineType
-    xy_m: Points
-
-
-@dataclass(frozen=True, slots=True)
-class Sign:
-    """A stop sign, and the strips that it speaks to."""
-
-    xy_m: Float64[np.ndarray, "2"]
-    strips: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class SignalPlan:
-    """Two groups of signals that take turns.
-
-    Attributes:
-        green_s: How long each group goes.
-        caution_s: How long a light then warns.
-        clear_s: How long all wait before the other group goes.
-        walk_s: How long after the start of a green walkers may set out beside it.
-        start_s: Where in the cycle time 0 stands.
-    """
-
-    green_s: tuple[float, float]
-    caution_s: float
-    clear_s: float
-    walk_s: float
-    start_s: float
-
-    def state(self, group: int, time_s: float) -> SignalState:
-        """Return what a group shows at a time."""
-        since_s = self._since_green(group, time_s)
-        if since_s < self.green_s[group]:
-            return SignalState.GO
-        if since_s < self.green_s[group] + self.caution_s:
-            return SignalState.CAUTION
-        return SignalState.STOP
-
-    def walk(self, group: int, time_s: float) -> bool:
-        """Say whether walkers along the traffic of a group may set out."""
-        return bool(self._since_green(group, time_s) < self.walk_s)
-
-    def _since_green(self, group: int, time_s: float) -> float:
-        turn_s = [green_s + self.caution_s + self.clear_s for green_s in self.green_s]
-        return (time_s + self.start_s - group * turn_s[0]) % sum(turn_s)
-
-
-@dataclass(frozen=True)
 class Town:
-    """All there is before anyone moves.
+    """All there is to record. Town frame: metres, the middle of the town at the origin.
 
     Attributes:
-        strips: Where road users go; exits and neighbours are positions in this list.
-        lines: Painted lines.
-        edges: Kerbs, the road on their left.
-        crosswalks: Outlines.
-        bumps: Outlines of speed bumps.
-        driveways: Outlines.
-        signs: Stop signs.
-        buildings: Blocks that hide what is behind: [x, y, heading, length, width].
-        parked: Poses and sizes of parked cars: [x, y, heading, length, width, height].
-        plan: Of the signals; None without them.
+        network: Streets.
+        road_map: The map.
+        lane_ids: Feature ids of lanes and of ways across junctions, by name.
+        surroundings: What stands beside the road.
+        kind: ``AgentKind`` of everyone under way.
+        size_lwh_m: Their boxes.
+        car: Who drives a car.
+        bodies: Where they are at each recorded step.
     """
 
-    strips: tuple[Strip, ...]
-    lines: tuple[Line, ...]
-    edges: tuple[Points, ...]
-    crosswalks: tuple[Points, ...]
-    bumps: tuple[Points, ...]
-    driveways: tuple[Points, ...]
-    signs: tuple[Sign, ...]
-    buildings: Float64[np.ndarray, "building 5"]
-    parked: Float64[np.ndarray, "parked 6"]
-    plan: SignalPlan | None
+    network: Network
+    road_map: RoadMap
+    lane_ids: dict[str, int]
+    surroundings: Surroundings
+    kind: Int64[np.ndarray, " trip"]
+    size_lwh_m: Float64[np.ndarray, "trip 3"]
+    car: Bool[np.ndarray, " trip"]
+    bodies: Bodies
 
-    @cached_property
-    def sources(self) -> tuple[int, ...]:
-        """Strips that no other leads to."""
-        led_to = {following for strip in self.strips for following in strip.exits}
-        return tuple(row for row in range(len(self.strips)) if row not in led_to)
+    @property
+    def num_steps(self) -> int:
+        """Number of recorded steps."""
+        return int(self.bodies.present.shape[1])
 
-    @cached_property
-    def conflicts(self) -> Bool[np.ndarray, "strip strip"]:
-        """Which gated strips must not be used at once.
 
-        Strips that leave the same one do not conflict: there people queue.
-        """
-        gated = [row for row, strip in enumerate(self.strips) if strip.gate is not None]
-        sparse = {row: resample(self.strips[row].xy_m, 1.0) for row in gated}
-        entries = {
-            row: {i for i, s in enumerate(self.strips) if row in s.exits} for row in gated
+def stream(*words: object) -> np.random.Generator:
+    """Return random numbers that depend on some words alone."""
+    digest = hashlib.sha256("/".join(map(str, words)).encode()).digest()
+    return np.random.default_rng(np.frombuffer(digest, np.uint32).tolist())
+
+
+def make_town(rng: np.random.Generator, num_steps: int) -> Town:
+    """Draw a town and record its traffic for so many steps.
+
+    Raises:
+        SumoError: if SUMO is missing or fails.
+    """
+    with TemporaryDirectory(prefix="infgen-town-") as name:
+        folder = Path(name)
+        layout = draw_layout(draw_skeleton(folder, rng), rng)
+        net = build_net(layout, folder, rng)
+        network = read_network(net)
+        streets = {
+            f"e{link}{way}": street
+            for link, street in enumerate(layout.street)
+            for way in "fb"
         }
-        found = np.zeros((len(self.strips), len(self.strips)), dtype=bool)
-        for one in gated:
-            for other in gated:
-                apart = np.linalg.norm(
-                    sparse[one][:, None] - sparse[other][None], axis=-1
-                ).min()
-                reach_m = (self.strips[one].width_m + self.strips[other].width_m) / 2
-                found[one, other] = apart < reach_m and not entries[one] & entries[other]
-        walkers = np.array([strip.kind == AgentKind.PEDESTRIAN for strip in self.strips])
-        return found & ~(walkers[:, None] & walkers[None])
+        seconds = WARM_UP_S + num_steps * CLOCK.step_s
+        trips = draw_trips(network, draw_level(rng), seconds, rng)
+        write_routes(trips, folder / "town.rou.xml")
+        seed = int(rng.integers(_MOST_SEED))
+        played = play(net, folder / "town.rou.xml", len(trips), WARM_UP_S, num_steps, seed)
+    return _with_traffic(network, streets, trips, follow(played, *_bodies(trips)), rng)
+
+
+def _bodies(trips: list[Trip]) -> tuple[np.ndarray, np.ndarray]:
+    """Length of everyone, and who walks."""
+    length_m = np.array([trip.person.size_lwh_m[0] for trip in trips])
+    return length_m, np.array([trip.person.body is Body.WALKER for trip in trips])
+
+
+def _with_traffic(
+    network: Network,
+    streets: dict[str, Street],
+    trips: list[Trip],
+    bodies: Bodies,
+    rng: np.random.Generator,
+) -> Town:
+    size_lwh_m = np.array([trip.person.size_lwh_m for trip in trips])
+    surroundings = surround(network, streets, draw_plenty(rng), rng)
+    trip, step = np.nonzero(bodies.present)
+    parked = clear_way(surroundings.parked, bodies.pose[trip, step], size_lwh_m[trip, :2])
+    surroundings = replace(surroundings, parked=parked)
+    furniture = Furniture(
+        lines=list(draw_lines(network, streets)),
+        kerbs=list(draw_kerbs(network)),
+        crosswalks=draw_crosswalks(network, rng),
+        driveways=surroundings.driveways,
+        bumps=draw_bumps(network, streets, rng),
+        signs=list(draw_signs(network)),
+    )
+    road_map, lane_ids = draw_map(network, furniture)
+    return Town(
+        network=network,
+        road_map=road_map,
+        lane_ids=lane_ids,
+        surroundings=surroundings,
+        kind=np.array([trip.person.body.kind for trip in trips], np.int64),
+        size_lwh_m=size_lwh_m,
+        car=np.array([trip.person.body is Body.CAR for trip in trips]),
+        bodies=bodies,
+    )

@@ -1,5 +1,5 @@
 """Counts the words of every source file. A file that says ``fail`` makes its unit fail, one
-that says ``die`` ends its process."""
+that says ``die`` ends its process, one that says ``hoard`` fills its memory."""
 
 import os
 import time
@@ -26,6 +26,9 @@ def work(unit, target, settings, progress):
         os._exit(1)
     if "fail" in words:
         raise ValueError(f"{unit.name} says fail")
+    if "hoard" in words:
+        hoard = [bytearray(os.urandom(1) * (1 << 24)) for _ in range(64)]
+        time.sleep(len(hoard))
     for part in range(3):
         time.sleep(settings.sleep_s / 3)
         (target / f"part-{part}.txt").write_text(" ".join(words[part::3]))

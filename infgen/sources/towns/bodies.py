@@ -1,0 +1,129 @@
+"""Bodies of road users: what they are, how large, and how they drive."""
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from infgen.scene import AgentKind
+
+
+class Body(Enum):
+    """What somebody is or drives. Values are SUMO's vehicle classes."""
+
+    CAR = "passenger"
+    VAN = "delivery"
+    TRUCK = "truck"
+    BUS = "bus"
+    MOTORCYCLE = "motorcycle"
+    BICYCLE = "bicycle"
+    WALKER = "pedestrian"
+
+    @property
+    def kind(self) -> AgentKind:
+        """What a log calls it."""
+        kinds = {Body.BICYCLE: AgentKind.CYCLIST, Body.WALKER: AgentKind.PEDESTRIAN}
+        return kinds.get(self, AgentKind.VEHICLE)
+
+
+MOTOR_SHARES = {
+    Body.CAR: 0.885,
+    Body.VAN: 0.05,
+    Body.TRUCK: 0.035,
+    Body.BUS: 0.012,
+    Body.MOTORCYCLE: 0.018,
+}
+_MEAN_LWH_M = {
+    Body.CAR: (4.75, 2.06, 1.68),
+    Body.VAN: (6.1, 2.3, 2.5),
+    Body.TRUCK: (8.4, 2.65, 3.3),
+    Body.BUS: (11.8, 2.9, 3.2),
+    Body.MOTORCYCLE: (2.2, 0.95, 1.6),
+    Body.BICYCLE: (1.76, 0.82, 1.74),
+    Body.WALKER: (0.9, 0.86, 1.72),
+}
+_SPREAD_LWH_M = {
+    Body.CAR: (0.38, 0.11, 0.17),
+    Body.VAN: (0.5, 0.1, 0.25),
+    Body.TRUCK: (1.2, 0.15, 0.4),
+    Body.BUS: (0.6, 0.1, 0.15),
+    Body.MOTORCYCLE: (0.1, 0.08, 0.1),
+    Body.BICYCLE: (0.08, 0.05, 0.08),
+    Body.WALKER: (0.1, 0.09, 0.1),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Person:
+    """Somebody on the road.
+
+    Attributes:
+        body: What they are or drive.
+        size_lwh_m: Box around it.
+        haste: Wished speed, as a share of the limit (of walkers: in metres per second).
+        headway_s: Time they keep to who is ahead.
+        accel_mps2: How hard they speed up.
+        brake_mps2: How hard they like to brake.
+        aside_m: How far left of the middle of their lane they like to be.
+    """
+
+    body: Body
+    size_lwh_m: tuple[float, float, float]
+    haste: float
+    headway_s: float
+    accel_mps2: float
+    brake_mps2: float
+    aside_m: float
+
+
+def draw_motorist(rng: np.random.Generator) -> Person:
+    """Draw a driver and what they drive."""
+    bodies = list(MOTOR_SHARES)
+    body = bodies[rng.choice(len(bodies), p=list(MOTOR_SHARES.values()))]
+    heavy = body in (Body.TRUCK, Body.BUS)
+    return Person(
+        body=body,
+        size_lwh_m=draw_size(body, rng),
+        haste=float(np.clip(rng.normal(0.98, 0.11), 0.7, 1.3)),
+        headway_s=float(rng.uniform(0.9, 1.8)),
+        accel_mps2=float(rng.uniform(0.9, 1.4) if heavy else rng.uniform(1.3, 2.9)),
+        brake_mps2=float(rng.uniform(1.8, 2.6) if heavy else rng.uniform(1.9, 3.4)),
+        aside_m=float(np.clip(rng.normal(0.0, 0.16), -0.35, 0.35)),
+    )
+
+
+def draw_cyclist(rng: np.random.Generator) -> Person:
+    """Draw somebody on a bicycle."""
+    return Person(
+        body=Body.BICYCLE,
+        size_lwh_m=draw_size(Body.BICYCLE, rng),
+        haste=float(np.clip(rng.normal(4.9, 1.2), 2.5, 8.0)),
+        headway_s=float(rng.uniform(0.8, 1.4)),
+        accel_mps2=float(rng.uniform(0.7, 1.3)),
+        brake_mps2=float(rng.uniform(1.5, 2.5)),
+        aside_m=0.0,
+    )
+
+
+def draw_walker(rng: np.random.Generator) -> Person:
+    """Draw somebody on foot."""
+    return Person(
+        body=Body.WALKER,
+        size_lwh_m=draw_size(Body.WALKER, rng),
+        haste=float(np.clip(rng.normal(1.35, 0.25), 0.6, 2.4)),
+        headway_s=1.0,
+        accel_mps2=1.0,
+        brake_mps2=1.5,
+        aside_m=0.0,
+    )
+
+
+def draw_size(body: Body, rng: np.random.Generator) -> tuple[float, float, float]:
+    """Draw a box: length, width, height, in whole millimetres as SUMO reads them."""
+    noise = np.clip(rng.normal(size=3), -2.2, 2.2)
+    # Some cars are pickups and large at that.
+    if body is Body.CAR and rng.random() < 0.2:
+        noise[0], noise[1:] = rng.uniform(1.5, 3.2), rng.uniform(0.8, 2.6, 2)
+    size_m = np.array(_MEAN_LWH_M[body]) + noise * np.array(_SPREAD_LWH_M[body])
+    length_m, width_m, height_m = np.round(size_m, 3).tolist()
+    return length_m, width_m, height_m

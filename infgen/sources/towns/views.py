@@ -1,0 +1,81 @@
+"""Views of a town: which car records, and when."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from infgen.clock import CLOCK
+from infgen.sources.towns.town import Town
+
+START_EVERY = 20
+"""Recordings begin at steps that are multiples of it."""
+FROM_RIM_M = 125.0
+"""The recording car keeps so far away from where streets end."""
+LONGEST_EGO_M = 5.6
+STANDING_M = 2.0
+"""A car that stands all the time is chosen as if it went so far."""
+BUSY_M, BUSY_MPS = 60.0, 3.0
+"""Where more is going on within it, no slower, a car is chosen rather."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A recording: the car that makes it, and its first step in the town's time."""
+
+    ego: int
+    start: int
+
+
+def draw_views(
+    town: Town, count: int, num_steps: int, rng: np.random.Generator
+) -> list[View]:
+    """Draw views, no two of one car at one time; fewer if the town has not so many.
+
+    A car is drawn the more likely the farther it goes.
+    """
+    able = _able(town)
+    starts = np.arange(0, town.num_steps - num_steps + 1, START_EVERY)
+    lasting = np.stack(
+        [able[:, start : start + num_steps].all(axis=1) for start in starts], axis=1
+    )
+    speed_mps = np.linalg.norm(town.bodies.velocity_mps, axis=-1)
+    far_m = np.pad(np.cumsum(speed_mps, axis=1), ((0, 0), (1, 0))) * CLOCK.step_s
+    way_m = far_m[:, starts + num_steps - 1] - far_m[:, starts]
+    busy = 1 + _moving_near(town, starts + num_steps // 2, speed_mps)
+    weight = np.where(lasting, (STANDING_M + way_m) * busy, 0.0)
+    views: list[View] = []
+    while len(views) < count and weight.any():
+        chosen = int(rng.choice(weight.size, p=(weight / weight.sum()).ravel()))
+        ego, at = divmod(chosen, len(starts))
+        views.append(View(ego, int(starts[at])))
+        # The same seconds of the same car are recorded once; others are rather chosen.
+        weight[ego, np.abs(starts - starts[at]) < num_steps] = 0.0
+        weight[ego] *= 0.3
+    return views
+
+
+def _moving_near(
+    town: Town,
+    steps: Int64[np.ndarray, " look"],
+    speed_mps: Float64[np.ndarray, "trip step"],
+) -> Int64[np.ndarray, "trip look"]:
+    """How many move near each road user, at some steps."""
+    found = np.zeros((len(town.kind), len(steps)), np.int64)
+    for at, step in enumerate(steps.tolist()):
+        moving = town.bodies.present[:, step] & (speed_mps[:, step] > BUSY_MPS)
+        xy_m = town.bodies.pose[:, step, :2]
+        apart_m = np.linalg.norm(xy_m[:, None] - xy_m[moving], axis=-1)
+        found[:, at] = (apart_m < BUSY_M).sum(axis=1)
+    return found
+
+
+def _able(town: Town) -> Bool[np.ndarray, "trip step"]:
+    """Which cars could record at which step."""
+    ends_m = np.array([town.network.places_m[name] for name in sorted(town.network.ends)])
+    car = town.car & (town.size_lwh_m[:, 0] < LONGEST_EGO_M)
+    able = town.bodies.present & car[:, None]
+    for end_m in ends_m:
+        apart_m = np.linalg.norm(town.bodies.pose[..., :2] - end_m, axis=-1)
+        able &= apart_m > FROM_RIM_M
+    return able

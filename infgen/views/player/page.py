@@ -1,0 +1,78 @@
+"""The player: one page that holds a film and all it takes to watch it.
+
+Nothing is loaded from elsewhere. Scripts and style are files of their own beside this one;
+they are joined here. What comes from records enters as data or escaped.
+"""
+
+import json
+import re
+from collections.abc import Mapping
+from html import escape
+from importlib.resources import files
+
+from infgen.views.looks import DARK, LIGHT, for_scripts
+from infgen.views.player.payload import pack
+from infgen.views.showing import Film
+
+MODULES = (
+    "looks",
+    "payload",
+    "pose",
+    "theme",
+    "roads",
+    "lights",
+    "agents",
+    "camera",
+    "clock",
+    "pane",
+    "tooltip",
+    "chart",
+    "gestures",
+    "controls",
+    "main",
+)
+"""Scripts, each after those that it imports."""
+_IMPORT = re.compile(r'^import (\{[^}]*\}) from "\./(\w+)\.js";$', re.MULTILINE)
+_EXPORT = re.compile(r"^export ((?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
+_GAP = re.compile(r"\{\{(\w+)\}\}")
+
+
+def player_page(film: Film) -> str:
+    """Write the page (HTML) that plays a film."""
+    names = ", ".join(showing.name for showing in film.showings)
+    about = f"Scene {film.scenario_id}: {names}."
+    if film.weights:
+        about += f" Weights {film.weights}."
+    return _fill(
+        _read("page.html"),
+        {
+            "title": escape(f"{film.scenario_id} - InfGen"),
+            "scene": escape(film.scenario_id),
+            "about": escape(about),
+            "style": _fill(_read("page.css"), {"light": LIGHT.css(), "dark": DARK.css()}),
+            "looks": json.dumps(for_scripts()),
+            "payload": pack(film),
+            "script": joined_scripts(),
+        },
+    )
+
+
+def joined_scripts() -> str:
+    """Join all scripts to one that imports nothing, each in a scope of its own."""
+    return "\n".join(_scoped(name, _read(f"{name}.js")) for name in MODULES)
+
+
+def _scoped(name: str, script: str) -> str:
+    """Make a constant of what a script exports, by a function that is called at once."""
+    exports = ", ".join(found[2] for found in _EXPORT.finditer(script))
+    body = _EXPORT.sub(r"\1", _IMPORT.sub(r"const \1 = $\2;", script))
+    return f"const ${name} = (() => {{\n{body}return {{ {exports} }};\n}})();"
+
+
+def _fill(text: str, parts: Mapping[str, str]) -> str:
+    """Fill all gaps at once, so that nothing is filled into what was filled in."""
+    return _GAP.sub(lambda gap: parts[gap[1]], text)
+
+
+def _read(name: str) -> str:
+    return files(__package__).joinpath(name).read_text(encoding="utf-8")

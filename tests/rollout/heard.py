@@ -1,0 +1,284 @@
+"""The slow, obvious way: all that the engine said, computed again from what was played.
+
+A ``Listening`` stepper keeps what it is shown and what it says. ``recompute`` writes the
+played rollouts down as a training batch, one agent per life, and passes it through
+``Network.forward``: every column anew, nothing remembered.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from infgen.model.agents import KINDS
+from infgen.model.batch import OUTSIDE, Agents, Batch, Details, Entries, collate_roads
+from infgen.model.columns import Column, EntryDetails, EntryQuery, MotionStep
+from infgen.model.outputs import DetailOutputs, EntryOutputs, MotionOutputs
+from infgen.model.steps import Stepper
+from infgen.rollout.population import settle
+from infgen.rollout.session import Session
+from infgen.rollout.trace import NOBODY
+from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE, Presence
+
+QUERY_LOGITS = ("add_logit", "cell_logits", "place_m")
+DETAIL_LOGITS = ("kind_logits", "size_lwh_m", "heading_logits", "turned_rad", "offset_m")
+MOTION_LOGITS = ("move_logits", "leave_logit", "pattern_logits")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Which rollouts asked for a newcomer at a half second, and which turn it was for each.
+
+    ``cell`` and ``place_m`` are where in them, if it was asked who enters.
+    """
+
+    token: int
+    rollout: Tensor
+    turn: Tensor
+    said: EntryQuery | EntryDetails
+    cell: Tensor | None = None
+    place_m: Tensor | None = None
+
+
+class Listening(Stepper):
+    """A stepper that keeps all it is shown, and all it says."""
+
+    def __init__(self, network):
+        super().__init__(network)
+        self.columns: list[Column] = []
+        self.motion: list[MotionStep] = []
+        self.queries: list[Asked] = []
+        self.details: list[Asked] = []
+
+    def motion_step(self, memory, column):
+        said = super().motion_step(memory, column)
+        self.columns.append(column)
+        self.motion.append(said)
+        return said
+
+    def entry_query(self, entries):
+        said = super().entry_query(entries)
+        self.queries.append(asked(entries, said))
+        return said
+
+    def entry_details(self, entries, cell, place_m=None):
+        said = super().entry_details(entries, cell, place_m)
+        self.details.append(asked(entries, said, cell, place_m))
+        return said
+
+
+def asked(entries, said, *where):
+    """Note who asked; newcomers so far tell the turn."""
+    turn = (entries.column.presence == Presence.ENTERING).sum(dim=1)
+    return Asked(entries.token, entries.rollout, turn, said, *where)
+
+
+@dataclass(frozen=True)
+class Played:
+    """Rollouts that were listened to.
+
+    Attributes:
+        starts: What they continue.
+        heard: The stepper that played them.
+        agent: Agent of the recomputed batch in each row, or -1 [token, rollout, row].
+    """
+
+    starts: list
+    heard: Listening
+    agent: np.ndarray
+
+    @property
+    def tokens(self):
+        """Half seconds whose column was played to the end."""
+        return len(self.heard.columns)
+
+    @property
+    def now(self):
+        return self.starts[0].history.now
+
+    @property
+    def presence(self):
+        """``Presence`` [token, rollout, row]."""
+        return torch.stack([column.presence for column in self.heard.columns]).numpy()
+
+    @property
+    def queries(self):
+        return [one for one in self.heard.queries if one.token < self.tokens]
+
+    @property
+    def details(self):
+        return [one for one in self.heard.details if one.token < self.tokens]
+
+
+def play(player, starts, half_seconds):
+    """Play so many half seconds, each with its newcomers."""
+    session = Session(player, starts)
+    lives = [session.population.life] * (session.token + 1)
+    for _ in range(half_seconds):
+        session.step()
+        lives.append(session.population.life)
+    session.step()  # Only now is the network shown the newcomers of the last half second.
+    return Played(starts, player.stepper, _agents_of(starts, np.stack(lives)))
+
+
+def _agents_of(starts, lives):
+    """Number agents: those of the history by their rows, the others by their lives."""
+    settled = settle(starts, lives.shape[2])[-1].life
+    agent = lives.copy()
+    for at, start in enumerate(starts):
+        logged = np.flatnonzero(settled[at] != NOBODY)
+        number = np.arange(max(lives[:, at].max() + 1, start.history.num_agents))
+        number[settled[at, logged]] = logged
+        agent[:, at] = np.where(lives[:, at] == NOBODY, -1, number[lives[:, at]])
+    return agent
+
+
+def recompute(network, played):
+    """All logits of a plain pass over everything that was played: ``(batch, outputs)``."""
+    histories = [start.history for start in played.starts]
+    batch = Batch(
+        scenario_ids=tuple(history.scenario_id for history in histories),
+        agents=_agents(played),
+        roads=collate_roads(histories, 10_000),
+        entries=_entries(played),
+        details=_details(network, played),
+    )
+    with torch.inference_mode():
+        return batch, network.eval()(batch)
+
+
+def _agents(played):
+    columns, agent = played.heard.columns, torch.from_numpy(played.agent).long()
+    tokens, rollouts, _ = agent.shape
+    count = int(agent.max()) + 1
+    token, rollout, row = (agent >= 0).nonzero(as_tuple=True)
+    number = agent[token, rollout, row]
+
+    def told(name, fill):
+        values = torch.stack([getattr(column, name) for column in columns])
+        shape = (rollouts, tokens, count, *values.shape[3:])
+        filled = torch.full(shape, fill, dtype=values.dtype)
+        filled[rollout, token, number] = values[token, rollout, row]
+        return filled
+
+    presence = told("presence", int(Presence.ABSENT))
+    return Agents(
+        kind=told("kind", 0).amax(dim=1),
+        size_lwh_m=told("size_lwh_m", 0.0).amax(dim=1),
+        near=torch.ones((rollouts, count), dtype=torch.bool),
+        pose=told("pose", 0.0),
+        move=told("move", NO_MOVE),
+        label=told("move", NO_MOVE),
+        presence=presence,
+        observed=told("observed", False),
+        pattern=torch.zeros_like(presence),
+        cell=told("cell", NO_CELL),
+        turn=_turns(presence, played.now),
+    )
+
+
+def _turns(presence, now):
+    """Turn of each agent among those that enter at its token: they are numbered so."""
+    entering = presence == Presence.ENTERING
+    played = torch.arange(presence.shape[1])[:, None] > now
+    turn = torch.where(played, entering.cumsum(dim=-1) - 1, OUTSIDE)
+    return torch.where(entering, turn, -1)
+
+
+def _entries(played):
+    """Ask for as many newcomers at every half second as the engine ever did."""
+    shape = (len(played.starts), played.tokens)
+    slots = 1 + max((int(one.turn.max()) for one in played.queries), default=0)
+    nobody = torch.full((*shape, slots), NOBODY)
+    return Entries(
+        asked=(torch.arange(played.tokens) > played.now).expand(shape),
+        count=torch.zeros(shape, dtype=torch.int64),
+        agent=nobody,
+        cell=torch.zeros_like(nobody),
+    )
+
+
+def _details(network, played):
+    """Every answer as three agents to describe, one of each kind, that nobody sees."""
+    told, kinds = played.details, len(KINDS)
+    rollouts = len(played.starts)
+
+    def spread(name, kind, shape=()):
+        filled = torch.zeros((rollouts, len(told), *shape), dtype=kind)
+        for at, one in enumerate(told):
+            value = getattr(one, name)
+            filled[one.rollout, at] = True if name == "rollout" else value
+        return filled.repeat_interleave(kinds, dim=1)
+
+    token, cell = spread("token", torch.int64), spread("cell", torch.int64)
+    offset_m = torch.zeros((*token.shape, 2))
+    if told and told[0].place_m is not None:
+        place_m = spread("place_m", torch.float32, (2,))
+        offset_m = place_m - network.details.centre_m[cell]
+    present = spread("rollout", torch.bool)
+    return Details(
+        present=present,
+        newcomer=torch.zeros_like(present),
+        agent=torch.full_like(token, NOBODY),
+        token=token,
+        turn=spread("turn", torch.int64),
+        cell=cell,
+        kind=torch.arange(kinds).repeat(len(told)).expand(rollouts, -1),
+        size_lwh_m=torch.ones((*token.shape, 3)),
+        heading=torch.zeros_like(token),
+        offset_m=offset_m,
+    )
+
+
+class Gaps:
+    """Largest difference of each kind of logit, and how many numbers were compared."""
+
+    def __init__(self, played, batch, outputs):
+        self.largest: dict[str, float] = {}
+        self.compared: dict[str, int] = {}
+        self._motion(played, outputs.motion)
+        visible = sum(int(column.visible.sum()) for column in played.heard.columns)
+        assert batch.agents.visible.sum() == visible
+        if outputs.entries is not None:
+            self._queries(played, outputs.entries)
+            self._details(played, outputs.details)
+
+    def _motion(self, played, said: MotionOutputs):
+        for token, step in enumerate(played.heard.motion):
+            rollout, row = played.heard.columns[token].visible.nonzero(as_tuple=True)
+            agent = torch.from_numpy(played.agent[token]).long()[rollout, row]
+            number = said.rows.number[rollout, token, agent]
+            for name in MOTION_LOGITS:
+                heard = getattr(step, name)
+                heard = None if heard is None else heard[rollout, row]
+                self._take(name, heard, getattr(said, name), number)
+
+    def _queries(self, played, said: EntryOutputs):
+        for one in played.queries:
+            number = said.rows.number[one.rollout, one.token]
+            for name in QUERY_LOGITS:
+                told = getattr(said, name)
+                told = None if told is None else told[number, one.turn]
+                self._take(name, getattr(one.said, name), told, slice(None))
+
+    def _details(self, played, said: DetailOutputs):
+        kinds = torch.arange(len(KINDS))
+        for at, one in enumerate(played.details):
+            number = said.rows.number[one.rollout[:, None], at * len(KINDS) + kinds]
+            for name in DETAIL_LOGITS:
+                told = said.size_log_m.exp() if name == "size_lwh_m" else None
+                told = getattr(said, name) if told is None else told
+                heard = getattr(one.said, name)
+                if name == "kind_logits":  # The same whatever kind is given.
+                    heard = heard[:, None].expand(-1, len(KINDS), -1)
+                self._take(name, heard, told, number)
+
+    def _take(self, name, heard, told, number):
+        assert (heard is None) == (told is None), name
+        if heard is None or not heard.numel():
+            return
+        assert torch.isfinite(heard).all(), name
+        gap = float((heard - told[number]).abs().max())
+        self.largest[name] = max(gap, self.largest.get(name, 0.0))
+        self.compared[name] = heard.numel() + self.compared.get(name, 0)
