@@ -3,6 +3,7 @@
 import re
 import shlex
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 import typer
@@ -93,10 +94,11 @@ def check_infgen(words: list[str]) -> None:
         parsed = verb.make_context(words[0], rest, parent=context).params
     if words[0] in RUN_LIKE:
         chosen = [word for word in parsed["set"] or () if not re.search("=[A-Z]+$", word)]
-        plan = ["plan", "--root", "none", "--records", "builtin"]
         profile = ["--profile", parsed["profile"]] if parsed["profile"] else []
         settings = [part for word in chosen for part in ("-s", word)]
-        assert exit_code([*plan, *profile, *settings]) == 0
+        with TemporaryDirectory() as root:
+            plan = ["plan", "--root", root, "--records", "builtin"]
+            assert exit_code([*plan, *profile, *settings]) == 0
     for stage in parsed.get("stages") or ():
         assert stage in load_stages(DEFAULT_FILE, {}).stages
 
