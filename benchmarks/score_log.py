@@ -172,7 +172,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--scenes", type=int, default=0, help="at most so many; 0 for all")
     parser.add_argument("--rollouts", type=int, default=32, help="of the Waymo metric")
     parser.add_argument(
-        "--splits", nargs="+", default=["validation"], help="starts of file names, or *"
+        "--splits",
+        nargs="+",
+        default=["validation"],
+        help="starts of file names, or *; with a slash, patterns of paths",
     )
     options = parser.parse_args(arguments)
     found = chain.from_iterable(read_split(split) for split in options.splits)

@@ -35,7 +35,8 @@ def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]
 
 
 def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
-    table = Table(*columns, title=title, title_justify="left")
+    wide = min(len(title), console().width)  # Or the title would be broken up.
+    table = Table(*columns, title=title, title_justify="left", min_width=wide)
     for row in rows:
         table.add_row(*[_cell(value) for value in row])
     return table

@@ -65,6 +65,12 @@ def test_tables_show_cells_as_they_are(capsys):
     assert "0.1235" in out
 
 
+def test_a_title_wider_than_its_table_stays_in_one_line(capsys):
+    show_table("0.0 MB to remove with --yes", ("a", "b"), [])
+
+    assert "0.0 MB to remove with --yes" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("count", "words"), [(1500, "0.0 MB"), (3 << 30, "3.00 GiB")])
 def test_bytes_are_written_for_people(count, words):
     assert gibibytes(count) == words

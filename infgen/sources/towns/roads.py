@@ -156,6 +156,7 @@ def _set_beside(
                 at = row[lane.name] + step
                 beside = edge.driven[at] if 0 <= at < len(edge.driven) else None
                 _add_side(tables, lane, side, beside, along.get((lane.name, side)))
+            _add_own_boundaries(tables, lane, along)
 
 
 def _add_side(
@@ -166,15 +167,24 @@ def _add_side(
     line: tuple[int, int] | None,
 ) -> None:
     own = tables.ids[lane.name]
-    last, row = tables.last_point(own), -1
-    if beside is not None and beside.use is lane.use:
-        other = tables.ids[beside.name]
-        row = len(tables.neighbour)
-        tables.neighbour.append((own, side, other, 0, last, 0, tables.last_point(other)))
+    last = tables.last_point(own)
+    if beside is None or beside.use is not lane.use:
+        return
+    other = tables.ids[beside.name]
     if line is not None:
-        if row >= 0:
-            tables.boundary.append((own, side, *line, 0, last, row))
-        tables.boundary.append((own, side, *line, 0, last, -1))
+        tables.boundary.append((own, side, *line, 0, last, len(tables.neighbour)))
+    tables.neighbour.append((own, side, other, 0, last, 0, tables.last_point(other)))
+
+
+def _add_own_boundaries(
+    tables: _Tables, lane: Lane, along: dict[tuple[str, Side], tuple[int, int]]
+) -> None:
+    """Add what bounds a lane itself: in a record it comes after all its neighbours."""
+    own = tables.ids[lane.name]
+    for side in (Side.LEFT, Side.RIGHT):
+        line = along.get((lane.name, side))
+        if line is not None:
+            tables.boundary.append((own, side, *line, 0, tables.last_point(own), -1))
 
 
 def _road_map(tables: _Tables) -> RoadMap:

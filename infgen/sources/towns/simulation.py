@@ -89,7 +89,7 @@ def _read(path: Path) -> Float64[np.ndarray, "row 6"]:
 
 
 def _gather(
-    tables: list[Float64[np.ndarray, "row 6"]],
+    tables: list[Float64[np.ndarray, "_ 6"]],
     num_trips: int,
     start_s: float,
     num_steps: int,

@@ -159,7 +159,7 @@ def _with_ways_out(skeleton: Skeleton, rng: np.random.Generator) -> Skeleton:
     return Skeleton(np.array(xy_m), np.array(links, np.int64))
 
 
-def _bearings(skeleton: Skeleton) -> list[Float64[np.ndarray, " link"]]:
+def _bearings(skeleton: Skeleton) -> list[Float64[np.ndarray, " _"]]:
     """Directions of the links of every node, ascending."""
     found: list[list[float]] = [[] for _ in skeleton.xy_m]
     for one, other in skeleton.link.tolist():
