@@ -162,7 +162,9 @@ def _memory_bytes(workers: int) -> int:
 
 
 def _gpus(devices: Sequence[str]) -> Any:
-    options = {"host": LOOPBACK, "dashboard": False}
+    # Any free port for its web server: another cluster may have the usual one.
+    web = {"dashboard": False, "dashboard_address": f"{LOOPBACK}:0"}
+    options = {"host": LOOPBACK, **web}
     scheduler = {"cls": _dask().Scheduler, "options": options}
     return _dask().SpecCluster(workers=gpu_workers(devices), scheduler=scheduler)
 

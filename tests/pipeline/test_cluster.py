@@ -89,7 +89,8 @@ def seen_by_this_process():
 
 @pytest.mark.slow
 def test_each_gpu_worker_sees_its_own_device_before_it_imports_anything():
-    options = {"host": "127.0.0.1", "dashboard": False}
+    web = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
+    options = {"host": "127.0.0.1", **web}
     scheduler = {"cls": distributed.Scheduler, "options": options}
     workers = gpu_workers(["4", "GPU-ab12"])
     assert workers["4"]["options"]["nthreads"] == 1
