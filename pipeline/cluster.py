@@ -33,6 +33,8 @@ from pipeline.work import Executor, InProcess, Outcome, Task, do
 
 HELP = "none | local[:N] | gpu[:0,1] | tcp://HOST:PORT | file:scheduler.json"
 LOOPBACK = "127.0.0.1"  # Dask runs what anyone who connects sends it.
+WEB: dict[str, Any] = {"dashboard": False, "dashboard_address": f"{LOOPBACK}:0"}
+"""Any free port for a scheduler's web server: another cluster may have the usual one."""
 SILENT_S = 60.0
 """Longest that a scheduler may leave a question unanswered."""
 CLOSE_S, POLL_S = 10.0, 0.1
@@ -150,7 +152,8 @@ def _local(count: int) -> Any:
         threads_per_worker=1,
         memory_limit=_memory_bytes(count),
         host=LOOPBACK,
-        dashboard_address=None,
+        dashboard_address=WEB["dashboard_address"],
+        scheduler_kwargs={"dashboard": WEB["dashboard"]},
         silence_logs=logging.ERROR,
         env=WORKER_ENVIRONMENT,
     )
@@ -162,9 +165,7 @@ def _memory_bytes(workers: int) -> int:
 
 
 def _gpus(devices: Sequence[str]) -> Any:
-    # Any free port for its web server: another cluster may have the usual one.
-    web = {"dashboard": False, "dashboard_address": f"{LOOPBACK}:0"}
-    options = {"host": LOOPBACK, **web}
+    options = {"host": LOOPBACK, **WEB}
     scheduler = {"cls": _dask().Scheduler, "options": options}
     return _dask().SpecCluster(workers=gpu_workers(devices), scheduler=scheduler)
 
