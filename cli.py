@@ -24,6 +24,7 @@ from pipeline.manifest import verify as find_damage
 from pipeline.options import (
     Asked,
     Building,
+    Comparing,
     Exporting,
     Running,
     Scoring,
@@ -41,6 +42,7 @@ from pipeline.verbs import (
     LOCKED,
     STALE,
     WRONG,
+    compare_arms,
     find_standings,
     print_json,
     run_stages,
@@ -67,18 +69,26 @@ WORK = Path("work")
 
 
 @app.command()
-@gathers(asked=Asked, running=Running)
+@gathers(asked=Asked, comparing=Comparing, running=Running)
 def run(
     stages: Annotated[list[str] | None, typer.Argument(metavar="[STAGE]...")] = None,
     json_: Json = False,
     *,
     asked: Asked,
+    comparing: Comparing,
     running: Running,
 ) -> None:
     """Make stages, and what they need, where they are not made yet (default: report).
 
     Example: infgen run report --root R --records '../data/*.tfrecord*' --profile small
+
+    Example: infgen run report --root R --preset towns-benchmark --arms infgen,smart
+
+    A preset trains, plays and scores several methods alike and sets them side by side.
     """
+    if comparing.preset is not None:
+        compare_arms(asked, comparing, stages or [], running, as_json=json_)
+        return
     run_stages(asked.request(), stages or [], running, as_json=json_)
 
 

@@ -17,6 +17,7 @@ its agents, of its road tokens, by its length, and by the rollouts played at onc
 import argparse
 import json
 import math
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -254,7 +255,8 @@ COLUMNS = {
 def report(title: str, cases: dict[str, Case]) -> dict[str, dict[str, float]]:
     """Measure rows and print their table."""
     found = {}
-    for name, case in cases.items():
+    for at, (name, case) in enumerate(cases.items(), start=1):
+        print(f"{title}, {at} of {len(cases)}: {name}", file=sys.stderr)
         found[name] = in_own_process(Path(__file__), asdict(case))
     show_table(
         title,

@@ -146,7 +146,8 @@ class TrainSettings:
         label_smoothing: Of motion, cell and map tokens.
         first_move_weight: Weight of a newcomer's first move in the motion loss.
         motion_weight, cell_weight, heading_weight, stay_weight, add_weight, size_weight,
-        kind_weight, offset_weight, map_weight: Weights of the loss terms.
+        kind_weight, offset_weight, map_weight: Weights of the loss terms. The paper's are
+            the profile ``paper-loss``.
         place_weight, turn_weight: The same, where places and headings are regressed.
         pattern_weight: The same, of validity patterns.
         max_agents: Agents per scene that a batch holds (nearest to the ego first).
@@ -164,8 +165,8 @@ class TrainSettings:
         precision: ``float32``; ``bf16`` for matrix products of half the bits (geometry and
             losses stay as they are); or ``auto``, bf16 on a GPU that has it.
         compile: Whether to compile the network: ``true``, ``false``, or ``auto``, on a GPU.
-        start: Folder or key of a stage ``train`` whose weights are gone on from; empty for
-            fresh ones.
+        start: Folder or key of a stage ``train`` whose weights are gone on from, or
+            ``builtin`` for those of the package; empty for fresh ones.
         closed_loop_top: Most likely moves from which the one nearest to the log is taken to
             play scenes before they are learned from (CatK, SPEC 7.1); 0 for scenes as
             logged.
@@ -195,11 +196,11 @@ class TrainSettings:
     motion_weight: float = 1.0
     cell_weight: float = 1.0
     heading_weight: float = 1.0
-    stay_weight: float = 10.0
-    add_weight: float = 10.0
-    size_weight: float = 0.2
-    kind_weight: float = 5.0
-    offset_weight: float = 5.0
+    stay_weight: float = 1.0
+    add_weight: float = 1.0
+    size_weight: float = 1.0
+    kind_weight: float = 1.0
+    offset_weight: float = 1.0
     map_weight: float = 1.0
     place_weight: float = 10.0
     turn_weight: float = 10.0

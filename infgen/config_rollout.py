@@ -48,7 +48,7 @@ class RolloutSettings:
         mode: ``long``, ``motion-only`` or ``wosac``: see ``MODES``.
         seconds: Length of a rollout after the history; the mode's if None.
         count: Rollouts per scene.
-        scenes: Scenes to play; 0 for all of the split.
+        scenes: Scenes to play, the first ones of all files alike; 0 for all of the split.
         scenes_per_task: Scenes of one unit of work.
         batch: Rollouts that are played at once.
         everyone: Whether to play every agent of the log that is there at now, however far
@@ -68,8 +68,10 @@ class RolloutSettings:
             likelier.
         cell_temperature: The same for cells.
         heading_temperature: The same for heading bins.
-        add_bias: Added to the log-odds that one more agent enters.
-        leave_bias: Added to the log-odds that an agent leaves.
+        calibrate: Whether log-odds of entering and leaving are shifted so that the weights'
+            held-out rates are those of the logs, as their last validation found.
+        add_bias: Added, on top, to the log-odds that one more agent enters.
+        leave_bias: Added, on top, to the log-odds that an agent leaves.
         entry_mask: Whether newcomers are kept off other boxes, and vehicles near lanes. The
             paper lets them in anywhere.
         entry_lane_m: Farthest from a lane's middle that a vehicle may enter. Most logged
@@ -100,6 +102,7 @@ class RolloutSettings:
     move_temperature: float = 1.0
     cell_temperature: float = 1.0
     heading_temperature: float = 1.0
+    calibrate: bool = True
     add_bias: float = 0.0
     leave_bias: float = 0.0
     entry_mask: bool = True

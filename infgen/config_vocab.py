@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from infgen.coerce import check_bounds
+from infgen.coerce import check_bounds, free
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +27,10 @@ class VocabSettings:
         max_accel_mps2: No segment changes its speed faster.
         max_yaw_rate_rad_s: No moving segment of a vehicle or cyclist turns faster.
         seed: Of the order in which disks are laid.
+        start: Weights whose codebooks are taken instead of new ones, to go on from them:
+            ``builtin``, a folder or key as for ``train.start``. The reports are made anew.
+
+    Settings that ``free`` marks change nothing of what is clustered.
     """
 
     split: str = "training"
@@ -44,6 +48,7 @@ class VocabSettings:
     max_accel_mps2: float = 12.0
     max_yaw_rate_rad_s: float = 2.0
     seed: int = 0
+    start: str = free("")  # What it names is among the stage's sources.
 
     def __post_init__(self) -> None:
         """Refuse what no codebook can be made with.

@@ -18,7 +18,8 @@ Event = Mapping[str, Any]
 where nothing was for some seconds), ``worker-full`` (worker, memory_gib: restarted, as it
 fills its memory), ``worker-lost`` (worker, units that begin again), ``workers-missing``
 (patience_min), ``stage-done`` (report), ``stage-failed``, ``stage-skipped``, ``run-ended``
-or ``run-stopped`` (why).
+or ``run-stopped`` (why). Around the runs of a preset: ``leg-started`` (leg, number, legs),
+``leg-failed`` (leg, why).
 """
 
 QUIET_S = 5.0

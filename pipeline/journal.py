@@ -60,6 +60,7 @@ class Journal:
         line = {
             "learning_rate": learning_rate(self._course.train, done - 1),
             "gradient_norm": stepped.norm,
+            "total": float(total(stepped.terms, self._course.train)),
             **figures(stepped.terms),
             "motion_perplexity": stepped.perplexity,
         }

@@ -1,5 +1,7 @@
 """YAML mappings that know the line of every key, and refuse a key given twice."""
 
+from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,53 @@ def load(path: Path) -> Lined:
     if not isinstance(loaded, Lined):
         raise ConfigError(f"{path}: expected a mapping, got {type(loaded).__name__}")
     return loaded
+
+
+def inner(mapping: Lined, key: str) -> Lined:
+    """Return the mapping under a key; an empty one if nothing stands there.
+
+    Raises:
+        ConfigError: if something else does.
+    """
+    found = mapping.get(key)
+    if found is None:
+        return Lined(mapping.file)
+    if not isinstance(found, Lined):
+        raise ConfigError(f"{mapping.where(key)}: {key} is {found!r}; expected a mapping")
+    return found
+
+
+def words(mapping: Lined, key: str) -> tuple[str, ...]:
+    """Return the list of words under a key; none if nothing stands there.
+
+    Raises:
+        ConfigError: if something else does.
+    """
+    found = mapping.get(key, [])
+    if not isinstance(found, list) or not all(isinstance(word, str) for word in found):
+        raise ConfigError(f"{mapping.where(key)}: {key} is {found!r}; expected a list")
+    return tuple(found)
+
+
+def known(mapping: Lined, names: Sequence[str], what: str) -> None:
+    """Refuse keys that are not among some names.
+
+    Raises:
+        ConfigError: naming the first such key, and the nearest name.
+    """
+    for key in mapping:
+        if key not in names:
+            raise ConfigError(
+                f"{mapping.where(key)}: {what}: no entry {key!r}{hint(key, names)}"
+            )
+
+
+def hint(name: str, names: Sequence[str]) -> str:
+    """Say which of some names may have been meant, to be put behind a message."""
+    near = get_close_matches(name, names, n=1)
+    if near:
+        return f"; did you mean {near[0]!r}?"
+    return f"; there is {', '.join(names)}" if names else ""
 
 
 def _plain(node: yaml.Node, file: str) -> Any:

@@ -13,9 +13,12 @@ import typer
 from infgen.config import ConfigError
 from pipeline.events import Event
 from pipeline.plan import Plan, PlanError
-from pipeline.request import Request, complete
+from pipeline.preset_legs import PRESET, REPORT, Comparison
+from pipeline.request import Request, complete, find_file, recall
 from pipeline.root import Root
 from pipeline.runner import Orders
+from pipeline.settings import load_stages
+from pipeline.sources import absolute
 
 if TYPE_CHECKING:
     from pipeline.export import Exported
@@ -37,7 +40,6 @@ class Asked:
         str | None,
         typer.Option(
             "--profile",
-            "--preset",
             help="Settings laid over, from stages.yaml; several by comma, the last on top.",
         ),
     ] = None
@@ -49,17 +51,18 @@ class Asked:
         Path | None, typer.Option(help="Another stages.yaml than ./stages.yaml.")
     ] = None
 
+    @property
+    def named_records(self) -> list[str]:
+        """Records that the command names."""
+        return [part for word in self.records or () for part in split_names(word)]
+
     def request(self, records: Sequence[str] = ()) -> Request:
         """Fill in from the root's memory what was not named."""
         return complete(
             Root(self.root.absolute()),
             file=self.file,
             profile=self.profile,
-            records=[
-                part
-                for word in (*(self.records or ()), *records)
-                for part in split_names(word)
-            ],
+            records=[*self.named_records, *[p for w in records for p in split_names(w)]],
             overrides=self.set or (),
             environ=os.environ,
         )
@@ -108,6 +111,48 @@ class Running:
             strict_code=self.strict_code,
             workers=self.dask,
             visible_devices=os.environ.get("CUDA_VISIBLE_DEVICES"),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Comparing:
+    """Which methods are trained, played and scored to be compared."""
+
+    preset: Annotated[
+        str | None, typer.Option(help="Train and compare methods, as in stages.yaml.")
+    ] = None
+    arms: Annotated[str | None, typer.Option(help="Of a preset: only these, by comma.")] = (
+        None
+    )
+    seeds: Annotated[
+        int | None, typer.Option(help="Of a preset: how many; default: its own.", min=1)
+    ] = None
+
+    @property
+    def arm_names(self) -> list[str]:
+        """Arms that are named."""
+        return [name.strip() for name in (self.arms or "").split(",") if name.strip()]
+
+    def comparison(self, asked: Asked, targets: Sequence[str]) -> Comparison:
+        """Find the preset, and lay over it what else is asked.
+
+        Raises:
+            ConfigError: for a preset that does not exist.
+        """
+        root, name = Root(asked.root.absolute()), self.preset or ""
+        before = recall(root, f"{PRESET}.{name}")
+        path = find_file(asked.file, before)
+        file = load_stages(path, os.environ)
+        records = [absolute(pattern) for pattern in asked.named_records]
+        return Comparison(
+            root=root,
+            path=path,
+            file=file,
+            preset=file.preset(name),
+            profile=asked.profile,
+            overrides=tuple(asked.set or ()),
+            records=tuple(records or before.get("records", ())),
+            targets=tuple(targets) or (REPORT,),
         )
 
 

@@ -12,8 +12,9 @@ from difflib import get_close_matches
 from typing import Any
 
 from infgen.config import decisive, settle
+from pipeline.overlay import Overlay, Value
 from pipeline.root import Root
-from pipeline.settings import SOURCES, Overlay, StageEntry, Value
+from pipeline.settings import SOURCES, StageEntry
 from pipeline.sources import find_sources
 from pipeline.stage import Source, Stage, Unit
 from pipeline.stages import load_stage

@@ -103,7 +103,7 @@ def finish(
 
 STAGE = Stage(
     name="reference",
-    version=1,
+    version=2,
     settings={"tokenize": TokenSettings, "reference": ReferenceSettings},
     plan=plan,
     work=work,

@@ -196,7 +196,7 @@ def _section(manifest: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 STAGE = Stage(
     name="report",
-    version=3,
+    version=4,
     settings={"report": ReportSettings},
     plan=plan,
     work=work,

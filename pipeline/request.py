@@ -60,19 +60,25 @@ class Request:
 
     def made(self) -> Mapping[str, str]:
         """Keys of the stages that the last run under this profile was to make."""
-        return _read(self.root, self.profile or NO_PROFILE).get("keys", {})
+        return recall(self.root, self.profile or NO_PROFILE).get("keys", {})
 
-    def remember(self, plan: Plan) -> None:
-        """Make this the root's last request."""
-        before = dict(self.made())
+    def remember(self, plan: Plan, name: str | None = None) -> None:
+        """Make this the root's last request.
+
+        Args:
+            plan: What it leads to.
+            name: To remember it by; the profile if None.
+        """
+        name = name or self.profile or NO_PROFILE
+        before = recall(self.root, name).get("keys", {})
         about = {
             "profile": self.profile,
             "records": self.records,
             "overrides": self.overrides,
             "file": None if self.file == DEFAULT_FILE else str(self.file),
-            "keys": {**before, **{name: plan[name].key for name in plan.stages}},
+            "keys": {**before, **{stage: plan[stage].key for stage in plan.stages}},
         }
-        path = _ref(self.root, self.profile or NO_PROFILE)
+        path = ref(self.root, name)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, about)
         link(self.root.refs / LAST, path)
@@ -88,13 +94,13 @@ def complete(
     environ: Mapping[str, str],
 ) -> Request:
     """Fill in from the root's memory what a command does not name."""
-    last = _read(root, LAST)
+    last = recall(root, LAST)
     fresh = profile is not None or bool(records)
+    before = last if profile is None else recall(root, profile)
     profile = profile or last.get("profile")
-    before = _read(root, profile or NO_PROFILE)
     request = Request(
         root=root,
-        file=_file(file, before or last),
+        file=find_file(file, before or last),
         profile=profile,
         records=tuple(absolute(pattern) for pattern in records),
         overrides=(*(() if fresh else before.get("overrides", ())), *overrides),
@@ -119,7 +125,8 @@ def _with_known_records(
     )
 
 
-def _file(named: Path | None, before: Mapping[str, Any]) -> Path:
+def find_file(named: Path | None, before: Mapping[str, Any]) -> Path:
+    """Choose the ``stages.yaml``: named, of this folder, remembered, or packaged."""
     own = Path(OWN_FILE)
     if named is not None:
         return named.absolute()
@@ -129,12 +136,14 @@ def _file(named: Path | None, before: Mapping[str, Any]) -> Path:
     return Path(remembered) if remembered else DEFAULT_FILE
 
 
-def _ref(root: Root, name: str) -> Path:
+def ref(root: Root, name: str) -> Path:
+    """File in which a root remembers a request by a name."""
     return root.refs / f"{name}.json"
 
 
-def _read(root: Root, name: str) -> dict[str, Any]:
-    path = root.refs / LAST if name == LAST else _ref(root, name)
+def recall(root: Root, name: str) -> dict[str, Any]:
+    """Return what a root remembers by a name; nothing if that is damaged."""
+    path = root.refs / LAST if name == LAST else ref(root, name)
     try:
         about = read_json(path)
     except StoreError:

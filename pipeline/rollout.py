@@ -7,14 +7,15 @@ overhead. What a rollout does depends on its scene, its index and the seed alone
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import lru_cache
-from itertools import groupby, islice, pairwise
+from itertools import accumulate, groupby, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infgen.clock import CLOCK
 from infgen.config import RolloutSettings
+from pipeline.calibration import Biases, read_biases
 from pipeline.parquet import Fields, joined, table
 from pipeline.splits import in_split
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
@@ -41,17 +42,16 @@ INDEX: Fields = {
 
 
 def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
-    """Cut the split into units of up to ``scenes_per_task`` scenes, about equally many."""
+    """Cut each shard, or a part of it, into units of about equally many scenes."""
     weights = inputs.folder("train")
     identity = inputs.content("train", "model.safetensors", "model.json")
+    biases = asdict(read_biases(weights) if settings.calibrate else Biases())
     shards = [
         done for done in inputs.units("ingest") if in_split(done.name, settings.split)
     ]
-    left = settings.scenes or sum(int(done.report["scenes"]) for done in shards)
+    counts = [int(done.report["scenes"]) for done in shards]
     units = []
-    for done in shards:
-        scenes = min(left, int(done.report["scenes"]))
-        left -= scenes
+    for done, scenes in zip(shards, _shares(counts, settings.scenes), strict=True):
         for first, after in pairwise(_edges(scenes, settings.scenes_per_task)):
             units.append(
                 Unit(
@@ -60,12 +60,22 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
                     task={
                         "scenes": str(done.path),
                         "weights": str(weights),
+                        "biases": biases,
                         "first": first,
                         "count": after - first,
                     },
                 )
             )
     return units
+
+
+def _shares(counts: Sequence[int], most: int) -> list[int]:
+    """Scenes to take of each shard, of all alike; all of them if ``most`` is 0."""
+    total = sum(counts)
+    if most == 0 or most >= total:
+        return list(counts)
+    ends = [end * most // total for end in accumulate(counts, initial=0)]
+    return [end - begin for begin, end in pairwise(ends)]
 
 
 def _edges(scenes: int, most: int) -> list[int]:
@@ -81,6 +91,12 @@ def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
     from infgen.rollout.trace import Frame, collect  # noqa: PLC0415
     from pipeline.store import write_records  # noqa: PLC0415
 
+    biases = Biases(**unit.task["biases"])
+    settings = replace(
+        settings,
+        add_bias=settings.add_bias + biases.add,
+        leave_bias=settings.leave_bias + biases.leave,
+    )
     folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
     player, weights = _player(folder, identity, settings)
     starts, refused = _starts(unit, player, settings)
@@ -104,7 +120,8 @@ def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
             group += 1
     table(rows, INDEX).write_parquet(target / "index.parquet")
     pace = {"rollouts_per_s": round(_rate(len(rows), begun), 4)}
-    return {**_report(rows, refused), "plays": player.plays, "run": pace}
+    told = {"add_bias": settings.add_bias, "leave_bias": settings.leave_bias}
+    return {**_report(rows, refused), **told, "plays": player.plays, "run": pace}
 
 
 def _rate(played: float | int, begun: float) -> float:
@@ -141,7 +158,14 @@ def finish(
     }
     refused = [line for done in units for line in done.report["refused"]]
     plays = sorted({done.report["plays"] for done in units})
-    return {"rollouts": count, "plays": "; ".join(plays), **means, "refused": refused}
+    biases = {name: units[0].report[name] for name in ("add_bias", "leave_bias") if units}
+    return {
+        "rollouts": count,
+        "plays": "; ".join(plays),
+        **means,
+        **biases,
+        "refused": refused,
+    }
 
 
 @lru_cache(maxsize=2)
@@ -223,10 +247,16 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=2,
+    version=3,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=play,
     finish=finish,
-    modules=("infgen.rollout", "infgen.model", "infgen.tokens", "pipeline.rollout"),
+    modules=(
+        "infgen.rollout",
+        "infgen.model",
+        "infgen.tokens",
+        "pipeline.calibration",
+        "pipeline.rollout",
+    ),
 )

@@ -197,7 +197,7 @@ def finish(
 
 STAGE = Stage(
     name="score",
-    version=2,
+    version=3,
     settings={"reference": ReferenceSettings, "score": ScoreSettings},
     plan=plan,
     work=work,

@@ -10,6 +10,7 @@
       tokenize: {max_gap_s: 1.0}
     profiles:
       small: {sources: builtin, train: {steps: 100}}
+    presets: {}      # methods that are compared: see ``pipeline.preset``
 
 Profiles may be stacked: ``--profile small,paper-loss`` lays the second over the first.
 A stage may name a ``module`` of its own that ends in ``STAGE = Stage(...)``.
@@ -17,27 +18,21 @@ A stage may name a ``module`` of its own that ends in ``STAGE = Stage(...)``.
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from difflib import get_close_matches
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from infgen.config import ConfigError
-from pipeline.lined_yaml import Lined, load
+from pipeline.lined_yaml import Lined, hint, inner, known, load, words
+from pipeline.overlay import Overlay, lay, read_values, read_words
+from pipeline.preset import Preset
+from pipeline.preset_file import read_preset
 from pipeline.stages import MODULES
 
 FILE_VERSION = 1
 DEFAULT_FILE = Path(__file__).with_name("default_stages.yaml")
 SOURCES = "sources"
 """Among ``deps``: the stage reads the source files."""
-
-
-@dataclass(frozen=True, slots=True)
-class Value:
-    """One value, and the place that gave it."""
-
-    value: Any
-    where: str
+_ENTRIES = ("version", SOURCES, "stages", "params", "profiles", "presets")
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,55 +55,58 @@ class StageEntry:
 
 
 @dataclass(frozen=True, slots=True)
-class Overlay:
-    """Settings by section, and source files; empty where nothing is said."""
-
-    sources: tuple[str, ...]
-    values: Mapping[str, Mapping[str, Value]]
-
-    def with_sources(self, sources: tuple[str, ...]) -> "Overlay":
-        """Replace the source files."""
-        return Overlay(sources, self.values)
-
-
-@dataclass(frozen=True, slots=True)
 class StagesFile:
     """A whole ``stages.yaml``."""
 
     stages: Mapping[str, StageEntry]
     base: Overlay
     profiles: Mapping[str, Overlay]
+    presets: Mapping[str, Preset] = field(default_factory=dict)
 
-    def choose(self, profile: str | None, overrides: Sequence[str] = ()) -> Overlay:
+    def choose(
+        self,
+        profile: str | None,
+        overrides: Sequence[str] = (),
+        between: Sequence[Overlay] = (),
+    ) -> Overlay:
         """Lay profiles, and then ``section.key=value`` words, over the base.
 
         Args:
             profile: Names with commas between, each laid over those before it.
             overrides: The words.
+            between: Laid over the profiles, below the words.
 
         Raises:
             ConfigError: for a profile or section that does not exist.
         """
-        layers = [self.base, *self._picked(profile)]
-        layers.append(_overrides(overrides, self._sections()))
-        values: dict[str, dict[str, Value]] = {}
-        for layer in layers:
-            for section, given in layer.values.items():
-                values.setdefault(section, {}).update(given)
-        sources = [layer.sources for layer in layers if layer.sources]
-        return Overlay(sources[-1] if sources else (), values)
+        over = read_words(overrides, self.sections)
+        return lay([self.base, *self.laid(profile), *between, over])
+
+    def preset(self, name: str) -> Preset:
+        """Find a preset.
+
+        Raises:
+            ConfigError: if there is none of that name.
+        """
+        if name not in self.presets:
+            there = hint(name, list(self.presets))
+            raise ConfigError(f"--preset {name}: no preset {name!r}{there}")
+        return self.presets[name]
 
     def names_sources(self, profile: str | None) -> bool:
         """Whether one of the profiles says itself which source files it reads."""
-        return any(overlay.sources for overlay in self._picked(profile))
+        return any(overlay.sources for overlay in self.laid(profile))
 
-    def _picked(self, profile: str | None) -> list[Overlay]:
+    def laid(self, profile: str | None) -> list[Overlay]:
+        """Find profiles by their names with commas between."""
         names = [] if profile is None else profile.split(",")
         return [
             _pick(self.profiles, name.strip(), "profile", "--profile") for name in names
         ]
 
-    def _sections(self) -> list[str]:
+    @property
+    def sections(self) -> list[str]:
+        """All sections of settings that stages read."""
         found = [section for entry in self.stages.values() for section in entry.params]
         return list(dict.fromkeys(found))
 
@@ -124,35 +122,43 @@ def load_stages(path: Path, environ: Mapping[str, str]) -> StagesFile:
         ConfigError: naming file, line, and what was expected there.
     """
     file = load(path)
-    _known(file, ("version", SOURCES, "stages", "params", "profiles"), path.name)
+    known(file, _ENTRIES, path.name)
     if file.get("version") != FILE_VERSION:
         found = file.get("version")
         raise ConfigError(f"{path.name}: version is {found!r}, expected {FILE_VERSION}")
-    stages = {name: _stage(file, name) for name in _inner(file, "stages")}
+    stages = {name: _stage(file, name) for name in inner(file, "stages")}
     sections = [section for entry in stages.values() for section in entry.params]
     return StagesFile(
         stages=stages,
-        base=Overlay(_sources(file, environ), _values(_inner(file, "params"), sections)),
+        base=read_values(inner(file, "params"), sections).with_sources(
+            _sources(file, environ)
+        ),
         profiles={
-            name: _profile(_inner(_inner(file, "profiles"), name), sections, environ)
-            for name in _inner(file, "profiles")
+            name: _profile(inner(inner(file, "profiles"), name), sections, environ)
+            for name in inner(file, "profiles")
+        },
+        presets={
+            name: read_preset(
+                inner(file, "presets"), name, sections, list(inner(file, "profiles"))
+            )
+            for name in inner(file, "presets")
         },
     )
 
 
 def _stage(file: Lined, name: str) -> StageEntry:
-    entry = _inner(_inner(file, "stages"), name)
-    where = _inner(file, "stages").where(name)
-    _known(entry, ("deps", "params", "module"), name)
+    entry = inner(inner(file, "stages"), name)
+    where = inner(file, "stages").where(name)
+    known(entry, ("deps", "params", "module"), name)
     module = entry.get("module", MODULES.get(name))
     if not isinstance(module, str):
-        near = _hint(name, list(MODULES))
+        near = hint(name, list(MODULES))
         raise ConfigError(f"{where}: stage {name!r} needs a `module`{near}")
     return StageEntry(
         name=name,
         module=module,
-        deps=_words(entry, "deps"),
-        params=_words(entry, "params"),
+        deps=words(entry, "deps"),
+        params=words(entry, "params"),
         where=where,
     )
 
@@ -162,32 +168,7 @@ def _profile(entry: Lined, sections: Sequence[str], environ: Mapping[str, str]) 
     for key, value in entry.items():
         if key != SOURCES:
             settings[key], settings.lines[key] = value, entry.lines[key]
-    return Overlay(_sources(entry, environ), _values(settings, sections))
-
-
-def _values(params: Lined, sections: Sequence[str]) -> dict[str, dict[str, Value]]:
-    _known(params, sections, "params")
-    return {
-        section: {
-            key: Value(value, f"{_inner(params, section).where(key)}: {section}")
-            for key, value in _inner(params, section).items()
-        }
-        for section in params
-    }
-
-
-def _overrides(words: Sequence[str], sections: Sequence[str]) -> Overlay:
-    values: dict[str, dict[str, Value]] = {}
-    for word in words:
-        match = re.fullmatch(r"([\w-]+)\.(\w+)=(.*)", word, re.DOTALL)
-        if match is None:
-            raise ConfigError(f"-s {word}: expected section.key=value, as train.steps=100")
-        section, key, value = match.groups()
-        if section not in sections:
-            hint = _hint(section, sections)
-            raise ConfigError(f"-s {word}: no section {section!r}{hint}")
-        values.setdefault(section, {})[key] = Value(value, f"-s {section}")
-    return Overlay((), values)
+    return read_values(settings, sections).with_sources(_sources(entry, environ))
 
 
 def _sources(entry: Lined, environ: Mapping[str, str]) -> tuple[str, ...]:
@@ -213,37 +194,7 @@ def _expand(path: str, environ: Mapping[str, str], where: str) -> str:
     return re.sub(r"\$\{(\w+)(?::-([^}]*))?\}", value, path)
 
 
-def _inner(mapping: Lined, key: str) -> Lined:
-    found = mapping.get(key)
-    if found is None:
-        return Lined(mapping.file)
-    if not isinstance(found, Lined):
-        raise ConfigError(f"{mapping.where(key)}: {key} is {found!r}; expected a mapping")
-    return found
-
-
-def _words(mapping: Lined, key: str) -> tuple[str, ...]:
-    found = mapping.get(key, [])
-    if not isinstance(found, list) or not all(isinstance(word, str) for word in found):
-        raise ConfigError(f"{mapping.where(key)}: {key} is {found!r}; expected a list")
-    return tuple(found)
-
-
-def _known(mapping: Lined, names: Sequence[str], what: str) -> None:
-    for key in mapping:
-        if key not in names:
-            hint = _hint(key, names)
-            raise ConfigError(f"{mapping.where(key)}: {what}: no entry {key!r}{hint}")
-
-
 def _pick(found: Mapping[str, Overlay], name: str, what: str, where: str) -> Overlay:
     if name not in found:
-        raise ConfigError(f"{where} {name}: no {what} {name!r}{_hint(name, list(found))}")
+        raise ConfigError(f"{where} {name}: no {what} {name!r}{hint(name, list(found))}")
     return found[name]
-
-
-def _hint(name: str, names: Sequence[str]) -> str:
-    near = get_close_matches(name, names, n=1)
-    if near:
-        return f"; did you mean {near[0]!r}?"
-    return f"; there is {', '.join(names)}" if names else ""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.doctor import Check
 from pipeline.gauge import amount, clock_time, rate
+from pipeline.preset_legs import PAGE, SHOWN
 from pipeline.root import KEY_DIGITS, Root, read_json
 from pipeline.runner import Result
 from pipeline.screen import LiveTable, console, gibibytes, show_table
@@ -17,12 +18,16 @@ from pipeline.watch import Look, Row
 
 if TYPE_CHECKING:
     from pipeline.export import Exported
+    from pipeline.preset_outlook import Outlook
+    from pipeline.preset_run import Ran
     from pipeline.towns import Written
     from pipeline.wosac import Official
 
 SCENES_PER_TABLE = 5
 SCORES = "table.json"
 """In the report's folder: ``{"columns": [...], "rows": [[...]]}``."""
+_AT_ONCE = ("claims", "against-the-logs")
+"""Tables of a comparison that are printed; all are in its folder."""
 
 
 def show_standings(found: Sequence[Standing]) -> None:
@@ -116,6 +121,38 @@ def show_results(root: Root, results: Sequence[Result], log: Path) -> None:
     if errors:
         console(stderr=True).print(f"tracebacks are in {log}", soft_wrap=True)
     _show_scores(root, results)
+
+
+def show_outlook(found: "Sequence[Outlook]") -> None:
+    """Print what the runs of a preset would make."""
+    rows = [(each.run, ", ".join(each.makes) or "nothing", each.note) for each in found]
+    show_table(f"{len(found)} runs", ("run", "to make", "note"), rows)
+
+
+def show_runs(ran: "Sequence[Ran]", shown: Path | None, log: Path) -> None:
+    """Print what became of the runs of a preset, and what they add up to."""
+    rows = [
+        (
+            each.leg.words,
+            each.state,
+            sum(result.made for result in each.results),
+            each.seconds,
+        )
+        for each in ran
+    ]
+    show_table("runs", ("run", "state", "units made now", "seconds"), rows)
+    missing = [f"{each.leg.words}: {each.why}" for each in ran if not each.is_whole]
+    for line in missing:
+        _warn(line)
+    if missing:
+        console(stderr=True).print(f"tracebacks are in {log}", soft_wrap=True)
+    if shown is None:
+        return
+    told = read_json(shown / SHOWN)
+    for name in _AT_ONCE:
+        if name in told:
+            show_table(told[name]["title"], told[name]["columns"], told[name]["rows"])
+    console().print(f"comparison: {shown / PAGE}", soft_wrap=True)
 
 
 def _show_scores(root: Root, results: Sequence[Result]) -> None:

@@ -128,7 +128,8 @@ def write_towns(order: Order, tell: Callable[[Event], None] = lambda _: None) ->
     """
     from infgen.sources.towns.programs import check_installed  # noqa: PLC0415
 
-    check_installed()
+    if not all(path.is_file() for path in order.paths):
+        check_installed()
     with locked(order.out / f"{order.split}.towns.lock"):
         _begin(order)
         missing = [part for part in _parts(order) if not part.path.is_file()]

@@ -11,10 +11,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from infgen.config import ConfigError, ModelSettings, TokenSettings, TrainSettings, build
-from pipeline.root import KEY_DIGITS, Root, read_json
+from infgen.config import ModelSettings, TokenSettings, TrainSettings, build
 from pipeline.splits import in_split
 from pipeline.stage import Done, Inputs, Progress, Report, Source, Stage, Unit
+from pipeline.starts import ABOUT, START, WEIGHTS, find_start
 
 if TYPE_CHECKING:
     from infgen.model.network import Network
@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from pipeline.distributed import Team
 
 CODEBOOKS = ("motion.zarr", "roads.zarr")
-OUTPUTS = ("model.safetensors", "model.json", "train.jsonl")
-START = "start"
-"""Name of the weights to begin with, among the sources."""
+OUTPUTS = (WEIGHTS, ABOUT, "train.jsonl")
 
 
 def load_network(folder: Path) -> "Network":
@@ -45,21 +43,7 @@ def reads(root: Path, settings: Mapping[str, Any]) -> list[Source]:
     Raises:
         ConfigError: if there are none, or the key is of several.
     """
-    named: str = settings["train"].start
-    if not named:
-        return []
-    stage = Root(root).stage("train")
-    keyed = [path for path in stage.glob("*") if path.name.startswith(named[:KEY_DIGITS])]
-    places = [Path(named).absolute(), *sorted(keyed)]
-    found = [place for place in places if (place / OUTPUTS[1]).is_file()]
-    if len(found) != 1:
-        told = "several have it" if found else "there is no such folder or key"
-        raise ConfigError(
-            f"train.start is {named!r}, but {told}; expected a folder with "
-            f"{OUTPUTS[0]} and {OUTPUTS[1]}, or the start of a key below {stage}"
-        )
-    folder = found[0].resolve()
-    return [Source(str(folder), START, str(read_json(folder / OUTPUTS[1])["weights"]))]
+    return find_start(root, "train.start", settings["train"].start)
 
 
 def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:

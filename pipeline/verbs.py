@@ -5,17 +5,24 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import typer
 
 from pipeline import stopping, tables
 from pipeline.events import Events
-from pipeline.options import Asked, Running
+from pipeline.options import Asked, Comparing, Running
+from pipeline.plan import Plan
+from pipeline.preset_legs import REPORT, Comparison, legs_of
+from pipeline.preset_outlook import Outlook, look_ahead
+from pipeline.preset_records import find_records
+from pipeline.preset_run import Ran, run_legs
 from pipeline.request import Request
-from pipeline.runner import Result
+from pipeline.root import Root
+from pipeline.runner import Orders, Result
 from pipeline.runner import run as make
 from pipeline.screen import LiveTable, Screen
 from pipeline.status import Standing, standings
@@ -46,7 +53,71 @@ def run_stages(
         tables.show_results(request.root, results, events.log)
     if any(result.errors for result in results):
         raise typer.Exit(FAILED)
-    _check_quarantine(request, results, running.max_bad)
+    _check_quarantine(request.root, results, running.max_bad)
+
+
+def compare_arms(
+    asked: Asked,
+    comparing: Comparing,
+    targets: Sequence[str],
+    running: Running,
+    *,
+    as_json: bool,
+) -> None:
+    """Run every arm of a preset, set them side by side, and leave with an exit code."""
+    comparison = comparing.comparison(asked, targets)
+    preset = comparison.preset
+    arms = preset.chosen(comparing.arm_names)
+    legs = legs_of(comparison, arms, comparing.seeds or preset.seeds)
+    for leg in legs:
+        comparison.sketch(leg)  # What is wrong with the settings is told before all else.
+    if running.dry_run:
+        _tell_outlook(look_ahead(comparison, legs), as_json=as_json)
+        return
+    with stopping.listening(), Screen() as screen:
+        events = Events(comparison.root, (screen,))
+        ready = find_records(comparison, screen)
+        comparison.remember({})
+        ran = run_legs(ready, legs, _orders(running, comparison, targets), events)
+        shown = None
+        if REPORT in comparison.targets:
+            from pipeline.preset_write import write_comparison  # noqa: PLC0415
+
+            shown = write_comparison(comparison, ran, again=running.force)
+    _tell_runs(ran, shown, events, as_json=as_json)
+    if not all(each.is_whole for each in ran):
+        raise typer.Exit(FAILED)
+    results = {result.key: result for each in ran for result in each.results}
+    _check_quarantine(comparison.root, list(results.values()), running.max_bad)
+
+
+def _orders(
+    running: Running, comparison: Comparison, targets: Sequence[str]
+) -> Callable[[Plan], Orders]:
+    def order(plan: Plan) -> Orders:
+        # What some runs do not come by is no mistake, if others do.
+        elsewhere = running.begin in comparison.stages and running.begin not in plan.stages
+        own = replace(running, begin=None) if elsewhere else running
+        return own.orders(targets, plan)
+
+    return order
+
+
+def _tell_outlook(found: Sequence[Outlook], *, as_json: bool) -> None:
+    if as_json:
+        print_json({"runs": [asdict(each) for each in found]})
+    else:
+        tables.show_outlook(found)
+
+
+def _tell_runs(
+    ran: Sequence[Ran], shown: Path | None, events: Events, *, as_json: bool
+) -> None:
+    if as_json:
+        runs = [{**each.to_json(), "state": each.state} for each in ran]
+        print_json({"runs": runs, "comparison": shown, "log": str(events.log)})
+    else:
+        tables.show_runs(ran, shown, events.log)
 
 
 def show_plan(
@@ -107,13 +178,13 @@ def _lookers(
     return partial(tables.show_look, table), table
 
 
-def _check_quarantine(request: Request, results: Sequence[Result], max_bad: float) -> None:
+def _check_quarantine(root: Root, results: Sequence[Result], max_bad: float) -> None:
     for result in results:
         bad, good = result.report.get("quarantined", 0), result.report.get("scenes", 0)
         if result.stage != "ingest" or not bad:
             continue
         share = bad / (bad + good)
-        where = request.root.folder("ingest", result.key) / "quarantine.parquet"
+        where = root.folder("ingest", result.key) / "quarantine.parquet"
         typer.echo(
             f"{bad} of {bad + good} records ({share:.2%}) are quarantined: {where}",
             err=True,

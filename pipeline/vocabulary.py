@@ -14,7 +14,7 @@ import numpy as np
 
 from infgen.config import TokenSettings, VocabSettings
 from infgen.scene import Scene
-from infgen.tokens.clusters import cluster_moves, cluster_roads
+from infgen.tokens.clusters import Origin, cluster_moves, cluster_roads
 from infgen.tokens.codebook import MotionCodebook, RoadCodebook
 from infgen.tokens.coverage import describe_moves, describe_roads, match_paths
 from infgen.tokens.curves import NO_CURVES, Curves, sample_curves, scene_curves
@@ -31,7 +31,8 @@ from infgen.views.codebooks import codebook_page
 from pipeline.ingest import read_scenes
 from pipeline.plan import PlanError
 from pipeline.splits import in_split, split_of
-from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
+from pipeline.stage import Done, Inputs, Progress, Report, Source, Stage, Unit
+from pipeline.starts import find_start
 
 if TYPE_CHECKING:
     from pipeline.columns import Unpacked
@@ -77,6 +78,16 @@ class _Gathered(NamedTuple):
     paths: Sequence[Paths]
 
 
+class _Books(NamedTuple):
+    """Both codebooks, the ``Origin`` of their rows, and the radius of a disk of roads."""
+
+    motion: MotionCodebook
+    move_origin: np.ndarray
+    roads: RoadCodebook
+    road_origin: np.ndarray
+    road_tolerance_m: float
+
+
 def load_codebooks(folder: Path) -> tuple[MotionCodebook, RoadCodebook]:
     """Read both codebooks from the folder of this stage.
 
@@ -97,6 +108,15 @@ def vocabulary_fingerprint(folder: Path) -> str:
             state.update(f"{field.name} {values.dtype.str} {values.shape}".encode())
             state.update(np.ascontiguousarray(values).tobytes())
     return state.hexdigest()
+
+
+def reads(root: Path, settings: VocabSettings) -> list[Source]:
+    """Find the weights whose codebooks are taken, if any are named.
+
+    Raises:
+        ConfigError: if there are none, or a key is of several.
+    """
+    return find_start(root, "build-vocab.start", settings.start)
 
 
 def plan(inputs: Inputs, settings: VocabSettings) -> list[Unit]:
@@ -150,10 +170,9 @@ def finish(
     """Cluster all samples, and measure the codebooks on what was held out."""
     progress(0, 4, "samples")
     learn, held_out = (_gather(units, side, settings) for side in _SIDES)
-    progress(1, 4, "moves")
-    motion, move_origin = cluster_moves(learn.segments, settings)
-    progress(2, 4, "roads")
-    roads, road_origin, tolerance_m = cluster_roads(learn.curves.curve_m, settings)
+    starts = [Path(source.url) for source in inputs.sources]
+    books = _taken(starts[0]) if starts else _clustered(learn, settings, progress)
+    motion, move_origin, roads, road_origin, road_tolerance_m = books
     _write(target / "motion.zarr", [motion], MotionCodebook, MOTION_SCHEMA)
     _write(target / "roads.zarr", [roads], RoadCodebook, ROADS_SCHEMA)
 
@@ -163,7 +182,7 @@ def finish(
         "scenes": {side: sum(done.report[side] for done in units) for side in _SIDES},
         "held_out": _held_out_words(units, settings),
         "tolerance_m": settings.tolerance_m,
-        "road_tolerance_m": round(tolerance_m, 5),
+        "road_tolerance_m": round(road_tolerance_m, 5),
         "motion": describe_moves(motion, move_origin, matches, familiar, settings),
         "roads": describe_roads(
             roads, road_origin, held_out.curves.curve_m, learn.curves.curve_m
@@ -175,6 +194,26 @@ def finish(
     page = codebook_page(report, motion, move_origin, roads, road_origin)
     write_file(target / "report.html", page.encode())
     return _headline(report)
+
+
+def _clustered(learn: _Gathered, settings: VocabSettings, progress: Progress) -> _Books:
+    progress(1, 4, "moves")
+    motion, move_origin = cluster_moves(learn.segments, settings)
+    progress(2, 4, "roads")
+    roads, road_origin, tolerance_m = cluster_roads(learn.curves.curve_m, settings)
+    return _Books(motion, move_origin, roads, road_origin, tolerance_m)
+
+
+def _taken(folder: Path) -> _Books:
+    """Take codebooks from weights; what is not logged in them counts as made."""
+    from pipeline.weights import load_codebooks as load  # noqa: PLC0415
+
+    motion, roads = load(folder)
+    move_origin, road_origin = (
+        np.where(book.real, Origin.LOGGED, Origin.MADE).astype(np.int8)
+        for book in (motion, roads)
+    )
+    return _Books(motion, move_origin, roads, road_origin, 0.0)
 
 
 class _Sample:
@@ -292,6 +331,7 @@ STAGE = Stage(
     plan=plan,
     work=work,
     finish=finish,
+    reads=reads,
     modules=(
         "infgen.clock",
         "infgen.geometry",

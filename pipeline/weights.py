@@ -16,9 +16,9 @@ from infgen.config import ModelSettings, TokenSettings, build
 from infgen.model.network import Network
 from infgen.tokens.codebook import MotionCodebook, RoadCodebook
 from pipeline.folders import StoreError, write_file, write_json
+from pipeline.starts import ABOUT, WEIGHTS
 
 SCHEMA = "infgen.model/1"
-WEIGHTS, ABOUT = "model.safetensors", "model.json"
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> str:
@@ -80,8 +80,7 @@ def load_network(folder: Path) -> Network:
     """
     about = read_about(folder)
     tensors = read_tensors(folder / WEIGHTS)
-    motion = MotionCodebook(*_arrays(tensors, "motion_size_lw_m motion_path motion_real"))
-    roads = RoadCodebook(*_arrays(tensors, "road_curve_m road_real"))
+    motion, roads = _codebooks(tensors)
     where = str(folder / ABOUT)
     network = Network(
         build(ModelSettings, about["model"], where),
@@ -96,6 +95,16 @@ def load_network(folder: Path) -> Network:
             f"{folder / WEIGHTS} does not fit its settings: {error}"
         ) from error
     return network.eval()
+
+
+def load_codebooks(folder: Path) -> tuple[MotionCodebook, RoadCodebook]:
+    """Read the codebooks that the weights in a folder were trained with.
+
+    Raises:
+        StoreError: if a file is missing, damaged, or of another schema.
+    """
+    read_about(folder)
+    return _codebooks(read_tensors(folder / WEIGHTS))
 
 
 def take_weights(network: Network, folder: Path) -> None:
@@ -160,6 +169,13 @@ def vocabulary_fingerprint(motion: MotionCodebook, roads: RoadCodebook) -> str:
 def state_of(network: torch.nn.Module) -> dict[str, Tensor]:
     """Weights and codebooks of a network by name (not copied)."""
     return {name: tensor.detach() for name, tensor in network.state_dict().items()}
+
+
+def _codebooks(tensors: Mapping[str, Tensor]) -> tuple[MotionCodebook, RoadCodebook]:
+    return (
+        MotionCodebook(*_arrays(tensors, "motion_size_lw_m motion_path motion_real")),
+        RoadCodebook(*_arrays(tensors, "road_curve_m road_real")),
+    )
 
 
 def _arrays(tensors: Mapping[str, Tensor], names: str) -> list[Any]:

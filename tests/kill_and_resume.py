@@ -225,7 +225,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Do the whole trial and print what it found."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--records", default="builtin")
-    parser.add_argument("--profile", default="demo")
+    parser.add_argument("--profile", default="smoke")
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--stages", nargs="*", default=list(STAGES))

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def trial(tmp_path_factory):
-    words = ("--records", "builtin", "--profile", "demo")
+    words = ("--records", "builtin", "--profile", "smoke", "-s", "ingest.limit=0")
     return script.Trial(words, tmp_path_factory.mktemp("trial"))
 
 

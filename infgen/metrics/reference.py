@@ -136,14 +136,21 @@ def token_bins(
     binned: Binned, feature: str, protocol: Protocol, num_tokens: int
 ) -> Int64[np.ndarray, " token"]:
     """Bin of the number of entries or exits in each half second."""
+    number = events_per_token(binned, feature, protocol, num_tokens)
+    bins = bin_of(number.astype(np.float32), FEATURES[ROW[feature]].histogram)
+    return bins.astype(np.int64)
+
+
+def events_per_token(
+    binned: Binned, feature: str, protocol: Protocol, num_tokens: int
+) -> Int64[np.ndarray, " token"]:
+    """Count the entries or exits in each half second, as far away as a protocol does."""
     token, distance_m = (
         (binned.entry_token, binned.entry_distance_m)
         if feature == "num_entries"
         else (binned.exit_token, binned.exit_distance_m)
     )
-    number = count_per_token(token, distance_m, protocol.event_radius_m, num_tokens)
-    bins = bin_of(number.astype(np.float32), FEATURES[ROW[feature]].histogram)
-    return bins.astype(np.int64)
+    return count_per_token(token, distance_m, protocol.event_radius_m, num_tokens)
 
 
 def _count_steps(

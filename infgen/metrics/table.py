@@ -3,7 +3,10 @@
 Names: ``paper/linear_speed`` (protocol and feature, bucket or composite), ``ace/own_75m``
 and ``ace_slope/own_75m`` (agent count error against the scene's own log, ``split`` the mean
 of all logs, ``truth`` the same moment of a longer log; within the count radius or ``all``),
-``agents/75m`` (mean number), ``rate/entries`` (per second).
+``agents/75m`` (mean number), ``rate/entries`` (per second, at any distance),
+``corrected/entry_rate`` (per second, where the protocol counts entries),
+``corrected/collision_rate`` (share of agents and windows with a collision),
+``corrected/newcomer_offroad_rate`` (of those who are not there now).
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,7 +20,7 @@ from infgen.metrics.binned import Binned
 from infgen.metrics.counts import count_errors, mean_counts, truth
 from infgen.metrics.long_term import BUCKETS, bucket_scores, composite, score_binned
 from infgen.metrics.protocols import FEATURES, PROTOCOLS, ROW
-from infgen.metrics.reference import happened
+from infgen.metrics.reference import events_per_token, happened
 from infgen.metrics.windows import Windows, cut_windows
 
 COMPOSITE, WITHOUT_PLACEMENT = "composite", "composite_without_placement"
@@ -87,15 +90,7 @@ def make_row(binned: Binned, against: Against) -> Row:
             numbers[f"{protocol.name}/{name}"] = float(value[0])
         for name, value in named(scores.windows[at].T):
             curves[f"{protocol.name}/{name}"] = value
-        for name, feature in (
-            ("collision", "collision_indication"),
-            ("offroad", "offroad_indication"),
-        ):
-            bins = binned.bins[at, ROW[feature], :, : windows.num_steps]
-            yes, counts = happened(bins, windows, protocol)
-            total = counts.sum()
-            rate = float((yes & counts).sum() / total) if total else float("nan")
-            numbers[f"{protocol.name}/{name}_rate"] = rate
+        _add_rates(numbers, curves, binned, at, windows)
     _add_counts(numbers, curves, binned, against, windows)
     return Row(numbers, curves)
 
@@ -109,6 +104,34 @@ def named(
     yield WITHOUT_PLACEMENT, composite(buckets, placement=False)
     yield from ((name, buckets[..., at]) for at, name in enumerate(BUCKETS))
     yield from ((feature.name, features[..., at]) for at, feature in enumerate(FEATURES))
+
+
+def _add_rates(
+    numbers: dict[str, float],
+    curves: dict[str, np.ndarray],
+    binned: Binned,
+    at: int,
+    windows: Windows,
+) -> None:
+    """Add how often agents collide, are off-road, enter and leave by one protocol."""
+    protocol = PROTOCOLS[at]
+    everyone, late = np.ones_like(binned.there_now), ~binned.there_now
+    for name, feature, who in (
+        ("collision_rate", "collision_indication", everyone),
+        ("offroad_rate", "offroad_indication", everyone),
+        ("newcomer_offroad_rate", "offroad_indication", late),
+    ):
+        bins = binned.bins[at, ROW[feature], :, : windows.num_steps]
+        yes, counts = (pairs[who] for pairs in happened(bins, windows, protocol))
+        total = counts.sum()
+        rate = float((yes & counts).sum() / total) if total else float("nan")
+        numbers[f"{protocol.name}/{name}"] = rate
+    length_s = windows.length * CLOCK.token_s
+    for name, feature in (("entry_rate", "num_entries"), ("exit_rate", "num_exits")):
+        events = events_per_token(binned, feature, protocol, windows.num_tokens)
+        seconds = windows.num_tokens * CLOCK.token_s
+        numbers[f"{protocol.name}/{name}"] = float(events.sum() / seconds)
+        curves[f"{protocol.name}/{name}"] = windows.sum_tokens(events) / length_s
 
 
 def _add_counts(

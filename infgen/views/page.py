@@ -37,7 +37,8 @@ iframe { width: 100%; height: 40em; border: 1px solid var(--faint); }
   h2, h3 { break-after: avoid; }
   .wide { overflow: visible; }
   table { font-size: 8.5px; }
-  th, td { padding: .1em .4em; overflow-wrap: anywhere; }
+  th, td { padding: .1em .4em; }
+  th, td.text { overflow-wrap: anywhere; }
 }
 """
 _DRAWING = (

@@ -14,8 +14,10 @@ _LATEX = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
+    "±": r"$\pm$",
     **{sign: f"\\{sign}" for sign in "&%$#_{}"},
 }
+NO_BREAK = "\N{NO-BREAK SPACE}"
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
@@ -116,8 +118,11 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Cell
 
 
 def _html_cell(cell: Cell) -> str:
-    look = ' class="text"' if isinstance(cell, str) else ""
-    return f"<td{look}>{escape(words(cell))}</td>"
+    """Write a cell; words stand to the left, but not figures (0.5 ± 0.1)."""
+    is_text = isinstance(cell, str) and any(sign.isalpha() for sign in cell)
+    if is_text:
+        return f'<td class="text">{escape(words(cell))}</td>'
+    return f"<td>{escape(words(cell)).replace(' ', NO_BREAK)}</td>"
 
 
 def _linked(row: str, page: str) -> str:

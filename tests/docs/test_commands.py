@@ -99,6 +99,8 @@ def check_infgen(words: list[str]) -> None:
         with TemporaryDirectory() as root:
             plan = ["plan", "--root", root, "--records", "builtin"]
             assert exit_code([*plan, *profile, *settings]) == 0
+    if parsed.get("preset"):
+        load_stages(DEFAULT_FILE, {}).preset(parsed["preset"])
     for stage in parsed.get("stages") or ():
         assert stage in load_stages(DEFAULT_FILE, {}).stages
 

@@ -141,6 +141,28 @@ def test_a_row_has_every_number_by_name(crossing, against):
     assert np.isnan(row.numbers["ace/truth_near"])
 
 
+def test_a_row_has_the_rates_of_what_a_protocol_counts(crossing, against):
+    row = make_row(binned(crossing(), as_logged=False), against)
+
+    for protocol in PROTOCOLS:
+        for name in ("entry_rate", "exit_rate"):  # The pedestrian, and the cyclist.
+            assert row.numbers[f"{protocol.name}/{name}"] == 1 / 8
+            np.testing.assert_array_equal(row.curves[f"{protocol.name}/{name}"], [1 / 8])
+        # The pedestrian, the only newcomer, walks off the road; others stay on it.
+        assert row.numbers[f"{protocol.name}/newcomer_offroad_rate"] == 1
+        assert row.numbers[f"{protocol.name}/offroad_rate"] < 1
+
+
+def test_who_comes_from_afar_counts_for_one_protocol_only(crossing, against):
+    far = np.full(1, 90, np.float32)
+    one = replace(binned(crossing(), as_logged=False), entry_distance_m=far)
+
+    row = make_row(one, against)
+
+    rates = [row.numbers[f"{each}/entry_rate"] for each in ("paper", "corrected")]
+    assert rates == [1 / 8, 0]
+
+
 def test_a_long_log_knows_the_truth_of_later_windows(crossing, against):
     number = np.ones(187, np.int16)
     logs = {"made": LogCounts(number, 2 * number)}

@@ -1,4 +1,7 @@
 import dataclasses
+import json
+import math
+import shutil
 
 import numpy as np
 import polars as pl
@@ -121,10 +124,46 @@ def test_the_pace_is_told_and_kept_apart_from_what_is_reproducible(inputs, tmp_p
     assert report["run"]["rollouts_per_s"] > 0
 
 
+def test_rates_that_were_wrong_on_held_out_scenes_are_put_right(inputs, tmp_path):
+    weights = tmp_path / "weights"
+    shutil.copytree(inputs.weights, weights)
+    bins = {"count": [400], "predicted": [200], "happened": [300]}
+    line = {"step": 1, "validation": {"add_bins": bins}}
+    (weights / "train.jsonl").write_text(json.dumps(line) + "\n")
+    known = Finished(inputs.scenes, weights)
+    settings = dataclasses.replace(SETTINGS, scenes=1, add_bias=1.0)
+
+    (unit,) = stage.STAGE.plan(known, settings)
+    (plain,) = stage.STAGE.plan(known, dataclasses.replace(settings, calibrate=False))
+    report, _ = play(unit, tmp_path / "calibrated", settings)
+
+    assert unit.task["biases"] == {"add": pytest.approx(math.log(3), abs=1e-4), "leave": 0}
+    assert plain.task["biases"] == {"add": 0, "leave": 0}
+    assert report["add_bias"] == pytest.approx(1 + math.log(3), abs=1e-4)
+    assert report["leave_bias"] == 0
+
+
 def test_scenes_may_be_limited(inputs):
     units = stage.STAGE.plan(inputs, dataclasses.replace(SETTINGS, scenes=3))
 
     assert [unit.task["count"] for unit in units] == [2, 1]
+
+
+@pytest.mark.parametrize(
+    ("most", "parts"), [(0, [9, 1, 4]), (14, [9, 1, 4]), (7, [4, 1, 2]), (1, [0, 0, 1])]
+)
+def test_of_all_files_alike_some_scenes_are_played(inputs, most, parts):
+    path = inputs.scenes[1].path
+    shards = [
+        Done(f"validation.tfrecord-{at}", "key", path, {"scenes": count})
+        for at, count in enumerate((9, 1, 4))
+    ]
+    settings = dataclasses.replace(SETTINGS, scenes=most, scenes_per_task=99)
+
+    units = stage.STAGE.plan(Finished(shards, inputs.weights), settings)
+
+    found = {unit.name.rsplit("-", 1)[0]: unit.task["count"] for unit in units}
+    assert [found.get(shard.name, 0) for shard in shards] == parts
 
 
 def test_every_scene_of_a_unit_is_played_as_often_as_asked(inputs, tmp_path):

@@ -41,6 +41,13 @@ def test_html_is_well_formed_and_escaped():
     assert root.find("h3").text == "A & B"
 
 
+def test_words_stand_to_the_left_and_figures_to_the_right_in_one_line():
+    html = Table("t", ["a", "b"], [["0.5 m", "0.5 ± 0.1"]]).to_html()
+
+    assert '<td class="text">0.5 m</td>' in html
+    assert "<td>0.5\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}0.1</td>" in html
+
+
 def test_markdown_keeps_its_columns_whatever_the_cells_hold():
     lines = TABLE.to_markdown().splitlines()
 
@@ -53,6 +60,10 @@ def test_markdown_keeps_its_columns_whatever_the_cells_hold():
 
 def test_markdown_cannot_be_broken_out_of():
     assert markdown("a\nb `c` [d](e) *f* <g>") == r"a b \`c\` \[d\](e) \*f\* &lt;g&gt;"
+
+
+def test_latex_knows_plus_and_minus():
+    assert r"0.5 $\pm$ 0.1" in Table("t", ["a"], [["0.5 ± 0.1"]]).to_latex()
 
 
 def test_latex_escapes_what_latex_reads():

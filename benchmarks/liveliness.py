@@ -1,0 +1,269 @@
+"""Does a scene stay alive, and do newcomers set off as real ones do?
+
+Reads the logs and the rollouts of a root, however long they are::
+
+    python benchmarks/liveliness.py ROOT [--span 10] [--radius 75]
+
+The first table has the rollouts, span by span, beside the logs as far as they go: agents
+around the ego, speed and off-road share of vehicles, entries and exits per half second. The
+second has who comes after now: speed in the first second, and whether vehicles begin off
+the road. The last line is one JSON object.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from infgen.clock import CLOCK
+from infgen.config import TokenSettings
+from infgen.metrics.binned import edges_of
+from infgen.metrics.kinematics import speed, speed_valid
+from infgen.metrics.placement import count_per_token
+from infgen.metrics.road import RoadEdges, road_edge_m
+from infgen.metrics.traffic import Traffic, from_log, from_rollout
+from infgen.scene import AgentKind
+from infgen.tokens.tracks import TokensError
+from pipeline.logs import open_logs, unit_folders
+from pipeline.rollout import read_rollouts
+from pipeline.screen import show_table
+
+STEPS_PER_S = round(1 / CLOCK.step_s)
+SPEED_EDGES_MPS = np.arange(0.0, 26.0)
+"""Bins of first speeds; what is faster is in the last one."""
+COLUMNS = {
+    "agents": ("agents", ".1f"),
+    "speed_mps": ("vehicles, m/s", ".2f"),
+    "off_road": ("off-road", ".1%"),
+    "entries": ("entries / 0.5 s", ".3f"),
+    "exits": ("exits / 0.5 s", ".3f"),
+}
+
+
+@dataclass(slots=True)
+class Side:
+    """Logs, or rollouts: sums and counts of each figure by span, and newcomers."""
+
+    sums: dict[str, Float64[np.ndarray, "2 span"]]
+    first_mps: list[Float64[np.ndarray, " newcomer"]] = field(default_factory=list)
+    off_road: list[Bool[np.ndarray, " newcomer"]] = field(default_factory=list)
+
+    def means(self, name: str) -> Float64[np.ndarray, " span"]:
+        """Means of one figure; NaN for spans that nothing reaches."""
+        total, count = self.sums[name]
+        return np.where(count > 0, total / np.where(count > 0, count, 1), np.nan)
+
+    def add(self, name: str, at_s: np.ndarray, values: np.ndarray, span_s: float) -> None:
+        """Add values that belong to times after now; none beyond the last span."""
+        span = (at_s / span_s + 1e-6).astype(int)
+        inside = span < self.sums[name].shape[1]
+        np.add.at(self.sums[name][0], span[inside], values[inside])
+        np.add.at(self.sums[name][1], span[inside], 1)
+
+    def first_shares(self) -> Float64[np.ndarray, " bin"]:
+        """Shares of newcomers by their speed in the first second."""
+        mps = np.concatenate([np.empty(0), *self.first_mps])
+        counts, _ = np.histogram(np.minimum(mps, SPEED_EDGES_MPS[-1]), SPEED_EDGES_MPS)
+        return counts / max(counts.sum(), 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """How everything is looked at."""
+
+    span_s: float
+    radius_m: float
+
+
+def take(side: Side, traffic: Traffic, edges: RoadEdges | None, look: Look) -> None:
+    """Measure one log or rollout."""
+    motion, now = traffic.motion, traffic.now
+    x_m, y_m, valid = motion.x_m[0], motion.y_m[0], motion.valid[0]
+    others = np.arange(len(valid)) != traffic.ego
+    away_m = np.hypot(x_m - x_m[traffic.ego], y_m - y_m[traffic.ego])
+    near = valid & (away_m < look.radius_m) & others[:, None]
+    vehicle = (motion.kind == AgentKind.VEHICLE)[:, None]
+    speed_mps = speed(x_m, y_m)
+    known = speed_valid(valid)
+
+    steps = np.arange(now + 1, valid.shape[1])
+    at_s = (steps - now - 1) * CLOCK.step_s
+    side.add("agents", at_s, near[:, steps].sum(axis=0), look.span_s)
+    row, step = np.nonzero((near & vehicle & known)[:, steps])
+    side.add("speed_mps", at_s[step], speed_mps[row, steps[step]], look.span_s)
+    if edges is not None:
+        some = slice(now + 1, None, STEPS_PER_S)
+        rows = np.flatnonzero(others & vehicle[:, 0])
+        off = road_edge_m(motion, rows, some, edges)[0] > 0
+        row, step = np.nonzero(near[rows, some])
+        side.add("off_road", at_s[::STEPS_PER_S][step], off[row, step], look.span_s)
+    _take_events(side, traffic, len(steps), look)
+    _take_newcomers(side, traffic, edges, speed_mps, known)
+
+
+def _take_events(side: Side, traffic: Traffic, num_steps: int, look: Look) -> None:
+    """Count entries and exits; nobody is seen to come or go in a log's last second."""
+    events, tokens = traffic.events, num_steps // CLOCK.steps_per_token - 2
+    at_s = np.arange(tokens) * CLOCK.token_s
+    for name, token, distance_m in (
+        ("entries", events.entry_token, events.entry_distance_m),
+        ("exits", events.exit_token, events.exit_distance_m),
+    ):
+        found = count_per_token(token, distance_m, look.radius_m, tokens)
+        side.add(name, at_s, found, look.span_s)
+
+
+def _take_newcomers(
+    side: Side,
+    traffic: Traffic,
+    edges: RoadEdges | None,
+    speed_mps: np.ndarray,
+    known: np.ndarray,
+) -> None:
+    """Measure who comes after now, and is seen for a second at least."""
+    valid, now = traffic.motion.valid[0], traffic.now
+    first = valid.argmax(axis=1)
+    rows = np.flatnonzero(valid.any(axis=1) & (first > now))
+    rows = rows[first[rows] + STEPS_PER_S < valid.shape[1]]
+    second = first[rows, None] + np.arange(1, STEPS_PER_S)
+    there = known[rows[:, None], second]
+    mps = np.where(there, speed_mps[rows[:, None], second], 0.0).sum(axis=1)
+    seen = there.any(axis=1)
+    side.first_mps.append((mps / np.maximum(there.sum(axis=1), 1))[seen].astype(float))
+    vehicles = rows[traffic.motion.kind[rows] == AgentKind.VEHICLE]
+    if edges is not None and len(vehicles):
+        side.off_road.append(_off_at(traffic, vehicles, first[vehicles], edges))
+
+
+def _off_at(
+    traffic: Traffic,
+    rows: Int64[np.ndarray, " newcomer"],
+    steps: Int64[np.ndarray, " newcomer"],
+    edges: RoadEdges,
+) -> Bool[np.ndarray, " newcomer"]:
+    """Whether each of some vehicles is off the road at a step of its own."""
+    found = np.zeros(len(rows), bool)
+    for step in np.unique(steps):
+        here = steps == step
+        off_m = road_edge_m(traffic.motion, rows[here], slice(step, step + 1), edges)
+        found[here] = off_m[0, :, 0] > 0
+    return found
+
+
+def measure(root: Path, look: Look) -> tuple[Side, Side]:
+    """Measure the logs that have rollouts in a root, and the rollouts.
+
+    Raises:
+        FileNotFoundError: if there are none.
+    """
+    logs = open_logs([str((root / "latest" / "ingest").resolve())])
+    units = unit_folders(root / "latest" / "rollout") or []
+    rollouts = (one for unit in units for one in read_rollouts(unit))
+    sides: list[Side] = []
+    for scenario_id, some in groupby(rollouts, key=lambda one: one.scenario_id):
+        scene = logs.find(scenario_id)
+        edges, played = edges_of(scene), [from_rollout(one) for one in some]
+        if not sides:
+            steps = played[0].motion.valid.shape[2] - played[0].now - 1
+            spans = max(1, round(steps * CLOCK.step_s / look.span_s))
+            sides = [_empty(spans), _empty(spans)]
+        try:
+            take(sides[0], from_log(scene, TokenSettings()), edges, look)
+        except TokensError as error:
+            print(f"<!-- no log of {scenario_id}: {error} -->")
+        for traffic in played:
+            take(sides[1], traffic, edges, look)
+    if not sides:
+        raise FileNotFoundError(f"{root} has no rollouts")
+    return sides[0], sides[1]
+
+
+def _empty(spans: int) -> Side:
+    return Side({name: np.zeros((2, spans)) for name in COLUMNS})
+
+
+def divergence(one: np.ndarray, other: np.ndarray) -> float:
+    """Jensen-Shannon divergence of two distributions in bits, 0 to 1."""
+    bits = 0.0
+    for share in (one, other):
+        some = share > 0
+        bits += (share[some] * np.log2(2 * share[some] / (one + other)[some])).sum()
+    return float(bits / 2)
+
+
+def report(logs: Side, played: Side, look: Look) -> dict[str, Any]:
+    """Print both tables; return all their numbers."""
+    spans = range(logs.sums["agents"].shape[1])
+    found: dict[str, Any] = {
+        name: {who: _numbers(side.means(name)) for who, side in
+               (("logs", logs), ("rollouts", played))}
+        for name in COLUMNS
+    }  # fmt: skip
+    show_table(
+        "rollouts (logs)",
+        ("seconds", *(head for head, _ in COLUMNS.values())),
+        [
+            (
+                f"{span * look.span_s:g} to {(span + 1) * look.span_s:g}",
+                *(
+                    f"{_cell(found[name]['rollouts'][span], form)} "
+                    f"({_cell(found[name]['logs'][span], form)})"
+                    for name, (_, form) in COLUMNS.items()
+                ),
+            )
+            for span in spans
+        ],
+    )
+    newcomers = {who: _newcomers(side) for who, side in
+                 (("logs", logs), ("rollouts", played))}  # fmt: skip
+    found["newcomers"] = newcomers
+    found["first_speed_js"] = divergence(logs.first_shares(), played.first_shares())
+    show_table(
+        "newcomers",
+        ("", *newcomers["logs"]),
+        [(who, *(f"{v:.3f}" for v in one.values())) for who, one in newcomers.items()],
+    )
+    print(f"first speeds, Jensen-Shannon divergence: {found['first_speed_js']:.3f} bits")
+    return found
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "no more" if value is None else format(value, form)
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    return [None if np.isnan(value) else round(float(value), 5) for value in values]
+
+
+def _newcomers(side: Side) -> dict[str, float]:
+    mps = np.concatenate([np.empty(0), *side.first_mps])
+    off = np.concatenate([np.empty(0, bool), *side.off_road])
+    known = len(mps) > 0
+    return {
+        "seen": float(len(mps)),
+        "standing (< 0.5 m/s)": float((mps < 0.5).mean()) if known else np.nan,
+        "median m/s": float(np.median(mps)) if known else np.nan,
+        "90 % m/s": float(np.percentile(mps, 90)) if known else np.nan,
+        "vehicles off-road": float(off.mean()) if len(off) else np.nan,
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print both tables of a root."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("root", type=Path, help="root with stages ingest and rollout")
+    parser.add_argument("--span", type=float, default=10.0, help="seconds per row")
+    parser.add_argument("--radius", type=float, default=75.0, help="metres to the ego")
+    asked = parser.parse_args(arguments)
+    look = Look(asked.span, asked.radius)
+    print(json.dumps(report(*measure(asked.root, look), look)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+"""Scores made by hand, of runs that never were."""
+
+import numpy as np
+
+from infgen.config import ReferenceSettings, ScoreSettings
+from infgen.views.sheets import Measured
+from pipeline.overlay import Overlay
+from pipeline.preset import Arm, Preset
+from pipeline.preset_compared import Compared
+from pipeline.preset_legs import Leg
+from pipeline.preset_run import Ran
+from pipeline.preset_scores import Scored
+from pipeline.score_summary import Tally
+
+NOTHING = Overlay((), {})
+
+
+def arm(name, **changes) -> Arm:
+    """An arm that sets nothing."""
+    given = {
+        "label": name,
+        "profile": (),
+        "settings": NOTHING,
+        "plays": {"long": NOTHING, "motion-only": NOTHING, "wosac": NOTHING},
+        "start": None,
+        "ablates": None,
+        "published": None,
+        "where": "stages.yaml:1",
+    }
+    return Arm(name=name, **{**given, **changes})
+
+
+def scored(method, seed, means, *, mode="long", numbers=None, curves=None) -> Scored:
+    """A scored run: means of each scene by name, numbers, and curves over the windows."""
+    method = arm(method) if isinstance(method, str) else method
+    sums = {
+        name: np.stack([np.asarray(values, float), np.ones(len(values))])
+        for name, values in (curves or {}).items()
+    }
+    return Scored(
+        ran=Ran(Leg("mini", method, seed, mode), "made"),
+        mode=mode,
+        weights=f"weights of {method.name} {seed}",
+        scenes=len(means),
+        rollouts=len(means),
+        official=1,
+        metric="wosac-2025",
+        numbers={
+            name: Measured(*_spread(value)) for name, value in (numbers or {}).items()
+        },
+        tally=Tally(means=dict(means), rollouts=len(means), sums=sums),
+        settings=ScoreSettings(resamples=200),
+        measures=ReferenceSettings(),
+    )
+
+
+def compared(runs, logs=None, *, missing=(), count_error="truth") -> Compared:
+    """A comparison of scored runs; ``missing`` are runs that failed."""
+    arms = {one.ran.leg.arm.name: one.ran.leg.arm for one in runs}
+    arms |= {each.leg.arm.name: each.leg.arm for each in missing}
+    preset = Preset("mini", (), 1, count_error, {}, arms)
+    ran = [*[one.ran for one in runs], *missing]
+    return Compared(preset, ran, list(runs), logs or Tally())
+
+
+def _spread(value):
+    return value if isinstance(value, tuple) else (value,)

@@ -1,0 +1,36 @@
+"""Stands for scoring: says what was played."""
+
+from dataclasses import dataclass
+
+from pipeline.root import read_json
+from pipeline.stage import Stage
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreSettings:
+    enter_radius_m: float = 0.0
+
+
+def plan(inputs, settings):
+    return []
+
+
+def work(unit, target, settings, progress):
+    return {}
+
+
+def finish(inputs, units, target, settings, progress):
+    (target / "score.txt").write_text("scored")
+    mode, weights = read_json(inputs.folder("rollout") / "played.json")
+    return {"mode": mode, "weights": weights, "radius_m": settings.enter_radius_m}
+
+
+STAGE = Stage(
+    name="score",
+    version=1,
+    settings={"score": ScoreSettings},
+    plan=plan,
+    work=work,
+    finish=finish,
+    modules=("toy_score",),
+)

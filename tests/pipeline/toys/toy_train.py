@@ -1,0 +1,59 @@
+"""Stands for training: its weights are a number; others go on from it. Some fail."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from infgen.config import ConfigError
+from pipeline.folders import write_json
+from pipeline.root import Root, read_json
+from pipeline.stage import Source, Stage, Unit
+
+
+@dataclass(frozen=True, slots=True)
+class TrainSettings:
+    steps: int = 1
+    seed: int = 0
+    fail: bool = False
+    start: str = field(default="", metadata={"free": True})
+
+
+def reads(root, settings):
+    if not settings.start:
+        return []
+    path = Root(root).folder("train", settings.start) / "weights.json"
+    if not path.is_file():
+        raise ConfigError(f"train.start is {settings.start!r}; there are no such weights")
+    return [Source(str(path), "start", str(read_json(path)))]
+
+
+def plan(inputs, settings):
+    known = {source.name: source for source in inputs.sources}
+    names = {name: source.fingerprint for name, source in known.items()}
+    return [Unit("weights", names, {name: one.url for name, one in known.items()})]
+
+
+def work(unit, target, settings, progress):
+    if settings.fail:
+        raise ValueError("told to fail")
+    start = read_json(Path(unit.task["start"])) if "start" in unit.task else 0
+    weights = start + settings.steps + 100 * settings.seed
+    write_json(target / "weights.json", weights)
+    return {"weights": str(weights)}
+
+
+def finish(inputs, units, target, settings, progress):
+    (unit,) = units
+    write_json(target / "weights.json", int(unit.report["weights"]))
+    return dict(unit.report)
+
+
+STAGE = Stage(
+    name="train",
+    version=1,
+    settings={"train": TrainSettings},
+    plan=plan,
+    work=work,
+    finish=finish,
+    reads=reads,
+    modules=("toy_train",),
+)

@@ -1,0 +1,225 @@
+"""A whole comparison, from records to tables, of the smallest networks there can be."""
+
+import json
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from cli import main
+from pipeline.settings import DEFAULT_FILE
+
+PRESETS = """
+  pair:
+    profile: small,benchmark,tiny
+    seeds: 2
+    plays:
+      long: {}
+      motion-only: {rollout: {mode: motion-only}}
+      wosac: {rollout: {mode: wosac}}
+    arms:
+      infgen: {published: InfGen, plays: [long, motion-only, wosac]}
+      smart:
+        published: SMART-7M
+        profile: smart
+        plays: {long: {score: {enter_radius_m: 75}}}
+
+  odd:
+    profile: small,benchmark,tiny
+    plays: {long: {}}
+    arms:
+      infgen: {published: InfGen, plays: [long]}
+      odd: {label: Odd one, model: {width: 15}, plays: [long]}
+      odder: {profile: smart, start: odd, plays: [long]}
+"""
+"""Beside those of the package: one that goes well, and one that does not."""
+RUNS = 2 * (3 + 1)
+SETTINGS = (
+    *(
+        "-s",
+        "train.steps=1",
+        "-s",
+        "train.batch_scenes=1",
+        "-s",
+        "train.checkpoint_every=0",
+    ),
+    *("-s", "train.validation_scenes=1", "-s", "ingest.limit=1"),
+    *("-s", "score.resamples=20", "--root", "R"),
+)
+FROM = ("--records", "builtin", "--file", "presets.yaml")
+PAIR = ("run", "report", "--preset", "pair", *SETTINGS)
+MADE = re.compile(r'"state": "(\w+)"')
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    """A folder in which the comparison was made."""
+    folder = tmp_path_factory.mktemp("desk")
+    before = Path.cwd()
+    os.chdir(folder)
+    text = DEFAULT_FILE.read_text().rstrip() + "\n" + PRESETS
+    (folder / "presets.yaml").write_text(text)
+    yield folder, call(*PAIR, *FROM, "--json")
+    os.chdir(before)
+
+
+def call(*words):
+    """Exit code of a command."""
+    with pytest.raises(SystemExit) as left:
+        main(list(words))
+    return left.value.code or 0
+
+
+@pytest.fixture(scope="module")
+def told(desk):
+    return json.loads((desk[0] / "R/presets/pair/comparison.json").read_text())
+
+
+def test_it_leaves_tables_in_three_forms_every_number_and_one_page(desk):
+    folder, code = desk
+    shown = folder / "R/presets/pair"
+
+    assert code == 0
+    names = {path.name for path in shown.iterdir()}
+    assert {"comparison.html", "comparison.json", "tables.json", "tables"} <= names
+    tables = {path.stem for path in (shown / "tables").iterdir()}
+    assert tables == {
+        "claims",
+        "table-1-short-term",
+        "table-2-long-term",
+        "table-3-motion-only",
+        "against-the-logs",
+        "runs",
+        "curves",
+    }
+    for name in tables - {"curves"}:
+        for suffix in ("md", "tex", "csv"):
+            assert (shown / "tables" / f"{name}.{suffix}").stat().st_size > 0
+
+
+def test_every_number_can_be_traced(desk, told):
+    store = desk[0] / "R/store"
+
+    assert len(told["runs"]) == RUNS
+    assert told["missing"] == []
+    assert len(told["records"]) == 3
+    for run in told["runs"]:
+        score = json.loads(
+            (store / "score" / run["keys"]["score"][:16])
+            .joinpath("summary.json")
+            .read_text()
+        )
+        ace = score["numbers"]["ace/own_near"]["mean"]
+        assert run["numbers"]["ace/own_near"]["mean"] == ace
+        model = store / "train" / run["keys"]["train"][:16] / "model.json"
+        assert json.loads(model.read_text())["weights"] == run["weights"]
+
+
+def test_what_arms_have_in_common_was_made_once(desk):
+    store = desk[0] / "R/store"
+
+    def made(stage):
+        return len(list((store / stage).glob("*/manifest.json")))
+
+    shared = ("ingest", "build-vocab", "tokenize", "reference", "comparison")
+    assert [made(stage) for stage in shared] == [1, 1, 1, 1, 1]
+    assert (made("train"), made("rollout"), made("score")) == (4, RUNS, RUNS)
+
+
+def test_the_mean_over_seeds_is_that_of_the_runs(told):
+    means = [
+        run["numbers"]["agents/near"]["mean"]
+        for run in told["runs"]
+        if (run["arm"], run["play"]) == ("smart", "long")
+    ]
+
+    combined = told["arms"]["smart"]["long"]["agents/near"]
+    assert combined["mean"] == pytest.approx(sum(means) / 2)
+    assert "2 seeds" in told["interval"]
+
+
+def test_the_page_stands_alone(desk):
+    page = (desk[0] / "R/presets/pair/comparison.html").read_text()
+
+    assert not re.findall(r"@import|url\(|<script|https?://(?!www\.w3)", page)
+    assert page.count("<svg") == page.count("</svg>") > 5
+    assert "nan" not in re.findall(r'd="([^"]*)"', page)
+    assert "InfGen / SMART" in page
+
+
+def test_a_second_call_makes_nothing_and_a_root_is_sound_and_has_no_garbage(desk, capsys):
+    root = desk[0] / "R"
+    before = {path: path.stat().st_mtime_ns for path in root.rglob("manifest.json")}
+    capsys.readouterr()
+
+    assert call(*PAIR, "--json") == 0
+    assert set(MADE.findall(capsys.readouterr().out)) == {"cached"}
+    after = {path: path.stat().st_mtime_ns for path in root.rglob("manifest.json")}
+    assert after == before
+    assert call("verify", "--root", "R", "--full") == 0
+    capsys.readouterr()
+    assert call("gc", "--root", "R", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["garbage"] == []
+
+
+def test_a_dry_run_says_what_is_left_to_make(desk, capsys):
+    capsys.readouterr()
+
+    assert call(*PAIR, "-n", "--json") == 0
+    runs = json.loads(capsys.readouterr().out)["runs"]
+    assert [run["makes"] for run in runs] == [[]] * RUNS
+    assert call(*PAIR, "-n", "-s", "score.seed=1") == 0
+    out = capsys.readouterr().out
+    assert out.count("score") == RUNS
+    assert "train" not in out
+
+
+def test_a_failing_arm_is_named_beside_those_that_are_there_and_the_exit_code_is_1(
+    desk, capsys
+):
+    capsys.readouterr()
+
+    code = call("run", "report", "--preset", "odd", *SETTINGS, *FROM)
+
+    assert code == 1
+    error = capsys.readouterr().err
+    assert "odd, seed 0, long: train: weights: ValueError: width 15" in error
+    shown = desk[0] / "R/presets/odd"
+    told = json.loads((shown / "comparison.json").read_text())
+    assert list(told["arms"]) == ["infgen"]
+    assert told["missing"][1] == "odder, seed 0, long: there are no weights of odd"
+    page = (shown / "comparison.html").read_text()
+    assert "odder, seed 0, long: there are no weights of odd" in page
+    assert (shown / "tables/table-2-long-term.csv").is_file()
+
+
+def test_fewer_arms_and_seeds_are_fewer_rows(desk, capsys):
+    capsys.readouterr()
+
+    assert call(*PAIR, "--arms", "smart", "--seeds", "1") == 0
+    out = capsys.readouterr().out
+    assert "smart, seed 0, long" in out
+    assert "comparison.html" in out
+    table = (desk[0] / "R/presets/pair/tables/runs.csv").read_text()
+    assert len(table.splitlines()) == 1 + 1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--preset", "womd-mni"], "no preset 'womd-mni'; did you mean 'womd-mini'"),
+        (["--preset", "womd-mini", "--arms", "smrt"], "did you mean 'smart'"),
+        (["--preset", "womd-mini", "-s", "train.stps=1"], "did you mean 'steps'"),
+        (["--preset", "womd-mini"], "reads records of your own"),
+    ],
+)
+def test_wrong_words_are_one_line_and_exit_code_2(
+    tmp_path, monkeypatch, capsys, words, message
+):
+    monkeypatch.chdir(tmp_path)
+
+    assert call("run", "report", "--root", "other", *words) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error
