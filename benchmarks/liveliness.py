@@ -188,8 +188,10 @@ def _empty(spans: int) -> Side:
     return Side({name: np.zeros((2, spans)) for name in COLUMNS})
 
 
-def divergence(one: np.ndarray, other: np.ndarray) -> float:
+def divergence(one: np.ndarray, other: np.ndarray) -> float | None:
     """Jensen-Shannon divergence of two distributions in bits, 0 to 1."""
+    if not (one.any() and other.any()):
+        return None
     bits = 0.0
     for share in (one, other):
         some = share > 0
@@ -227,30 +229,35 @@ def report(logs: Side, played: Side, look: Look) -> dict[str, Any]:
     show_table(
         "newcomers",
         ("", *newcomers["logs"]),
-        [(who, *(f"{v:.3f}" for v in one.values())) for who, one in newcomers.items()],
+        [
+            (who, *(_cell(value, ".3f") for value in one.values()))
+            for who, one in newcomers.items()
+        ],
     )
-    print(f"first speeds, Jensen-Shannon divergence: {found['first_speed_js']:.3f} bits")
+    apart = _cell(found["first_speed_js"], ".3f")
+    print(f"first speeds, Jensen-Shannon divergence in bits: {apart}")
     return found
 
 
 def _cell(value: float | None, form: str) -> str:
-    return "no more" if value is None else format(value, form)
+    return "none" if value is None else format(value, form)
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:
     return [None if np.isnan(value) else round(float(value), 5) for value in values]
 
 
-def _newcomers(side: Side) -> dict[str, float]:
+def _newcomers(side: Side) -> dict[str, float | None]:
     mps = np.concatenate([np.empty(0), *side.first_mps])
     off = np.concatenate([np.empty(0, bool), *side.off_road])
-    known = len(mps) > 0
+    if not len(mps):
+        return {"seen": 0.0}
     return {
         "seen": float(len(mps)),
-        "standing (< 0.5 m/s)": float((mps < 0.5).mean()) if known else np.nan,
-        "median m/s": float(np.median(mps)) if known else np.nan,
-        "90 % m/s": float(np.percentile(mps, 90)) if known else np.nan,
-        "vehicles off-road": float(off.mean()) if len(off) else np.nan,
+        "standing (< 0.5 m/s)": float((mps < 0.5).mean()),
+        "median m/s": float(np.median(mps)),
+        "90 % m/s": float(np.percentile(mps, 90)),
+        "vehicles off-road": float(off.mean()) if len(off) else None,
     }
 
 
