@@ -26,6 +26,7 @@ from infgen.config import TokenSettings
 from infgen.metrics.binned import edges_of
 from infgen.metrics.kinematics import speed, speed_valid
 from infgen.metrics.placement import count_per_token
+from infgen.metrics.reference import divergence_bits
 from infgen.metrics.road import RoadEdges, road_edge_m
 from infgen.metrics.traffic import Traffic, from_log, from_rollout
 from infgen.scene import AgentKind
@@ -66,11 +67,11 @@ class Side:
         np.add.at(self.sums[name][0], span[inside], values[inside])
         np.add.at(self.sums[name][1], span[inside], 1)
 
-    def first_shares(self) -> Float64[np.ndarray, " bin"]:
-        """Shares of newcomers by their speed in the first second."""
+    def first_counts(self) -> Float64[np.ndarray, " bin"]:
+        """Count newcomers by their speed in the first second."""
         mps = np.concatenate([np.empty(0), *self.first_mps])
         counts, _ = np.histogram(np.minimum(mps, SPEED_EDGES_MPS[-1]), SPEED_EDGES_MPS)
-        return counts / max(counts.sum(), 1)
+        return counts.astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,17 +189,6 @@ def _empty(spans: int) -> Side:
     return Side({name: np.zeros((2, spans)) for name in COLUMNS})
 
 
-def divergence(one: np.ndarray, other: np.ndarray) -> float | None:
-    """Jensen-Shannon divergence of two distributions in bits, 0 to 1."""
-    if not (one.any() and other.any()):
-        return None
-    bits = 0.0
-    for share in (one, other):
-        some = share > 0
-        bits += (share[some] * np.log2(2 * share[some] / (one + other)[some])).sum()
-    return float(bits / 2)
-
-
 def report(logs: Side, played: Side, look: Look) -> dict[str, Any]:
     """Print both tables; return all their numbers."""
     spans = range(logs.sums["agents"].shape[1])
@@ -225,7 +215,8 @@ def report(logs: Side, played: Side, look: Look) -> dict[str, Any]:
     newcomers = {who: _newcomers(side) for who, side in
                  (("logs", logs), ("rollouts", played))}  # fmt: skip
     found["newcomers"] = newcomers
-    found["first_speed_js"] = divergence(logs.first_shares(), played.first_shares())
+    apart = divergence_bits(logs.first_counts(), played.first_counts())
+    (found["first_speed_js"],) = _numbers(np.atleast_1d(apart))
     show_table(
         "newcomers",
         ("", *newcomers["logs"]),
@@ -234,8 +225,8 @@ def report(logs: Side, played: Side, look: Look) -> dict[str, Any]:
             for who, one in newcomers.items()
         ],
     )
-    apart = _cell(found["first_speed_js"], ".3f")
-    print(f"first speeds, Jensen-Shannon divergence in bits: {apart}")
+    told = _cell(found["first_speed_js"], ".3f")
+    print(f"first speeds, Jensen-Shannon divergence in bits: {told}")
     return found
 
 

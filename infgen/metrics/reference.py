@@ -89,11 +89,16 @@ def divergence(one: Counts, other: Counts) -> Float64[np.ndarray, "protocol feat
     A likelihood alone is best for traffic that always does the most common thing; this is
     best only for traffic whose values are spread as the log's.
     """
+    return divergence_bits(one.bins, other.bins)
+
+
+def divergence_bits(one: np.ndarray, other: np.ndarray) -> Float64[np.ndarray, "..."]:
+    """Jensen-Shannon divergence of counts [..., bin] in bits; NaN where there are none."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        p, q = (c.bins / c.bins.sum(axis=-1, keepdims=True) for c in (one, other))
+        p, q = (counts / counts.sum(axis=-1, keepdims=True) for counts in (one, other))
         middle = (p + q) / 2
         bits = [np.where(x > 0, x * np.log2(x / middle), x) for x in (p, q)]
-    return (bits[0] + bits[1]).sum(axis=-1) / 2
+    return np.asarray((bits[0] + bits[1]).sum(axis=-1) / 2)
 
 
 def happened(
