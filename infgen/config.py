@@ -100,6 +100,9 @@ class ModelSettings:
         heading_token: Whether newcomers' headings are bins, not regressed.
         pattern_tokens: Whether the network says at which steps of the next half second a
             log would show the agent: detections flicker.
+        ground_width: Features of every cell by which newcomers' cells and headings are told
+            from the street that is there; 0 to tell them from the query alone, as the
+            paper does.
     """
 
     width: int = 128
@@ -127,6 +130,7 @@ class ModelSettings:
     cell_token: bool = True
     heading_token: bool = True
     pattern_tokens: bool = False
+    ground_width: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from infgen.config import ModelSettings
 from infgen.model.agents import KINDS
+from infgen.model.ground import Bearings, Ground, Lying
 from infgen.model.layers import Attention, Seen, embedding_mlp, mlp
 from infgen.model.outputs import DetailOutputs, EntryOutputs
 from infgen.model.relations import Rows, relation_embedding
@@ -59,6 +60,8 @@ class CellStack(nn.Module):
         by_cell = settings.cell_token
         self.cell = mlp(width, width, grid.num_cells) if by_cell else None
         self.place = None if by_cell else mlp(width, width, 2)
+        features = settings.ground_width if by_cell else 0
+        self.ground = Ground(width, features, grid) if features else None
 
     def roads_reach(self) -> Reach:
         """How the query sees roads."""
@@ -82,12 +85,24 @@ class CellStack(nn.Module):
             x = block(x, roads, agents)
         return x
 
-    def answer(self, rows: Rows, x: Tensor) -> EntryOutputs:
-        """Say of every row, by its updated features, whether an agent enters and where."""
+    def answer(self, rows: Rows, x: Tensor, ground: Tensor | None) -> EntryOutputs:
+        """Say of every row, by its updated features, whether an agent enters and where.
+
+        Args:
+            rows: What the features are of.
+            x: The features [N, S, D].
+            ground: Features of the cells, if they are told from them [N, cell, C]. The more
+                cells somebody might come from, the likelier somebody comes: it adds what
+                they sum up to.
+        """
+        add, cell = self.add(x)[..., 0], None if self.cell is None else self.cell(x)
+        if self.ground is not None and cell is not None and ground is not None:
+            cell = cell + self.ground.choose(x, ground)
+            add = add + cell.logsumexp(dim=-1) - math.log(self.num_cells)
         return EntryOutputs(
             rows,
-            self.add(x)[..., 0],
-            None if self.cell is None else self.cell(x),
+            add,
+            cell,
             None if self.place is None else self.radius_m * torch.tanh(self.place(x)),
             self.radius_m,
         )
@@ -133,6 +148,8 @@ class DetailStack(nn.Module):
         self.heading = mlp(width, width, grid.num_headings) if by_bin else None
         self.turn = None if by_bin else mlp(width, width, 1)
         self.offset = mlp(width, width, 2) if settings.cell_token else None
+        features = settings.ground_width if by_bin else 0
+        self.bearings = Bearings(width, features, grid.num_headings) if features else None
 
     def roads_reach(self) -> Reach:
         """How the query sees roads."""
@@ -158,21 +175,28 @@ class DetailStack(nn.Module):
         centre_m = self.centre_m[cell]
         return centre_m if self.offset is not None else centre_m + offset_m
 
-    def answer(self, rows: Rows, x: Tensor, kind: Tensor) -> DetailOutputs:
+    def answer(
+        self, rows: Rows, x: Tensor, kind: Tensor, pose: Tensor, roads: Lying
+    ) -> DetailOutputs:
         """Say who enters, and how it stands once its kind is known.
 
         Args:
             rows: What the features are of.
             x: Updated features [N, ..., D].
             kind: ``AgentKind`` of each.
+            pose: Where it was asked [N, 3] ...
+            roads: ... and the road tokens seen from there.
         """
         given = x + self.given_kind(kind)
         turn, offset = self.turn, self.offset
+        heading = None if self.heading is None else self.heading(given)
+        if self.bearings is not None and heading is not None:
+            heading = heading + self.bearings(given, pose, roads)
         return DetailOutputs(
             rows,
             self.kind(x),
             self.size(given),
-            None if self.heading is None else self.heading(given),
+            heading,
             None if turn is None else math.pi * torch.tanh(turn(given)[..., 0]),
             None if offset is None else self.reach_m * torch.tanh(offset(given)),
         )

@@ -11,6 +11,7 @@ from infgen.config import ModelSettings, TokenSettings
 from infgen.model.agents import AgentEmbedding, AgentRows, MotionStack, Sight
 from infgen.model.batch import Agents, Batch
 from infgen.model.entries import CellStack, DetailStack
+from infgen.model.ground import Lying
 from infgen.model.layers import initialise, normed
 from infgen.model.outputs import (
     DetailOutputs,
@@ -173,7 +174,15 @@ def _entries(
     occupied = stack.occupied(cell.expand_as(seen.present), seen.present)
     reach, scene = stack.roads_reach(), _count(agents.kind)
     roads_seen = see_roads(reach, asked, ego_pose, roads, scene)
-    return stack.answer(asked, stack(occupied, roads_seen, seen))
+    ground = None
+    if stack.ground is not None:
+        there = agents.visible & (agents.turn < 0)  # Newcomers differ by slot: left out.
+        lying = Lying(
+            raw, *(asked.pack(each) for each in (rows.number, agents.pose, there))
+        )
+        map_of = asked.at // agents.pose.shape[1]
+        ground = stack.ground(asked.pack(ego_pose), Lying.roads(roads, map_of), lying)
+    return stack.answer(asked, stack(occupied, roads_seen, seen), ground)
 
 
 def _details(
@@ -203,7 +212,8 @@ def _details(
     reach = stack.roads_reach()
     roads_seen = see_roads(reach, each, pose[:, None], roads, scene)
     x = stack(cell, roads_seen, around.seen(raw))
-    return stack.answer(wanted, x, wanted.pack(details.kind))
+    kind = wanted.pack(details.kind)
+    return stack.answer(wanted, x, kind, pose, Lying.near(roads, roads_seen))
 
 
 def _count(like: Tensor) -> Tensor:

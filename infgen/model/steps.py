@@ -30,6 +30,7 @@ from infgen.model.agents import AgentRows, Sight
 from infgen.model.batch import Roads
 from infgen.model.columns import Column, EntryDetails, EntryQuery, MotionStep
 from infgen.model.entries import CellStack, DetailStack
+from infgen.model.ground import Lying
 from infgen.model.layers import Seen, normed
 from infgen.model.network import EGO, Network
 from infgen.model.pairs import Shared
@@ -87,6 +88,8 @@ class Entries:
         relation: How all rows stand to the ego [rollout, row, D].
         within: Which of them the ego's query sees [rollout, row].
         roads: Road tokens around the ego.
+        ground: Features of the cells around it, if they are told from them
+            [rollout, cell, C].
     """
 
     token: int
@@ -100,6 +103,7 @@ class Entries:
     relation: Tensor
     within: Tensor
     roads: Seen
+    ground: Tensor | None
 
     def take(self, places: Int64[Tensor, " kept"]) -> "Entries":
         """Go on with some of the rollouts only: nothing more is computed for the others."""
@@ -114,6 +118,7 @@ class Entries:
             relation=self.relation[places],
             within=self.within[places],
             roads=self.roads.take(places),
+            ground=None if self.ground is None else self.ground[places],
         )
 
 
@@ -243,8 +248,10 @@ class Stepper:
             relation=torch.zeros_like(raw),
             within=within,
             roads=roads,
+            ground=None,
         )
-        return self.entry_add(empty, column)
+        entries = self.entry_add(empty, column)
+        return replace(entries, ground=self._ground(entries))
 
     @torch.no_grad()
     def entry_add(self, entries: Entries, column: Column) -> Entries:
@@ -275,8 +282,12 @@ class Stepper:
         agents = Seen.own(entries.raw, relation, entries.within)
         x = cells(occupied[:, None], entries.roads, agents)[:, 0]
         each = torch.arange(len(x), device=x.device)
-        said = cells.answer(Rows(each, each), x)
-        return EntryQuery(said.add_logit, said.cell_logits, said.place_m)
+        said = cells.answer(Rows(each, each), x[:, None], entries.ground)
+        return EntryQuery(
+            said.add_logit[:, 0],
+            None if said.cell_logits is None else said.cell_logits[:, 0],
+            None if said.place_m is None else said.place_m[:, 0],
+        )
 
     @torch.no_grad()
     def entry_details(
@@ -310,7 +321,8 @@ class Stepper:
         roads = see_roads(asking.detail_roads, rows, pose, entries.map, entries.scene)
         x = details(cell, roads, around.seen(entries.raw.flatten(0, 1)))
         kinds = torch.arange(details.given_kind.num_embeddings, device=cell.device)
-        said = details.answer(rows, x[:, None], kinds)
+        near = Lying.near(entries.map, roads)
+        said = details.answer(rows, x[:, None], kinds, pose[:, 0], near)
         return EntryDetails(
             said.kind_logits[:, 0],
             said.size_log_m.exp(),
@@ -318,6 +330,19 @@ class Stepper:
             said.turned_rad,
             said.offset_m,
         )
+
+    def _ground(self, entries: Entries) -> Tensor | None:
+        """Describe the cells around every ego, before any newcomer."""
+        ground, column = self._asked().cells.ground, entries.column
+        if ground is None:
+            return None
+        row = torch.arange(column.presence.numel(), device=column.pose.device)
+        there = column.visible & (column.presence != Presence.ENTERING)
+        features = entries.raw.flatten(0, 1)
+        lying = Lying(features, row.view_as(column.presence), column.pose, there)
+        roads = Lying.roads(entries.map, entries.scene)
+        described: Tensor = ground(column.pose[:, EGO], roads, lying)
+        return described
 
     def _asked(self) -> _Asking:
         if self._asking is None:
