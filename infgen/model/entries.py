@@ -98,7 +98,7 @@ class CellStack(nn.Module):
         add, cell = self.add(x)[..., 0], None if self.cell is None else self.cell(x)
         if self.ground is not None and cell is not None and ground is not None:
             cell = cell + self.ground.choose(x, ground)
-            add = add + cell.logsumexp(dim=-1) - math.log(self.num_cells)
+            add = add + cell.float().logsumexp(dim=-1) - math.log(self.num_cells)
         return EntryOutputs(
             rows,
             add,

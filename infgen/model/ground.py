@@ -5,7 +5,8 @@ query, which would have to carry the whole street (SPEC 4.6). Here what is aroun
 onto the cells, or the bins, that it covers, and each of them has a say of its own.
 
 Everything is shared out between the nearest points of a lattice, so features change
-continuously with poses. Shape letters as in ``layers``; C is the width of these features.
+continuously with poses; in float32 also under autocast. Shape letters as in ``layers``; C
+is the width of these features.
 """
 
 import math
@@ -89,7 +90,7 @@ class Ground(nn.Module):
         laid = self._lay(ego_pose, roads, self.road) + self._lay(
             ego_pose, agents, self.agent
         )
-        square = laid.unflatten(0, (len(ego_pose), self.side, self.side))
+        square = laid.view(len(ego_pose), self.side, self.side, laid.shape[1])
         spread = self.beside(square.permute(0, 3, 1, 2))
         cells = spread.flatten(2)[..., self.lattice].mT
         keys: Tensor = self.key(functional.relu(cells + self.place(self.centre_m)))
@@ -117,7 +118,7 @@ class Ground(nn.Module):
         share = at - lower
         column, row = lower.long().unbind(-1)
         first = (query * self.side + row) * self.side + column
-        laid = features.new_zeros((len(ego_pose) * self.side**2, features.shape[1]))
+        laid = share.new_zeros((len(ego_pose) * self.side**2, features.shape[1]))
         for up in (0, 1):
             for right in (0, 1):
                 weight = _part(share[:, 0], right) * _part(share[:, 1], up)

@@ -111,6 +111,11 @@ def decade_ticks(low: float, high: float) -> list[float]:
     return marks[start : end + 1]
 
 
+def _tick(value: float) -> str:
+    """Write the number at a tick; small ones short, so that they stay beside their axis."""
+    return f"{value:.0e}".replace("e-0", "e-") if 0 < abs(value) < 1e-3 else f"{value:g}"
+
+
 def grid(
     x_axis: Axis, y_axis: Axis, x_marks: Sequence[float], y_marks: Sequence[float]
 ) -> str:
@@ -120,7 +125,7 @@ def grid(
         y_px = y_axis.px(value)
         lines.append(
             f'<path class="grid" d="M{x_axis.from_px:g} {y_px:.1f}H{x_axis.to_px:g}"/>'
-            + text(x_axis.from_px - 6, y_px + 4, f"{value:g}", "end")
+            + text(x_axis.from_px - 6, y_px + 4, _tick(value), "end")
         )
     return "".join(lines)
 
@@ -132,7 +137,7 @@ def x_grid(axis: Axis, marks: Sequence[float], top_px: float, bottom_px: float) 
         x_px = axis.px(value)
         lines.append(
             f'<path class="grid" d="M{x_px:.1f} {top_px:g}V{bottom_px:g}"/>'
-            + text(x_px, bottom_px + 15, f"{value:g}", "middle")
+            + text(x_px, bottom_px + 15, _tick(value), "middle")
         )
     return "".join(lines)
 
