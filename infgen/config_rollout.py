@@ -62,7 +62,8 @@ class RolloutSettings:
         top_moves: Most likely moves that are sampled from; 0 for all.
         top_cells: Most likely cells that are sampled from; 0 for all.
         move_nucleus: Least share of probability that the moves sampled from have together,
-            the most likely first; 1 for all.
+            the most likely first; 1 for all. Moves that stand still and those that do not
+            have a nucleus each and keep their probability: who seldom sets off still does.
         cell_nucleus: The same for cells.
         move_temperature: Logits of moves are divided by it: below 1 the likely become
             likelier.

@@ -247,7 +247,7 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=3,
+    version=4,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=play,

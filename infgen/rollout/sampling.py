@@ -11,6 +11,7 @@ def choose(
     *,
     nucleus: float = 1.0,
     temperature: float = 1.0,
+    apart: Tensor | None = None,
 ) -> Tensor:
     """Sample the last dimension by inverting its cumulative distribution.
 
@@ -21,6 +22,8 @@ def choose(
         nucleus: Of these, only from the fewest likeliest that have this share of their
             probability together.
         temperature: Logits are divided by it first.
+        apart: Which choices have a nucleus of their own [..., choice]: they and the others
+            each keep the probability that they have together.
 
     Returns:
         Indices [...], int64.
@@ -29,16 +32,34 @@ def choose(
     keep = min(top, count) if top else count
     best, index = logits.topk(keep, dim=-1)
     share = (best.double() / temperature).softmax(dim=-1)
+    if nucleus < 1:
+        share = _within(share, nucleus, None if apart is None else apart.gather(-1, index))
     reached = share.cumsum(dim=-1)
-    likely = share > 0
-    if nucleus < 1:
-        likely &= reached - share < nucleus
-    last = likely.sum(dim=-1).clamp(min=1) - 1
-    sought = uniform
-    if nucleus < 1:
-        sought = uniform * reached.gather(-1, last[..., None])[..., 0]
+    # Beyond the last likely one nothing is reached any more, whatever rounding does.
+    last = _last(share > 0)
+    sought = uniform * reached[..., -1] if nucleus < 1 else uniform
     rank = (sought[..., None] >= reached).sum(dim=-1).minimum(last)
     return index.gather(-1, rank[..., None])[..., 0]
+
+
+def _within(share: Tensor, nucleus: float, apart: Tensor | None) -> Tensor:
+    """Keep the nucleus of descending shares, or those of two groups of them."""
+    if apart is None:
+        return share * (share.cumsum(dim=-1) - share < nucleus)
+    kept = torch.zeros_like(share)
+    for group in (apart, ~apart):
+        own = share * group
+        reached = own.cumsum(dim=-1)
+        whole = reached[..., -1:]
+        some = own * (reached - own < nucleus * whole)
+        kept += some * (whole / some.sum(dim=-1, keepdim=True).clamp(min=1e-300))
+    return kept
+
+
+def _last(likely: Tensor) -> Tensor:
+    """Place of the last true value of the last dimension; 0 if there is none."""
+    places = torch.arange(likely.shape[-1], device=likely.device)
+    return (likely * places).amax(dim=-1)
 
 
 def happens(logit: Tensor, uniform: Tensor, bias: float = 0.0) -> Tensor:

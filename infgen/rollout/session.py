@@ -70,6 +70,7 @@ class Session:
         self.population = history[-1]
         self.token = starts[0].history.now
         self._table = make_move_table(player.codebook)
+        self._standing = player.tensor(player.codebook.standing)
         self._driven_to: np.ndarray | None = None
 
     @property
@@ -149,7 +150,7 @@ class Session:
     ) -> tuple[Population, np.ndarray]:
         """Sample everyone's move, and who leaves; drive the egos that are driven."""
         player, settings = self._player, self._player.settings
-        move = self._moves(said, token)
+        move = self._moves(before, said, token)
         if ego_path is not None:
             target, pose = ego_path[:, -1], before.pose[:, EGO_ROW]
             kind = before.kind[:, EGO_ROW]
@@ -162,14 +163,19 @@ class Session:
             path[:, EGO_ROW] = ego_path
         return moved, path
 
-    def _moves(self, said: MotionStep, token: int) -> Int64[np.ndarray, "rollout row"]:
+    def _moves(
+        self, before: Population, said: MotionStep, token: int
+    ) -> Int64[np.ndarray, "rollout row"]:
+        """Sample moves. Who seldom sets off still does: standing has its own nucleus."""
         settings, packed = self._player.settings, said.packed
+        kind = packed.rows.pack(self._player.tensor(before.kind).long())
         drawn = choose(
             packed.move_logits,
             self._luck(packed.rows, token, Purpose.MOVE),
             settings.top_moves,
             nucleus=settings.move_nucleus,
             temperature=settings.move_temperature,
+            apart=self._standing[kind] if settings.move_nucleus < 1 else None,
         )
         return packed.rows.spread(drawn).cpu().numpy()
 

@@ -18,6 +18,9 @@ BOX_LW_M = np.array([[4.8, 2.0], [1.0, 1.0], [2.0, 1.0]], dtype=np.float32)
 STAND_STILL = 0
 """Row of every kind's codebook that goes nowhere."""
 
+STANDING_M = 0.1
+"""Shorter moves are those of agents that stand (0.2 m/s)."""
+
 ROAD_SPACING_M = 0.5
 """Distance along a map line between two points of a piece."""
 
@@ -51,6 +54,11 @@ class MotionCodebook:
     def end_pose(self) -> Float32[np.ndarray, "3 move 3"]:
         """Pose at the end of each move, in the frame of its start."""
         return self.path[:, :, -1]
+
+    @property
+    def standing(self) -> Bool[np.ndarray, "3 move"]:
+        """Which moves go nowhere, or hardly anywhere."""
+        return np.hypot(*np.moveaxis(self.end_pose[..., :2], -1, 0)) < STANDING_M
 
     @property
     def end_corners_m(self) -> Float32[np.ndarray, "3 move 4 2"]:

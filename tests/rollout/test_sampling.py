@@ -109,3 +109,40 @@ def test_a_bias_moves_the_log_odds(bias, expected):
     share = happens(torch.zeros(10_000), uniform, bias).float().mean()
 
     assert float(share) == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("apart", "nucleus", "expected"),
+    [
+        # Whoever seldom does the one thing still does: its probability stays 0.1.
+        ([True, False, False, False], 0.5, [0.1, 0, 0.45, 0.45]),
+        ([True, True, False, False], 0.6, [0, 0.3, 0.35, 0.35]),
+        ([True, True, True, True], 0.5, [0, 0, 0.5, 0.5]),
+        ([False, False, False, False], 0.5, [0, 0, 0.5, 0.5]),
+        ([True, False, False, False], 1.0, [0.1, 0.2, 0.35, 0.35]),
+    ],
+)
+def test_choices_set_apart_have_a_nucleus_of_their_own(apart, nucleus, expected):
+    marks = torch.tensor(apart).expand(1000, -1)
+    shares = [0.1, 0.2, 0.35, 0.35]
+
+    found = shares_of(shares, nucleus=nucleus, apart=marks)
+
+    assert torch.allclose(found, torch.tensor(expected), atol=2e-3)
+
+
+@given(
+    st.lists(st.tuples(st.floats(-9, 9), st.booleans()), min_size=1, max_size=9),
+    st.floats(0.05, 0.99),
+)
+def test_a_nucleus_takes_no_probability_from_either_group(choices, nucleus):
+    logits = torch.tensor([logit for logit, _ in choices], dtype=torch.float64)
+    apart = torch.tensor([mark for _, mark in choices])
+    uniform = (torch.arange(2000, dtype=torch.float64) + 0.5) / 2000
+
+    picks = choose(
+        logits.expand(2000, -1), uniform, nucleus=nucleus, apart=apart.expand(2000, -1)
+    )
+
+    expected = logits.softmax(dim=0)[apart].sum()
+    assert abs(apart[picks].double().mean() - expected) < 2e-3

@@ -273,11 +273,23 @@ def test_the_likeliest_alone_is_what_every_seed_plays(crossing, start, player):
     few = {"insert": False, "remove": False, "seconds": 1.0}
     certain = player(top_moves=1, **few)
     cold = player(top_moves=0, move_temperature=1e-6, **few)
-    narrow = player(top_moves=0, move_nucleus=1e-6, **few)
 
     one, other = play(certain, [start(scene, 0), start(scene, 1)])
 
     np.testing.assert_array_equal(one.xyz_m, other.xyz_m)
-    for playing in (cold, narrow):
-        (same,) = play(playing, [start(scene, 2)])
-        np.testing.assert_allclose(same.xyz_m, one.xyz_m, atol=1e-4)
+    (same,) = play(cold, [start(scene, 2)])
+    np.testing.assert_allclose(same.xyz_m, one.xyz_m, atol=1e-4)
+
+
+def test_a_narrow_nucleus_leaves_the_likeliest_way_to_go_and_to_stand(
+    crossing, start, player
+):
+    few = {"insert": False, "remove": False, "seconds": 0.5, "top_moves": 0}
+    playing = player(move_nucleus=1e-6, **few)
+
+    ends_m = [
+        play(playing, [start(crossing(), seed)])[0].xyz_m[:, -1] for seed in range(12)
+    ]
+
+    for each in np.swapaxes(ends_m, 0, 1):
+        assert len(np.unique(each.round(3), axis=0)) <= 2
