@@ -59,10 +59,9 @@ def peak_mib(device: str) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def peak_flops(device: str) -> float:
+def peak_flops(device: str, *, bf16: bool) -> float:
     """Operations a second (of the clock) of a product of large matrices."""
-    low = device != "cpu" and torch.cuda.is_bf16_supported()
-    kind = torch.bfloat16 if low else torch.float32
+    kind = torch.bfloat16 if bf16 else torch.float32
     one = torch.randn(PEAK_SIDE, PEAK_SIDE, device=device, dtype=kind)
     other, best = one.clone(), 0.0
 

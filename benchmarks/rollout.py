@@ -192,6 +192,8 @@ def measure(case: Case) -> dict[str, float]:
     spent_s, passed_s = used_s(case.device) - start_s, time.perf_counter() - start
     memory_mib = peak_mib(case.device)
     flops = _flops_of_a_step(session) * len(frames)
+    bf16 = case.device != "cpu" and torch.cuda.is_bf16_supported()
+    peak = peak_flops(case.device, bf16=bf16)
     return {
         "agents": float(np.mean([(frame.life >= 0).sum(axis=1) for frame in frames])),
         "roads": float(history.num_roads),
@@ -202,7 +204,7 @@ def measure(case: Case) -> dict[str, float]:
         "rollouts_per_clock_s": case.batch / passed_s,
         "peak_mib": memory_mib,
         "gflop_per_rollout": flops / case.batch / 1e9,
-        "flops_over_peak": flops / passed_s / peak_flops(case.device),
+        "flops_over_peak": flops / passed_s / peak,
     }
 
 

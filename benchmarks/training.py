@@ -4,8 +4,10 @@ On the scene that all such figures of ours are about (637f20cafde22ff8), or on t
 built-in one where it is absent::
 
     python benchmarks/training.py [--size paper] [--threads 2] [--device cpu]
+        [--precision auto]
 
-Every row is a process of its own, so its memory is too. The last line is one JSON object:
+One row has products of half the bits, which pay on processors that multiply bfloat16. Every
+row is a process of its own, so its memory is too. The last line is one JSON object:
 ``cpu_s_per_scene`` and ``peak_rss_mib`` of the first row, one scene a step, and
 ``flops_over_peak``: multiply-adds of matrix products a second over those of a plain product
 of large matrices in the same process. On a GPU seconds are the clock's.
@@ -55,6 +57,7 @@ class Case:
         neighbours: Map tokens that an agent sees; 0 for the default.
         device: Where.
         threads: Of the processor.
+        precision: As in ``TrainSettings``.
     """
 
     size: str
@@ -62,6 +65,7 @@ class Case:
     neighbours: int
     device: str
     threads: int
+    precision: str
 
 
 def prepare(case: Case) -> tuple[Descent, Batch, Training]:
@@ -69,7 +73,7 @@ def prepare(case: Case) -> tuple[Descent, Batch, Training]:
     model = SIZES[case.size]
     if case.neighbours:
         model = replace(model, map_agent_neighbours=case.neighbours)
-    grid, how = TokenSettings(), TrainSettings()
+    grid, how = TokenSettings(), TrainSettings(precision=case.precision)
     motion, roads = made_codebooks()
     tokens = tokenize_scene(read_scene(), motion, roads, grid)
     batch = collate([tokens] * case.scenes, Limits.of(model, how, grid), 0)
@@ -94,6 +98,7 @@ def measure(case: Case) -> dict[str, float]:
         used = seconds(lambda: descent.step([batch], range(1), 1), STEPS, case.device)
         passed_s = (time.perf_counter() - start) / STEPS
     flops = float(counter.get_total_flops())
+    peak = peak_flops(case.device, bf16=descent.forward.bf16)
     return {
         "agents": float(batch.agents.visible.sum()) / case.scenes,
         "roads": float(batch.roads.real.sum()) / case.scenes,
@@ -102,27 +107,29 @@ def measure(case: Case) -> dict[str, float]:
         "clock_s_per_scene": passed_s / case.scenes,
         "peak_rss_mib": peak_mib(case.device),
         "gflop_per_scene": flops / case.scenes / 1e9,
-        "flops_over_peak": flops / passed_s / peak_flops(case.device),
+        "flops_over_peak": flops / passed_s / peak,
     }
 
 
-def report(size: str, device: str, threads: int) -> None:
+def report(first: Case) -> None:
     """Print the table and, last, the figures as JSON."""
+    size, device, threads = first.size, first.device, first.threads
     cases = {
-        "one scene": Case(size, 1, 0, device, threads),
-        "two scenes": Case(size, 2, 0, device, threads),
-        f"one scene, {FEW_NEIGHBOURS} map tokens per agent": Case(
-            size, 1, FEW_NEIGHBOURS, device, threads
+        "one scene": first,
+        "two scenes": replace(first, scenes=2),
+        f"one scene, {FEW_NEIGHBOURS} map tokens per agent": replace(
+            first, neighbours=FEW_NEIGHBOURS
         ),
+        "one scene, bf16": replace(first, precision="bf16"),
     }
     found = {
         name: in_own_process(Path(__file__), asdict(case)) for name, case in cases.items()
     }
-    first = next(iter(found.values()))
+    one = found["one scene"]
     used = "CPU-s" if device == "cpu" else "s"
     show_table(
-        f"training step, {size} ({first['parameters']:,.0f} parameters), "
-        f"{first['agents']:.0f} agents at a time, {first['roads']:.0f} road tokens",
+        f"training step, {size} ({one['parameters']:,.0f} parameters), "
+        f"{one['agents']:.0f} agents at a time, {one['roads']:.0f} road tokens",
         (
             "step of",
             f"{used} a scene",
@@ -148,12 +155,14 @@ def report(size: str, device: str, threads: int) -> None:
         "size": size,
         "device": device,
         "threads": threads,
-        "cpu_s_per_scene": round(first["used_s_per_scene"], 3),
+        "precision": first.precision,
+        "cpu_s_per_scene": round(one["used_s_per_scene"], 3),
         "cpu_s_per_scene_of_two": round(found["two scenes"]["used_s_per_scene"], 3),
         "cpu_s_few_neighbours": round(few["used_s_per_scene"], 3),
-        "peak_rss_mib": round(first["peak_rss_mib"]),
-        "gflop_per_scene": round(first["gflop_per_scene"], 1),
-        "flops_over_peak": round(first["flops_over_peak"], 3),
+        "cpu_s_bf16": round(found["one scene, bf16"]["used_s_per_scene"], 3),
+        "peak_rss_mib": round(one["peak_rss_mib"]),
+        "gflop_per_scene": round(one["gflop_per_scene"], 1),
+        "flops_over_peak": round(one["flops_over_peak"], 3),
     }
     print(json.dumps(figures))
 
@@ -164,12 +173,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--size", choices=sorted(SIZES), default="paper")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--precision", choices=("auto", "float32", "bf16"), default="auto")
     parser.add_argument("--case", type=json.loads, help=argparse.SUPPRESS)
     asked = parser.parse_args(arguments)
     if asked.case:
         print(json.dumps(measure(Case(**asked.case))))
     else:
-        report(asked.size, asked.device, asked.threads)
+        report(Case(asked.size, 1, 0, asked.device, asked.threads, asked.precision))
 
 
 if __name__ == "__main__":

@@ -103,6 +103,8 @@ class ModelSettings:
         ground_width: Features of every cell by which newcomers' cells and headings are told
             from the street that is there; 0 to tell them from the query alone, as the
             paper does.
+        tell_ego: Whether the ego's embedding says that it is the ego: whoever records is
+            under way, where one that looks the same may be parked.
     """
 
     width: int = 128
@@ -131,6 +133,7 @@ class ModelSettings:
     heading_token: bool = True
     pattern_tokens: bool = False
     ground_width: int = 0
+    tell_ego: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,7 +57,7 @@ class Course:
             TrainingError: if there is nothing to learn from, or not for everyone.
         """
         how = self.train
-        if not len(self.scenes):
+        if how.steps and not len(self.scenes):
             raise TrainingError(f"no scenes of split {how.split!r} to train on")
         parts = how.accumulate * team.size
         if parts > how.batch_scenes:

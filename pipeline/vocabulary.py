@@ -122,13 +122,15 @@ def reads(root: Path, settings: VocabSettings) -> list[Source]:
 def plan(inputs: Inputs, settings: VocabSettings) -> list[Unit]:
     """One unit per file of the two splits.
 
+    Codebooks that are taken, not made, need no file to learn from.
+
     Raises:
-        PlanError: if there is no file to learn from.
+        PlanError: if there is no file to learn from, or none at all.
     """
     files = inputs.units("ingest")
     learn = [done for done in files if in_split(done.name, settings.split)]
     held_out = [done for done in files if in_split(done.name, settings.held_out)]
-    if not learn:
+    if not learn and not (settings.start and held_out):
         found = ", ".join(sorted({split_of(done.name) for done in files})) or "none"
         raise PlanError(
             f"no file of split {settings.split!r} to build vocabularies from (there is: "

@@ -52,6 +52,7 @@ class AgentRows:
         move: Codebook row, ``FIRST_MOVE`` or ``NO_MOVE`` [row].
         presence: ``Presence`` [row].
         cell: Cell of the ego's grid, or ``NO_CELL`` [row].
+        ego: Whether it is the ego [row].
     """
 
     kind: Tensor
@@ -62,6 +63,7 @@ class AgentRows:
     move: Tensor
     presence: Tensor
     cell: Tensor
+    ego: Tensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +106,7 @@ class AgentEmbedding(nn.Module):
         self.motion = FourierEmbedding(2, settings.fourier_bands, width)
         self.kind = nn.Embedding(len(KINDS), width)
         self.size = embedding_mlp(3, width)
+        self.ego = nn.Parameter(torch.zeros(width)) if settings.tell_ego else None
         self.presence = nn.Embedding(len(Presence), width) if life else None
         self.fuse = embedding_mlp((4 if life else 2) * width, width)
 
@@ -122,6 +125,8 @@ class AgentEmbedding(nn.Module):
         move = torch.where(agents.move == FIRST_MOVE, special, move)
         move = torch.where(agents.move == NO_MOVE, special + 1, move)
         what = self.kind(agents.kind) + self.size(agents.size_lwh_m)
+        if self.ego is not None:
+            what = what + agents.ego[:, None] * self.ego
         parts = [gather(tables.moves, move), self.motion(_last_motion(agents), what)]
         if self.presence is not None and tables.cells is not None:
             cell = torch.where(agents.cell == NO_CELL, self.num_cells, agents.cell)

@@ -237,4 +237,5 @@ def _agent_rows(agents: Agents, rows: Rows) -> AgentRows:
         move=rows.pack(agents.move),
         presence=rows.pack(agents.presence),
         cell=rows.pack(agents.cell),
+        ego=rows.at % visible.shape[-1] == EGO,
     )

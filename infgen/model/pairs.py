@@ -34,11 +34,13 @@ class Shared:
         ticket: Stands for it in the graph: it depends on every layer that reads the values
             through it, so their gradients are complete when its own arrives.
         pulled: Where layers add their gradients to.
+        copies: The values in other precisions, made when first asked for.
     """
 
     values: Tensor
     ticket: Tensor
     pulled: "_Sum"
+    copies: dict[torch.dtype, Tensor] = field(default_factory=dict)
 
     @classmethod
     def of(cls, tensor: Tensor) -> "Shared":
@@ -46,6 +48,14 @@ class Shared:
         pulled = _Sum()
         ticket = _Ticket.apply(tensor, pulled)  # type: ignore[no-untyped-call]
         return cls(tensor.detach(), ticket, pulled)
+
+    def of_kind(self, kind: torch.dtype) -> Tensor:
+        """Return the values in some precision: one copy for all layers."""
+        if kind == self.values.dtype:
+            return self.values
+        if kind not in self.copies:
+            self.copies[kind] = self.values.to(kind)
+        return self.copies[kind]
 
 
 @dataclass(slots=True)
@@ -103,7 +113,7 @@ def look_at_pairs(
         kept: Factor on each weight for dropout [N, Q, K], or None.
     """
     kind = by_features.dtype  # The queries' own: low precision under autocast.
-    shared = relation.values.to(kind), relation.ticket, relation.pulled
+    shared = relation.of_kind(kind), relation.ticket, relation.pulled
     kept = None if kept is None else kept.to(kind)
     pairs = (by_features, by_relation, features.to(kind), index, *shared, hidden, kept)
     with torch.autocast(by_features.device.type, enabled=False):

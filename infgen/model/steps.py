@@ -363,6 +363,7 @@ class Stepper:
             move=rows.pack(column.move),
             presence=rows.pack(column.presence),
             cell=rows.pack(column.cell),
+            ego=rows.at % column.cell.shape[-1] == EGO,
         )
         embedded: Tensor = self.network.embed(agents, self._tables)
         return embedded

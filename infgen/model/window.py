@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32, Int8, Int16, Int64, UInt8
 
 from infgen.tokens.grid import Grid, encode_cell, to_grid
 from infgen.tokens.noise import Noise, lead_astray
-from infgen.tokens.scene_tokens import FIRST_MOVE, Presence, SceneTokens
+from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, Presence, SceneTokens
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,20 +83,26 @@ def cut_window(
 def disturb(
     window: SceneWindow, noise: Noise, grid: Grid, random: np.random.Generator
 ) -> SceneWindow:
-    """Lead agents astray, all but the ego: what is told relative to it stays true.
+    """Lead agents astray, the ego like all others.
 
-    Who is absent, entering or not observed is where it was. Cells follow the poses.
+    Who is absent, entering or not observed is where it was. Cells follow the poses, the
+    ego's too; but a newcomer is lost to none for it, and none is won.
     """
-    moving = window.observed.copy()
-    moving[0] = False
-    strays = lead_astray(window.kind, window.pose, window.move, moving, noise, random)
+    strays = lead_astray(
+        window.kind, window.pose, window.move, window.observed, noise, random
+    )
     cell = encode_cell(to_grid(strays.pose[..., :2], strays.pose[0]), grid)
+    entering = window.presence == Presence.ENTERING
+    kept = entering & ((cell == NO_CELL) | (window.cell == NO_CELL))
+    told = (window.observed | entering) & (strays.off | strays.off[0]) & ~kept
+    cell = np.where(told, cell, window.cell)
     return replace(
         window,
         pose=strays.pose,
         move=strays.move,
         label=strays.label,
-        cell=np.where(strays.off, cell, window.cell),
+        cell=cell,
+        entry_cell=cell[window.entry_row, window.entry_token],
     )
 
 

@@ -40,6 +40,7 @@ TINY = ModelSettings(
     heading_agent_neighbours=4,
     max_entries=3,
     ground_width=6,
+    tell_ego=True,
 )
 
 VARIANTS = {
@@ -50,7 +51,7 @@ VARIANTS = {
     "no heading token": {"heading_token": False},
     "no leave, no cell token": {"leave_token": False, "cell_token": False},
     "patterns": {"pattern_tokens": True},
-    "the paper's heads": {"ground_width": 0},
+    "the paper's heads": {"ground_width": 0, "tell_ego": False},
     "smart with patterns": {"life_cycle": False, "pattern_tokens": True},
 }
 """Baselines and ablations of SPEC 7, and heads that are off by default."""

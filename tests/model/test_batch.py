@@ -204,22 +204,22 @@ def test_noise_changes_only_what_agents_do_and_where_they_are(pair):
         for field in fields(part)
         if not torch.equal(getattr(part, field.name), getattr(other, field.name))
     }
-    told_of_players = {"Details.cell", "Details.heading", "Details.offset_m"}
+    told = {"Entries.cell", "Details.cell", "Details.heading", "Details.offset_m"}
     asked = {"Details.agent", "Details.token", "Details.kind", "Details.size_lwh_m"}
     agents = {"Agents.pose", "Agents.move", "Agents.label", "Agents.cell"}
     assert agents | {"Details.offset_m", "Roads.token"} <= changed
-    assert changed <= agents | told_of_players | asked | {"Roads.token"}
+    assert changed <= agents | told | asked | {"Roads.token"}
 
 
-def test_noise_moves_neither_the_ego_nor_who_is_absent_entering_or_unseen(pair):
+def test_noise_moves_the_ego_but_nobody_who_is_absent_entering_or_unseen(pair):
     plain, noisy = pair
     still = ~plain.agents.observed
-    still[:, :, 0] = True
+    ego = plain.agents.observed[:, :, 0]
 
-    for name in ("pose", "move", "label", "cell"):
+    for name in ("pose", "move", "label"):
         one, two = getattr(plain.agents, name), getattr(noisy.agents, name)
         assert torch.equal(one[still], two[still]), name
-        assert not torch.equal(one, two)
+        assert not torch.equal(one[:, :, 0][ego], two[:, :, 0][ego]), name
     assert (plain.agents.presence[still] == Presence.PRESENT).any()  # The gap.
 
 
@@ -237,10 +237,7 @@ def test_noisy_agents_go_where_their_moves_lead_and_learn_to_come_back(pair, cod
     label = nearest_moves(wanted, before, kind, table)
 
     np.testing.assert_allclose(noisy.agents.pose[scene, token, row], ends, atol=1e-4)
-    others = row.numpy() > 0  # The ego goes as logged.
-    np.testing.assert_array_equal(
-        noisy.agents.label[scene, token, row].numpy()[others], label[others]
-    )
+    np.testing.assert_array_equal(noisy.agents.label[scene, token, row].numpy(), label)
 
 
 def test_noisy_agents_are_in_the_cells_they_are_in(pair, grid_settings):
@@ -251,6 +248,24 @@ def test_noisy_agents_are_in_the_cells_they_are_in(pair, grid_settings):
     cell = torch.from_numpy(encode_cell(in_grid_m, grid)).long()
 
     assert torch.equal(agents.cell[agents.observed], cell[agents.observed])
+
+
+def test_noise_loses_no_newcomer_and_puts_each_in_its_cell_of_the_ego_as_it_is(
+    pair, grid_settings
+):
+    plain, noisy = pair
+    came = noisy.entries.agent != NOBODY
+    scene, token, _ = came.nonzero(as_tuple=True)
+    agent = noisy.entries.agent[came]
+    pose, ego_pose = (noisy.agents.pose[scene, token, row] for row in (agent, 0))
+
+    in_grid_m = to_grid(pose[..., :2].numpy(), ego_pose.numpy())
+    cell = torch.from_numpy(encode_cell(in_grid_m, make_grid(grid_settings))).long()
+
+    assert torch.equal(plain.entries.agent, noisy.entries.agent)
+    assert torch.equal(noisy.entries.cell[came], cell)
+    assert torch.equal(noisy.agents.cell[scene, token, agent], cell)
+    assert not torch.equal(ego_pose, plain.agents.pose[scene, token, 0])
 
 
 def test_noise_draws_what_is_its_own_and_by_draw_and_scene(record, limits, noise):

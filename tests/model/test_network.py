@@ -215,6 +215,21 @@ def test_signals_and_presence_are_seen(network, record, limits):
     assert (after.motion.move_logits - before.motion.move_logits).abs().max() > 1e-4
 
 
+def test_the_ego_alone_is_told_that_it_is(new_network, record, limits):
+    network = new_network().eval()
+    batch = collate([record(1, lives=[(0, 6)])], limits, 0)
+    batch.agents.pose[:, :, 1] += 500  # Neither sees the other.
+
+    with torch.no_grad():
+        told = network(batch).motion.move_logits
+        network.embed.ego.zero_()
+        untold = network(batch).motion.move_logits
+    ego, other = (told - untold).abs().amax(dim=-1).view(-1, 2).T
+
+    assert ego.min() > 1e-3
+    assert other.max() == 0
+
+
 def test_an_agent_that_is_not_observed_is_neither_row_nor_neighbour(
     network, record, limits
 ):

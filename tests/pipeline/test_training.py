@@ -81,6 +81,14 @@ def test_no_scenes_to_train_on_is_said(course, books, quiet):
         train(empty, begin(course, *books), quiet)
 
 
+def test_who_does_no_steps_needs_no_scenes_to_train_on(course, books, quiet):
+    idle = replace(course, scenes=TokenScenes([]), train=replace(course.train, steps=0))
+
+    found = train(idle, begin(idle, *books), quiet)
+
+    assert found.validation
+
+
 def test_without_held_out_scenes_there_is_no_validation(course, books, quiet):
     found = train(replace(course, held_out=[]), begin(course, *books), quiet)
 

@@ -118,6 +118,16 @@ def test_without_a_split_to_learn_from_the_error_names_those_there_are(two_split
         vocabulary.plan(two_splits, settings)
 
 
+def test_codebooks_that_are_taken_need_nothing_to_learn_from(two_splits):
+    settings = dataclasses.replace(SETTINGS, split="trainig", start="builtin")
+
+    (unit,) = vocabulary.plan(two_splits, settings)
+
+    assert (unit.name, unit.task["role"]) == ("validation.tfrecord-0", "held-out")
+    with pytest.raises(PlanError, match="no file of split 'trainig'"):
+        vocabulary.plan(two_splits, dataclasses.replace(settings, held_out="none"))
+
+
 def test_codebooks_come_back_as_they_were_written_with_a_report(two_splits, tmp_path):
     folder, figures = build(two_splits, tmp_path)
     motion, roads = load_codebooks(folder)
