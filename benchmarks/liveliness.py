@@ -5,7 +5,8 @@ Reads the logs and the rollouts of a root, however long they are::
     python benchmarks/liveliness.py ROOT [--span 10] [--radius 75]
 
 The first table has the rollouts, span by span, beside the logs as far as they go: agents
-around the ego, speed and off-road share of vehicles, entries and exits per half second. The
+around the ego, its speed and that of vehicles, the share of vehicles that are off the road
+(most are parked there), that of those that drive, entries and exits per half second. The
 second has who comes after now: speed in the first second, and whether vehicles begin off
 the road. The last line is one JSON object.
 """
@@ -38,10 +39,14 @@ from pipeline.screen import show_table
 STEPS_PER_S = round(1 / CLOCK.step_s)
 SPEED_EDGES_MPS = np.arange(0.0, 26.0)
 """Bins of first speeds; what is faster is in the last one."""
+DRIVING_MPS = 1.0
+"""Vehicles that are faster drive."""
 COLUMNS = {
     "agents": ("agents", ".1f"),
+    "ego_mps": ("ego, m/s", ".2f"),
     "speed_mps": ("vehicles, m/s", ".2f"),
     "off_road": ("off-road", ".1%"),
+    "driving_off_road": ("driving off-road", ".1%"),
     "entries": ("entries / 0.5 s", ".3f"),
     "exits": ("exits / 0.5 s", ".3f"),
 }
@@ -98,12 +103,17 @@ def take(side: Side, traffic: Traffic, edges: RoadEdges | None, look: Look) -> N
     side.add("agents", at_s, near[:, steps].sum(axis=0), look.span_s)
     row, step = np.nonzero((near & vehicle & known)[:, steps])
     side.add("speed_mps", at_s[step], speed_mps[row, steps[step]], look.span_s)
+    seen = known[traffic.ego, steps]
+    ego_mps = speed_mps[traffic.ego, steps[seen]]
+    side.add("ego_mps", at_s[seen], ego_mps, look.span_s)
     if edges is not None:
         some = slice(now + 1, None, STEPS_PER_S)
-        rows = np.flatnonzero(others & vehicle[:, 0])
+        rows = np.flatnonzero(vehicle[:, 0])
         off = road_edge_m(motion, rows, some, edges)[0] > 0
-        row, step = np.nonzero(near[rows, some])
-        side.add("off_road", at_s[::STEPS_PER_S][step], off[row, step], look.span_s)
+        drives = (near | ~others[:, None]) & known & (speed_mps > DRIVING_MPS)
+        for name, those in (("off_road", near), ("driving_off_road", drives)):
+            row, step = np.nonzero(those[rows, some])
+            side.add(name, at_s[::STEPS_PER_S][step], off[row, step], look.span_s)
     _take_events(side, traffic, len(steps), look)
     _take_newcomers(side, traffic, edges, speed_mps, known)
 

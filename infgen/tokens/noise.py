@@ -5,7 +5,8 @@ their ways a little: at each half second an agent takes not the move that ends n
 where it should be, but one of the few nearest, and goes on from where that leads. What is
 to be learned is always the nearest, from where the agent has come to. As every draw is near
 to the true pose, errors never add up: agents stray as far as a few neighbouring moves are
-apart, centimetres.
+apart. Who stands is left alone: it would learn to tremble, and that nobody who has begun to
+move goes on.
 
 Where an agent should be is its quantised pose, which is all that tokens keep of the log. It
 is within centimetres of the log's own.
@@ -21,9 +22,11 @@ from infgen.config import ConfigError, TrainSettings
 from infgen.tokens.codebook import MotionCodebook, RoadCodebook
 from infgen.tokens.moves import MoveTable, advance, make_move_table, nearest_few
 
-FARTHEST_M = 0.5
+FARTHEST_M = 1.0
 """No draw leads farther from where an agent should be: where moves are rare, the second
-nearest may end metres away."""
+nearest may end metres away ..."""
+FARTHEST_SHARE = 1 / 8
+"""... nor farther than this share of the agent's way in the half second."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -111,8 +114,9 @@ def lead_astray(
         nearest, taken = few[:, 0], few[np.arange(len(rows)), turn[rows, token]]
         ends = advance(before, kind[rows], taken, noise.table.codebook)
 
+        way_m = np.hypot(*(wanted - pose[rows, token - 1])[:, :2].T)
         away_m = np.hypot(*(ends - wanted)[:, :2].T)
-        far = np.flatnonzero(away_m > FARTHEST_M)
+        far = np.flatnonzero(away_m > np.minimum(FARTHEST_M, FARTHEST_SHARE * way_m))
         taken[far] = nearest[far]
         ends[far] = advance(before[far], kind[rows[far]], taken[far], noise.table.codebook)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from infgen.config import ConfigError, TrainSettings
 from infgen.tokens.codebook import BOX_LW_M, MotionCodebook, RoadCodebook
 from infgen.tokens.moves import advance, make_move_table, nearest_moves
-from infgen.tokens.noise import FARTHEST_M, Noise, exchange_roads, lead_astray, make_noise
+from infgen.tokens.noise import Noise, exchange_roads, lead_astray, make_noise
 from infgen.tokens.scene_tokens import NO_MOVE
 
 ITSELF = np.arange(9, dtype=np.int16)[:, None]
@@ -143,11 +143,23 @@ def test_moves_that_end_far_off_are_not_taken():
     drives = metre_drives()
     codebook = straight_moves(step_m=1.0, count=5)
     drives[2][:, 1:] = 1
-    assert FARTHEST_M < 1
 
     strays = stray(drives, noise_of(codebook, 3))
 
     np.testing.assert_array_equal(strays.move, drives[2])
+
+
+@pytest.mark.parametrize(("way_m", "off_m"), [(0, 0), (1.8, 0), (3, 0.3), (30, 0.9)])
+def test_the_slow_stray_less_and_who_stands_not_at_all(way_m, off_m):
+    kind, pose, move, moving = metre_drives(agents=20, tokens=4)
+    pose[..., 0] *= way_m
+    codebook = straight_moves(step_m=0.3, count=120)
+    move[:, 1:] = round(way_m / 0.3)
+
+    strays = stray((kind, pose, move, moving), noise_of(codebook, 20))
+
+    farthest_m = np.abs(strays.pose[..., 0] - pose[..., 0]).max()
+    assert farthest_m == pytest.approx(off_m, abs=1e-3)
 
 
 def test_equal_draws_lead_equally_astray_and_others_otherwise():
