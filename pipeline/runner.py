@@ -200,6 +200,7 @@ class _Making:
         errors = {outcome.name: outcome.error for outcome in outcomes if outcome.error}
         report: Report = {}
         if not errors:
+            self._clear()  # Of workers that died, too: others did their units.
             report, errors = self._finish(inputs, tasks)
         self._note_attempt(tasks, errors)
         made = sum(outcome.report is not None for outcome in outcomes)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int16
 
-from infgen.config import ConfigError, TrainSettings
+from infgen.config import TrainSettings
 from infgen.tokens.codebook import MotionCodebook, RoadCodebook
 from infgen.tokens.moves import MoveTable, advance, make_move_table, nearest_few
 
@@ -67,19 +67,13 @@ def make_noise(
 ) -> Noise | None:
     """Make the noise that settings ask for; None if they ask for none.
 
-    Raises:
-        ConfigError: if tokens are to be drawn from more than there are.
+    In a codebook that has fewer tokens, draws are from all of them.
     """
-    for name, most in (("noise_moves", motion.num_moves), ("noise_roads", roads.num_roads)):
-        if getattr(settings, name) > most:
-            raise ConfigError(
-                f"train.{name} is {getattr(settings, name)}; the codebook has {most}"
-            )
     if not settings.noise_moves and not settings.noise_roads:
         return None
     return Noise(
         table=make_move_table(motion),
-        moves=settings.noise_moves,
+        moves=min(settings.noise_moves, motion.num_moves),
         share=settings.noise_share,
         near_roads=_near_roads(roads, max(1, settings.noise_roads)),
     )

@@ -216,10 +216,13 @@ def test_shapes_that_are_alike_stand_for_themselves_first(metre_moves):
     assert noise.near_roads.tolist() == [[0], [1]]
 
 
-@pytest.mark.parametrize("name", ["noise_moves", "noise_roads"])
-def test_more_tokens_than_the_codebook_has_are_refused(metre_moves, bent_roads, name):
-    with pytest.raises(ConfigError, match=rf"train\.{name} is 99; the codebook has"):
-        make_noise(TrainSettings(**{name: 99}), metre_moves, bent_roads)
+def test_of_more_tokens_than_the_codebook_has_all_are_drawn_from(metre_moves, bent_roads):
+    noise = make_noise(
+        TrainSettings(noise_moves=99, noise_roads=99), metre_moves, bent_roads
+    )
+
+    assert noise.moves == metre_moves.num_moves
+    assert noise.near_roads.shape == (bent_roads.num_roads, bent_roads.num_roads)
 
 
 def test_agents_are_led_astray_in_one_way_only():
