@@ -114,6 +114,7 @@ def make_network(case: Case, pace: Pace) -> Network:
     network = Network(SIZES[case.size], motion, roads, TokenSettings())
     assert network.cells is not None
     assert network.motion.leave is not None
+    assert network.motion.move is not None
     # One more enters with probability p: p / (1 - p) of them in all.
     _always(network.cells.add, math.log(max(pace.entries, 1e-6)))
     _always(network.motion.leave, math.log(pace.leaves / (1 - pace.leaves) + 1e-9))

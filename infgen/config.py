@@ -88,6 +88,10 @@ class ModelSettings:
         heading_radius_m: Reach of the query for a newcomer's heading.
         map_map_neighbours: Nearest map tokens that a map token sees.
         map_agent_neighbours: Nearest map tokens that an agent sees.
+        map_agent_ahead_m: They are those nearest to (and within the radius of) a point so
+            far ahead of the agent: what lies behind, it has passed.
+        map_agent_across: Whether an agent is also told how far to the side of each of them
+            it is: of a lane's tokens, how far off the lane's centre it drives.
         agent_agent_neighbours: Nearest agents that an agent sees.
         query_map_neighbours: Nearest map tokens that a query for a cell sees.
         heading_map_neighbours: Nearest map tokens that a query for a heading sees.
@@ -103,6 +107,8 @@ class ModelSettings:
         ground_width: Features of every cell by which newcomers' cells and headings are told
             from the street that is there; 0 to tell them from the query alone, as the
             paper does.
+        move_width: Features of every move by which the next one is told from where it
+            leads; 0 for a logit per move, each learned alone, as in the paper.
         tell_ego: Whether the ego's embedding says that it is the ego: whoever records is
             under way, where one that looks the same may be parked.
     """
@@ -122,6 +128,8 @@ class ModelSettings:
     heading_radius_m: float = 10.0
     map_map_neighbours: int = 32
     map_agent_neighbours: int = 64
+    map_agent_ahead_m: float = 0.0
+    map_agent_across: bool = False
     agent_agent_neighbours: int = 64
     query_map_neighbours: int = 256
     heading_map_neighbours: int = 32
@@ -133,6 +141,7 @@ class ModelSettings:
     heading_token: bool = True
     pattern_tokens: bool = False
     ground_width: int = 0
+    move_width: int = 0
     tell_ego: bool = False
 
 
@@ -163,6 +172,8 @@ class TrainSettings:
         noise_moves: Moves nearest to the true one that each agent's next one is drawn from,
             while it is learned to come back (SMART: 5; SPEC 2.3); 0 for moves as logged.
         noise_share: Of moves, how many are drawn; the others lead back as well as can be.
+        noise_drift: Share of the agents on the move that drift beside their ways for
+            seconds, up to a metre or two, while they are learned to come back.
         noise_roads: Shapes nearest to the true one that a road token is drawn from (SPEC
             1.3); 0 for the true ones.
         accumulate: Parts that a batch is cut into, one after the other, to save memory; the
@@ -217,6 +228,7 @@ class TrainSettings:
     max_tokens: int = 18
     noise_moves: int = 0
     noise_share: float = 1.0
+    noise_drift: float = 0.0
     noise_roads: int = 0
     accumulate: int = 1
     bucket_batches: int = 64
@@ -253,17 +265,19 @@ class TrainSettings:
             ("noise_moves", 0, math.inf),
             ("noise_roads", 0, math.inf),
             ("noise_share", 0, 1),
+            ("noise_drift", 0, 1),
             ("accumulate", 1, math.inf),
             ("bucket_batches", 1, math.inf),
             ("loader_workers", 0, math.inf),
             ("closed_loop_top", 0, math.inf),
         )
         check_bounds(self, "train", bounds)
-        if self.closed_loop_top and self.noise_moves:
-            raise ConfigError(
-                "train.closed_loop_top and train.noise_moves both lead agents off their "
-                "ways; set one of them to 0"
-            )
+        for noise in ("noise_moves", "noise_drift"):
+            if self.closed_loop_top and getattr(self, noise):
+                raise ConfigError(
+                    f"train.closed_loop_top and train.{noise} both lead agents off their "
+                    "ways; set one of them to 0"
+                )
         if self.accumulate > self.batch_scenes:
             raise ConfigError(
                 f"train.accumulate is {self.accumulate}, more than the "

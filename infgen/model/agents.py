@@ -19,6 +19,7 @@ from infgen.model.layers import (
     mlp,
     normed,
 )
+from infgen.model.moves import MoveHead
 from infgen.model.outputs import MotionOutputs
 from infgen.model.pairs import Shared
 from infgen.model.relations import Rows, direction, relation_embedding
@@ -189,21 +190,30 @@ class MotionBlock(nn.Module):
 class MotionStack(nn.Module):
     """What every agent does next, all at once (SPEC 4.5)."""
 
-    def __init__(self, settings: ModelSettings, num_moves: int, token_s: float) -> None:
+    def __init__(
+        self, settings: ModelSettings, codebook: MotionCodebook, token_s: float
+    ) -> None:
         super().__init__()
         width, bands = settings.width, settings.fourier_bands
         window = settings.window_tokens
         far_m = MAX_SPEED_MPS * token_s * window
         self.settings = settings
         self.past_relation = relation_embedding(far_m, bands, width, window)
-        self.roads_relation = relation_embedding(settings.map_agent_radius_m, bands, width)
+        self.roads_relation = relation_embedding(
+            settings.map_agent_radius_m + settings.map_agent_ahead_m,
+            bands,
+            width,
+            across=settings.map_agent_across,
+        )
         self.agents_relation = relation_embedding(
             settings.agent_agent_radius_m, bands, width
         )
         self.blocks = nn.ModuleList(
             MotionBlock(settings) for _ in range(settings.motion_blocks)
         )
-        self.move = mlp(width, width, num_moves)
+        shaped = settings.move_width
+        self.move = None if shaped else mlp(width, width, codebook.num_moves)
+        self.shaped = MoveHead(width, shaped, codebook) if shaped else None
         leaves = settings.life_cycle and settings.leave_token
         self.leave = mlp(width, width, 1) if leaves else None
         patterns = settings.pattern_tokens
@@ -212,7 +222,13 @@ class MotionStack(nn.Module):
     def roads_reach(self) -> Reach:
         """How agents see roads."""
         s = self.settings
-        return Reach.of(s.map_agent_radius_m, s.map_agent_neighbours, self.roads_relation)
+        return Reach.of(
+            s.map_agent_radius_m,
+            s.map_agent_neighbours,
+            self.roads_relation,
+            ahead_m=s.map_agent_ahead_m,
+            across=s.map_agent_across,
+        )
 
     def agents_reach(self) -> Reach:
         """How agents see each other."""
@@ -228,11 +244,33 @@ class MotionStack(nn.Module):
             x_ND = block(x_ND, past, sight)
         return x_ND
 
-    def foretell(self, rows: Rows, x_ND: Tensor) -> MotionOutputs:
-        """Say of every row, by its updated features, what it does next."""
+    def move_shapes(self) -> Tensor | None:
+        """Evaluate the moves' features for one pass, if moves are told from them."""
+        return None if self.shaped is None else self.shaped.table()
+
+    def foretell(
+        self, rows: Rows, x_ND: Tensor, kind: Tensor, shapes: Tensor | None
+    ) -> MotionOutputs:
+        """Say of every row what it does next.
+
+        Args:
+            rows: The visible agents.
+            x_ND: Their updated features.
+            kind: ``AgentKind`` of each.
+            shapes: ``move_shapes``.
+        """
         return MotionOutputs(
             rows,
-            self.move(x_ND),
+            self._moves(x_ND, kind, shapes),
             None if self.leave is None else self.leave(x_ND)[:, 0],
             None if self.pattern is None else self.pattern(x_ND),
         )
+
+    def _moves(self, x_ND: Tensor, kind: Tensor, shapes: Tensor | None) -> Tensor:
+        if self.shaped is not None and shapes is not None:
+            shaped: Tensor = self.shaped(x_ND, kind, shapes)
+            return shaped
+        if self.move is None:
+            raise ValueError("moves are told from their shapes; pass move_shapes()")
+        alone: Tensor = self.move(x_ND)
+        return alone

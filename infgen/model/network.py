@@ -58,7 +58,7 @@ class Network(nn.Module):
             self.register_buffer(name, torch.from_numpy(array.copy()))
         self.roads = RoadEncoder(settings, roads)
         self.embed = AgentEmbedding(settings, motion, cells)
-        self.motion = MotionStack(settings, motion.num_moves, CLOCK.token_s)
+        self.motion = MotionStack(settings, motion, CLOCK.token_s)
         self.cells = CellStack(settings, cells) if settings.life_cycle else None
         self.details = DetailStack(settings, cells) if settings.life_cycle else None
         self.apply(initialise)
@@ -131,7 +131,8 @@ class Network(nn.Module):
             ),
         )
         x = self.motion(x, past_index, sight)
-        return self.motion.foretell(rows, x)
+        kind = rows.pack(agents.kind[:, None].expand(agents.visible.shape))
+        return self.motion.foretell(rows, x, kind, self.motion.move_shapes())
 
     def _past(self, agents: Agents, rows: Rows) -> tuple[Tensor, Tensor, Shared]:
         """Rows, presence and relations of every row's own past, oldest first [N, K]."""

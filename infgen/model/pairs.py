@@ -115,7 +115,9 @@ def look_at_pairs(
     kind = by_features.dtype  # The queries' own: low precision under autocast.
     shared = relation.of_kind(kind), relation.ticket, relation.pulled
     kept = None if kept is None else kept.to(kind)
-    pairs = (by_features, by_relation, features.to(kind), index, *shared, hidden, kept)
+    # Batches of products are slow where the queries lie head by head, as they may come.
+    queries = by_features.contiguous(), by_relation.contiguous()
+    pairs = (*queries, features.to(kind), index, *shared, hidden, kept)
     with torch.autocast(by_features.device.type, enabled=False):
         return Looked(*_Pairs.apply(*pairs))  # type: ignore[no-untyped-call]
 

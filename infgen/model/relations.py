@@ -5,11 +5,13 @@ order that depends on the device. Nothing here is learned and nothing is differe
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
+from torch.nn import functional
 
 from infgen.model.tables import RelationEmbedding, Span
 
@@ -100,9 +102,41 @@ def nearest(
         )
         for at in range(0, targets, block)
     ]
-    key = torch.cat(parts, dim=1)
+    return _told(torch.cat(parts, dim=1))
+
+
+@torch.no_grad()
+def nearest_listed(
+    parts: Iterable[tuple[Tensor, Tensor, Tensor, Tensor]], radius_m: float, count: int
+) -> Neighbours:
+    """Find the ``count`` nearest within a radius among sources listed for each target.
+
+    Args:
+        parts: Some targets at a time: where they are [target, 2], where their sources are
+            [target, listed, 2], the sources' positions [target, listed], by which ties go,
+            and which there are [target, listed].
+        radius_m: Radius.
+        count: How many.
+
+    Returns:
+        Neighbours of a single group: positions as listed.
+    """
+    keys = []
+    for target_xy_m, source_xy_m, position, there in parts:
+        x_m, y_m = (target_xy_m[:, None] - source_xy_m).unbind(-1)
+        square = _whole_units(x_m, y_m)
+        hidden = (square > _square_limit(radius_m)) | ~there
+        key = square.mul_(1 << INDEX_BITS).add_(position).masked_fill_(hidden, _NOBODY)
+        key = functional.pad(key, (0, max(0, count - key.shape[1])), value=_NOBODY)
+        keys.append(key.topk(count, dim=-1, largest=False).values)
+    return _told(torch.cat(keys)[None])
+
+
+def _told(key: Tensor) -> Neighbours:
+    """Say whom keys [group, target, neighbour] stand for."""
     present = key < _NOBODY
-    most = int(present.sum(dim=-1).max())  # The rest would be padding for everyone.
+    # The rest would be padding for everyone.
+    most = int(present.sum(dim=-1).max()) if key.numel() else 0
     key, present = key[..., :most], present[..., :most]
     index = torch.where(present, key & ((1 << INDEX_BITS) - 1), 0)
     return Neighbours(index, present)
@@ -169,8 +203,25 @@ def relations(
     return torch.stack([distance_m, direction(away_m, heading_rad), turned_rad], dim=-1)
 
 
+@torch.no_grad()
+def across(
+    target_pose: Float32[Tensor, "target 3"],
+    source_pose: Float32[Tensor, "target neighbour 3"],
+) -> Float32[Tensor, "target neighbour 1"]:
+    """How far to the left of each neighbour, as that one faces, the target is."""
+    away_m = target_pose[:, None, :2] - source_pose[..., :2]
+    heading_rad = source_pose[..., 2]
+    left_m = heading_rad.cos() * away_m[..., 1] - heading_rad.sin() * away_m[..., 0]
+    return left_m[..., None]
+
+
 def relation_embedding(
-    radius_m: float, bands: int, width: int, past_tokens: int = 0
+    radius_m: float,
+    bands: int,
+    width: int,
+    past_tokens: int = 0,
+    *,
+    across: bool = False,
 ) -> RelationEmbedding:
     """Make the embedding of one family of relations.
 
@@ -179,6 +230,7 @@ def relation_embedding(
         bands: Frequencies per scalar.
         width: Of the features.
         past_tokens: If not 0, relations end in a time difference of -1 to so many tokens.
+        across: Whether they end in ``across``.
     """
     turn = Span(-math.pi, math.pi, ANGLE_NODES, closed=True)
     nodes = math.ceil(radius_m / DISTANCE_STEP_M) + 1
@@ -186,4 +238,6 @@ def relation_embedding(
     if past_tokens:
         # One node more than there are tokens, so that a window of one is a range too.
         spans.append(Span(-float(past_tokens), 0.0, past_tokens + 1))
+    if across:
+        spans.append(Span(-radius_m, radius_m, 2 * nodes - 1))
     return RelationEmbedding(spans, bands, width)

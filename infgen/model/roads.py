@@ -9,7 +9,8 @@ from infgen.config import ModelSettings
 from infgen.model.batch import Roads
 from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.relations import Rows, relation_embedding
-from infgen.model.sight import Around, Reach, RoadFeatures, look_around
+from infgen.model.road_grid import RoadGrid
+from infgen.model.sight import Around, Reach, RoadFeatures
 from infgen.tokens.codebook import RoadCodebook
 from infgen.tokens.roads import LineKind, PointKind
 from infgen.tokens.scene_tokens import SignalClass
@@ -21,12 +22,13 @@ class RoadSight:
 
     rows: Rows
     around: Around
+    grid: RoadGrid
 
     def covered(self, roads: Roads) -> "RoadSight":
         """Let nobody see a hidden token, not even its place: it would be given away."""
         kept = ~self.rows.pack(roads.picked)
         present = self.around.present & kept[self.around.index]
-        return RoadSight(self.rows, replace(self.around, present=present))
+        return replace(self, around=replace(self.around, present=present))
 
 
 class RoadEncoder(nn.Module):
@@ -54,13 +56,21 @@ class RoadEncoder(nn.Module):
 
     def look(self, roads: Roads) -> RoadSight:
         """Find who sees whom on the maps."""
-        rows = Rows.where(roads.real)
-        count = roads.real.shape[1]
-        others = ~torch.eye(count, dtype=torch.bool, device=roads.real.device)
-        allowed = roads.real[:, None] & others
+        rows, grid = Rows.where(roads.real), RoadGrid.of(roads.pose, roads.real)
         reach = Reach.of(self.radius_m, self.neighbours, self.relation)
-        around = look_around(reach, rows, roads.pose, roads.pose, rows.number, allowed)
-        return RoadSight(rows, around)
+        pose, count = rows.pack(roads.pose), roads.real.shape[1]
+        scene = rows.at // max(1, count)
+        found = grid.nearest(
+            pose[:, :2], scene, reach.radius_m, reach.count, itself=rows.at % max(1, count)
+        )
+        place, present = found.index[0], found.present[0]
+        around = Around(
+            index=rows.number[scene[:, None], place],
+            relation=reach.describe(pose, roads.pose[scene[:, None], place]),
+            present=present,
+            place=place,
+        )
+        return RoadSight(rows, around, grid)
 
     def forward(self, roads: Roads, sight: RoadSight) -> RoadFeatures:
         """Encode every road token."""
@@ -68,7 +78,7 @@ class RoadEncoder(nn.Module):
         x = self._embed(roads, sight.rows)
         for block in self.blocks:
             x = block(x, around.seen(normed(x)))
-        return RoadFeatures(sight.rows, normed(x), roads.pose, roads.real)
+        return RoadFeatures(sight.rows, normed(x), roads.pose, roads.real, sight.grid)
 
     def predict_hidden(self, roads: Roads, covered: RoadFeatures) -> tuple[Tensor, Tensor]:
         """Predict hidden road tokens from their predecessors, which did not see them.

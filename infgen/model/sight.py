@@ -13,7 +13,8 @@ from torch import Tensor
 
 from infgen.model.layers import Seen
 from infgen.model.pairs import Shared
-from infgen.model.relations import Rows, nearest, relations
+from infgen.model.relations import Rows, across, nearest, relations
+from infgen.model.road_grid import RoadGrid
 from infgen.model.tables import RelationEmbedding
 
 
@@ -26,17 +27,48 @@ class Reach:
         count: Nearest sources that are seen.
         relation: Embedding of how sources stand to targets.
         table: Its table.
+        ahead_m: How far ahead of a target the point is that they are nearest to.
+        across: Whether relations end in ``relations.across``.
     """
 
     radius_m: float
     count: int
     relation: RelationEmbedding
     table: Tensor
+    ahead_m: float
+    across: bool
 
     @classmethod
-    def of(cls, radius_m: float, count: int, relation: RelationEmbedding) -> "Reach":
+    def of(
+        cls,
+        radius_m: float,
+        count: int,
+        relation: RelationEmbedding,
+        *,
+        ahead_m: float = 0.0,
+        across: bool = False,
+    ) -> "Reach":
         """Evaluate the relation's table for one pass."""
-        return cls(radius_m, count, relation, relation.table())
+        return cls(radius_m, count, relation, relation.table(), ahead_m, across)
+
+    def centre_m(self, pose: Float32[Tensor, "*target 3"]) -> Float32[Tensor, "*target 2"]:
+        """Where targets look for sources."""
+        if not self.ahead_m:
+            return pose[..., :2]
+        heading_rad = pose[..., 2]
+        ahead = torch.stack([heading_rad.cos(), heading_rad.sin()], dim=-1)
+        return pose[..., :2] + self.ahead_m * ahead
+
+    def describe(
+        self,
+        target_pose: Float32[Tensor, "target 3"],
+        source_pose: Float32[Tensor, "target neighbour 3"],
+    ) -> Shared:
+        """Normed features of how sources stand to their targets."""
+        described = relations(target_pose, source_pose)
+        if self.across:
+            described = torch.cat([described, across(target_pose, source_pose)], dim=-1)
+        return Shared.of(self.relation.look_up(described, self.table))
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +101,14 @@ class RoadFeatures:
         features: Normed features [row, D].
         pose: Poses of the padded maps [scene, road, 3].
         real: Which places of the padded maps hold a road token [scene, road].
+        grid: The same tokens by where they are.
     """
 
     rows: Rows
     features: Tensor
     pose: Tensor
     real: Tensor
+    grid: RoadGrid
 
 
 def look_around(
@@ -96,14 +130,17 @@ def look_around(
         allowed: Which sources each target may see.
     """
     found = nearest(
-        target_pose[..., :2], source_pose[..., :2], allowed, reach.radius_m, reach.count
+        reach.centre_m(target_pose),
+        source_pose[..., :2],
+        allowed,
+        reach.radius_m,
+        reach.count,
     )
     place, present = targets.pack(found.index), targets.pack(found.present)
     group = (targets.at // found.index.shape[1])[:, None]
-    described = relations(targets.pack(target_pose), source_pose[group, place])
     return Around(
         index=source_row[group, place],
-        relation=Shared.of(reach.relation.look_up(described, reach.table)),
+        relation=reach.describe(targets.pack(target_pose), source_pose[group, place]),
         present=present,
         place=place,
     )
@@ -117,15 +154,15 @@ def see_roads(
     scene: Int64[Tensor, " group"],
 ) -> Seen:
     """Show every target row the road tokens around it; ``scene`` is each group's map."""
-    around = look_around(
-        reach,
-        targets,
-        target_pose,
-        roads.pose[scene],
-        roads.rows.number[scene],
-        roads.real[scene][:, None],
+    pose, on = targets.pack(target_pose), scene[targets.at // target_pose.shape[1]]
+    found = roads.grid.nearest(reach.centre_m(pose), on, reach.radius_m, reach.count)
+    place, present = found.index[0], found.present[0]
+    return Seen(
+        roads.features,
+        roads.rows.number[on[:, None], place],
+        reach.describe(pose, roads.pose[on[:, None], place]),
+        present,
     )
-    return around.seen(roads.features)
 
 
 def cell_pose(

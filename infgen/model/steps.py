@@ -156,6 +156,7 @@ class Stepper:
         self.network = network.eval()
         self._tables = network.embed.tables()
         self._past_table = network.motion.past_relation.table()
+        self._shapes = network.motion.move_shapes()
         self._roads_reach = network.motion.roads_reach()
         self._agents_reach = network.motion.agents_reach()
         self._asking: _Asking | None = None
@@ -212,7 +213,7 @@ class Stepper:
         memory.pose[:, :, place] = column.pose
         memory.visible[:, :, place] = visible
         memory.columns += 1
-        return MotionStep(motion.foretell(rows, x))
+        return MotionStep(motion.foretell(rows, x, rows.pack(column.kind), self._shapes))
 
     @torch.no_grad()
     def entry_begin(self, memory: Memory, column: Column) -> Entries:

@@ -8,25 +8,45 @@ to the true pose, errors never add up: agents stray as far as a few neighbouring
 apart. Who stands is left alone: it would learn to tremble, and that nobody who has begun to
 move goes on.
 
+Small errors that last do add up: who turns into a road a few degrees off is metres beside
+it two seconds later. So some drivers drift: for seconds they are led beside their ways,
+facing where that leads them, and learn how to get back.
+
 Where an agent should be is its quantised pose, which is all that tokens keep of the log. It
 is within centimetres of the log's own.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int8, Int16
+from jaxtyping import Bool, Float, Float32, Float64, Int8, Int16
 
 from infgen.config import TrainSettings
 from infgen.tokens.codebook import MotionCodebook, RoadCodebook
-from infgen.tokens.moves import MoveTable, advance, make_move_table, nearest_few
+from infgen.tokens.moves import (
+    MoveTable,
+    advance,
+    make_move_table,
+    nearest_few,
+    nearest_moves,
+)
 
 FARTHEST_M = 1.0
 """No draw leads farther from where an agent should be: where moves are rare, the second
 nearest may end metres away ..."""
 FARTHEST_SHARE = 1 / 8
 """... nor farther than this share of the agent's way in the half second."""
+
+DRIFT_KEPT = 0.8
+"""Share of how far aside a drifting agent is that is left half a second later."""
+DRIFT_M, DRIFT_SHARE = 0.9, 0.15
+"""Typically it is so far aside, or less: this share of its way in half a second ..."""
+DRIFT_MOST = 2.0
+"""... and never more than so many times as far."""
+DRIFT_LEAST_WAY_M = 0.75
+"""Who goes less does not drift."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -37,12 +57,14 @@ class Noise:
         table: The moves.
         moves: How many moves each is drawn from, all equally likely; 0 for none disturbed.
         share: Of the moves that are drawn; the others are the nearest.
+        drift: Share of the agents that drift while they are on the move.
         near_roads: For each map shape those that it is drawn from, itself the first.
     """
 
     table: MoveTable
     moves: int
     share: float
+    drift: float
     near_roads: Int16[np.ndarray, "road near"]
 
 
@@ -69,12 +91,14 @@ def make_noise(
 
     In a codebook that has fewer tokens, draws are from all of them.
     """
-    if not settings.noise_moves and not settings.noise_roads:
+    if not (settings.noise_moves or settings.noise_drift or settings.noise_roads):
         return None
+    moves = min(settings.noise_moves, motion.num_moves)
     return Noise(
         table=make_move_table(motion),
-        moves=min(settings.noise_moves, motion.num_moves),
+        moves=max(moves, 1) if settings.noise_drift else moves,
         share=settings.noise_share,
+        drift=settings.noise_drift,
         near_roads=_near_roads(roads, max(1, settings.noise_roads)),
     )
 
@@ -101,18 +125,27 @@ def lead_astray(
     turn = random.integers(noise.moves, size=moving.shape)
     turn[random.random(moving.shape) >= noise.share] = 0
     strays = Strays(move.copy(), pose.copy(), move.copy(), np.zeros_like(moving))
+    pushes = _pushes(moving.shape, noise.drift, random)
+    aside_m = np.zeros(len(kind))
     for token in range(1, moving.shape[1]):
         rows = np.flatnonzero(moving[:, token])
         before, wanted = strays.pose[rows, token - 1], pose[rows, token]
-        few = nearest_few(wanted, before, kind[rows], noise.table, noise.moves)
-        nearest, taken = few[:, 0], few[np.arange(len(rows)), turn[rows, token]]
-        ends = advance(before, kind[rows], taken, noise.table.codebook)
-
         way_m = np.hypot(*(wanted - pose[rows, token - 1])[:, :2].T)
-        away_m = np.hypot(*(ends - wanted)[:, :2].T)
+        was_m, aside_m = aside_m, np.zeros(len(kind))
+        aside_m[rows] = _drifted(was_m[rows], way_m, pushes[rows, token])
+        led = _led_aside(wanted, way_m, was_m[rows], aside_m[rows])
+
+        few = nearest_few(led, before, kind[rows], noise.table, noise.moves)
+        nearest, taken = few[:, 0].copy(), few[np.arange(len(rows)), turn[rows, token]]
+        ends = advance(before, kind[rows], taken, noise.table.codebook)
+        away_m = np.hypot(*(ends - led)[:, :2].T)
         far = np.flatnonzero(away_m > np.minimum(FARTHEST_M, FARTHEST_SHARE * way_m))
         taken[far] = nearest[far]
         ends[far] = advance(before[far], kind[rows[far]], taken[far], noise.table.codebook)
+        back = np.flatnonzero(aside_m[rows])  # To these, the nearest is on the drift.
+        nearest[back] = nearest_moves(
+            wanted[back], before[back], kind[rows[back]], noise.table
+        )
 
         # Who is where it should be and takes the move it took stays so to the last bit.
         off = strays.off[rows, token - 1] | (taken != move[rows, token])
@@ -120,6 +153,42 @@ def lead_astray(
         strays.pose[rows, token] = np.where(off[:, None], ends, wanted)
         strays.off[rows, token] = off
     return strays
+
+
+def _pushes(
+    shape: tuple[int, ...], drift: float, random: np.random.Generator
+) -> Float64[np.ndarray, "agent token"]:
+    """Draw what leads agents aside at each token: nothing, for those that do not drift."""
+    if not drift:
+        return np.zeros(shape)
+    drifts = random.random(shape[0]) < drift
+    return drifts[:, None] * random.normal(size=shape)
+
+
+def _drifted(
+    aside_m: Float64[np.ndarray, " row"],
+    way_m: Float[np.ndarray, " row"],
+    push: Float64[np.ndarray, " row"],
+) -> Float64[np.ndarray, " row"]:
+    """Say how far to the left of their ways agents are led next."""
+    spread_m = np.minimum(DRIFT_M, DRIFT_SHARE * way_m) * (way_m >= DRIFT_LEAST_WAY_M)
+    fresh_m = math.sqrt(1 - DRIFT_KEPT**2) * spread_m * push
+    most_m = DRIFT_MOST * spread_m
+    return np.clip(DRIFT_KEPT * aside_m + fresh_m, -most_m, most_m)
+
+
+def _led_aside(
+    wanted: Float32[np.ndarray, "row 3"],
+    way_m: Float[np.ndarray, " row"],
+    was_m: Float64[np.ndarray, " row"],
+    aside_m: Float64[np.ndarray, " row"],
+) -> Float32[np.ndarray, "row 3"]:
+    """Shift poses to the left, and turn them to where the shift leads."""
+    led = wanted.copy()
+    led[:, 0] -= aside_m * np.sin(wanted[:, 2])
+    led[:, 1] += aside_m * np.cos(wanted[:, 2])
+    led[:, 2] += np.where(aside_m, np.arctan2(aside_m - was_m, way_m), 0.0)
+    return led
 
 
 def exchange_roads(

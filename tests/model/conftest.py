@@ -39,7 +39,10 @@ TINY = ModelSettings(
     heading_map_neighbours=8,
     heading_agent_neighbours=4,
     max_entries=3,
+    map_agent_ahead_m=4.0,
+    map_agent_across=True,
     ground_width=6,
+    move_width=10,
     tell_ego=True,
 )
 
@@ -51,7 +54,13 @@ VARIANTS = {
     "no heading token": {"heading_token": False},
     "no leave, no cell token": {"leave_token": False, "cell_token": False},
     "patterns": {"pattern_tokens": True},
-    "the paper's heads": {"ground_width": 0, "tell_ego": False},
+    "the paper's": {
+        "ground_width": 0,
+        "move_width": 0,
+        "tell_ego": False,
+        "map_agent_ahead_m": 0.0,
+        "map_agent_across": False,
+    },
     "smart with patterns": {"life_cycle": False, "pattern_tokens": True},
 }
 """Baselines and ablations of SPEC 7, and heads that are off by default."""

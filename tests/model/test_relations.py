@@ -7,8 +7,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from infgen.model.relations import Rows, direction, nearest, relations, within_radius
-from infgen.model.sight import cell_pose
+from infgen.model.relations import (
+    Rows,
+    across,
+    direction,
+    nearest,
+    relation_embedding,
+    relations,
+    within_radius,
+)
+from infgen.model.sight import Reach, cell_pose, look_around
 
 
 def line(*x_m):
@@ -113,6 +121,34 @@ def test_a_neighbour_ahead_to_the_left_facing_back():
     left_rad = math.atan2(3, 4)
     assert found[:2].tolist() == pytest.approx([5.0, left_rad], abs=1e-5)
     assert abs(found[2]) == pytest.approx(math.pi, abs=1e-5)
+
+
+def test_across_is_how_far_off_a_lane_one_drives_wherever_the_lane_began():
+    target = torch.tensor([[7.0, 2.0, 0.3], [0.0, 5.0, 0.0]])
+    lane = torch.tensor([[[0.0, 0.5, 0.0], [-50.0, 0.5, 0.0]], [[1.0, 0.0, 1.57080]] * 2])
+
+    left_m = across(target, lane)[..., 0]
+
+    assert left_m.tolist()[0] == pytest.approx([1.5, 1.5])
+    assert left_m.tolist()[1] == pytest.approx([1.0, 1.0], abs=1e-4)
+
+
+@pytest.mark.parametrize(("ahead_m", "seen"), [(0.0, {1, 2}), (6.0, {2, 3})])
+def test_who_looks_ahead_sees_what_lies_there_rather_than_behind(ahead_m, seen):
+    relation = relation_embedding(20.0, 2, 8)
+    reach = Reach.of(20.0, 2, relation, ahead_m=ahead_m)
+    facing = 2.0
+    way = torch.tensor([math.cos(facing), math.sin(facing)])
+    along_m = torch.tensor([-4.0, -1.0, 2.0, 7.0])
+    source = torch.cat([along_m[:, None] * way, torch.zeros(4, 1)], dim=-1)[None]
+    target = torch.tensor([[[0.0, 0.0, facing]]])
+    one = Rows.where(torch.ones(1, 1, dtype=torch.bool))
+
+    found = look_around(
+        reach, one, target, source, torch.arange(4)[None], torch.ones(1, 1, 4).bool()
+    )
+
+    assert set(found.index[0].tolist()) == seen
 
 
 @pytest.mark.parametrize("heading_rad", [0.0, 1.0, -3.0, math.pi])

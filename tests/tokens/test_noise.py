@@ -25,8 +25,28 @@ def straight_moves(step_m=0.1, count=31):
     return MotionCodebook(BOX_LW_M, path, np.ones((3, count), bool))
 
 
-def noise_of(codebook, moves, share=1.0):
-    return Noise(make_move_table(codebook), moves, share, ITSELF)
+def fan_moves():
+    """About five metres ahead, to either side, facing anywhere ahead."""
+    ahead_m, left_m, turn_rad = np.meshgrid(
+        np.linspace(4.5, 5.5, 11), np.linspace(-1.5, 1.5, 31), np.linspace(-0.4, 0.4, 9)
+    )
+    ends = np.stack([ahead_m, left_m, turn_rad], axis=-1).reshape(-1, 3)
+    path = ends[None, :, None] * np.linspace(0, 1, 6)[:, None]
+    path = np.repeat(path.astype(np.float32), 3, axis=0)
+    return MotionCodebook(BOX_LW_M, path, np.ones(path.shape[:2], bool))
+
+
+def noise_of(codebook, moves, share=1.0, drift=0.0):
+    return Noise(make_move_table(codebook), moves, share, drift, ITSELF)
+
+
+def five_metre_drives(codebook, agents=400, tokens=18):
+    kind, pose, move, moving = metre_drives(agents, tokens)
+    pose[..., 0] *= 5
+    straight = np.hypot(codebook.end_pose[0, :, 0] - 5, codebook.end_pose[0, :, 1])
+    straight += np.abs(codebook.end_pose[0, :, 2])
+    move[:, 1:] = straight.argmin()
+    return kind, pose, move, moving
 
 
 def metre_drives(agents=4, tokens=18):
@@ -162,6 +182,39 @@ def test_the_slow_stray_less_and_who_stands_not_at_all(way_m, off_m):
     assert farthest_m == pytest.approx(off_m, abs=1e-3)
 
 
+def test_a_share_of_the_drivers_drifts_for_seconds_and_learns_the_way_back():
+    codebook = fan_moves()
+    drives = five_metre_drives(codebook)
+
+    strays = stray(drives, noise_of(codebook, 1, drift=0.5))
+
+    aside_m = strays.pose[..., 1] - drives[1][..., 1]
+    drifts = np.abs(aside_m).max(axis=1) > 0.2
+    assert 0.4 < drifts.mean() < 0.6
+    np.testing.assert_allclose(aside_m[~drifts], 0.0, atol=1e-3)
+    settled_m = aside_m[drifts, 6:]
+    assert 0.45 < settled_m.std() < 0.8  # 0.15 of five metres, less what is cut off.
+    assert np.abs(settled_m).max() < 1.6
+    kept = (settled_m[:, 1:] * settled_m[:, :-1]).mean() / (settled_m**2).mean()
+    assert 0.7 < kept < 0.85
+    # Whoever is far to one side is to go to the other.
+    back_m = codebook.end_pose[0, strays.label[drifts, 7:], 1]
+    turned_rad = strays.pose[drifts, 6:-1, 2]
+    across_m = 5 * np.sin(turned_rad) + back_m * np.cos(turned_rad)
+    far = np.abs(settled_m[:, :-1]) > 0.5
+    assert (across_m[far] * settled_m[:, :-1][far] < 0).mean() > 0.95
+
+
+def test_who_hardly_moves_does_not_drift():
+    drives = metre_drives(agents=20)
+    drives[1][..., 0] *= 0.7
+    drives[2][:, 1:] = 7
+
+    strays = stray(drives, noise_of(straight_moves(), 1, drift=1.0))
+
+    assert not strays.off.any()
+
+
 def test_equal_draws_lead_equally_astray_and_others_otherwise():
     drives, noise = metre_drives(), noise_of(straight_moves(), 5)
 
@@ -225,12 +278,20 @@ def test_of_more_tokens_than_the_codebook_has_all_are_drawn_from(metre_moves, be
     assert noise.near_roads.shape == (bent_roads.num_roads, bent_roads.num_roads)
 
 
-def test_agents_are_led_astray_in_one_way_only():
+@pytest.mark.parametrize("noise", [{"noise_moves": 5}, {"noise_drift": 0.5}])
+def test_agents_are_led_astray_in_one_way_only(noise):
     with pytest.raises(ConfigError, match="set one of them to 0"):
-        TrainSettings(noise_moves=5, closed_loop_top=32)
+        TrainSettings(**noise, closed_loop_top=32)
 
 
+def test_drift_needs_no_other_noise(metre_moves, bent_roads):
+    noise = make_noise(TrainSettings(noise_drift=0.5), metre_moves, bent_roads)
+
+    assert (noise.moves, noise.drift) == (1, 0.5)
+
+
+@pytest.mark.parametrize("name", ["noise_share", "noise_drift"])
 @pytest.mark.parametrize("share", [-0.1, 1.1])
-def test_a_share_is_from_none_to_all(share):
-    with pytest.raises(ConfigError, match=r"train\.noise_share"):
-        TrainSettings(noise_share=share)
+def test_a_share_is_from_none_to_all(name, share):
+    with pytest.raises(ConfigError, match=rf"train\.{name}"):
+        TrainSettings(**{name: share})

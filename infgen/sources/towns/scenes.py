@@ -18,7 +18,10 @@ from infgen.sources.towns.views import View
 
 NOW = 10
 MAP_REACH_M = 115.0
-"""A log has the map features that come so near to the recording car."""
+"""A log has the map features that come so near to the recording car ..."""
+FAR_MPS = 15.0
+"""... or, if it is long, as far as one gets at this speed in its time: who plays it may
+turn where the log did not, and must not come to where the map ends."""
 MIN_VALID_STEPS = 3
 """Tracks seen for less are not in the record."""
 EGO_WIDTH_M, EGO_HEIGHT_M = 2.3, 2.2
@@ -101,7 +104,7 @@ def record(
     kept, valid = _kept(*tracks_of(shown), ego, rng)
     moved = _measured(actors, velocity_mps, ego, rng)
     tracks, origin_xyz_m = _tracks(actors, moved, kept, valid, place)
-    cut = _cut_map(town.road_map, eye_m)
+    cut = _cut_map(town.road_map, eye_m, _map_reach_m(num_steps))
     road_map = _placed(cut, place, origin_xyz_m)
     predict, difficulty = to_predict(tracks, NOW)
     return Scene(
@@ -160,12 +163,19 @@ def _reaches(
     return found
 
 
-def _cut_map(road_map: RoadMap, eye_m: Float64[np.ndarray, "step 2"]) -> RoadMap:
+def _map_reach_m(num_steps: int) -> float:
+    """How far from the recording car a log of so many steps still has a map."""
+    return max(MAP_REACH_M, FAR_MPS * num_steps * CLOCK.step_s)
+
+
+def _cut_map(
+    road_map: RoadMap, eye_m: Float64[np.ndarray, "step 2"], reach_m: float
+) -> RoadMap:
     """Keep the features that the recording car comes near to."""
     near = np.zeros(len(road_map.xyz_m), bool)
     x_m, y_m = road_map.xyz_m[:, 0], road_map.xyz_m[:, 1]
     for at_m in eye_m[::_LOOK_STEPS].astype(np.float32):
-        near |= (x_m - at_m[0]) ** 2 + (y_m - at_m[1]) ** 2 < MAP_REACH_M**2
+        near |= (x_m - at_m[0]) ** 2 + (y_m - at_m[1]) ** 2 < reach_m**2
     counted = np.concatenate([[0], np.cumsum(near)])
     kept = np.diff(counted[road_map.point_offsets]) > 0
     return keep_features(road_map, kept)

@@ -136,6 +136,20 @@ def test_the_map_is_of_the_same_place(scene):
     assert 1.7 < np.linalg.norm(from_ego_m, axis=1).min() < 1.9
 
 
+@pytest.mark.parametrize(("far_mps", "whole"), [(1.0, False), (50.0, True)])
+def test_a_long_log_has_the_map_as_far_as_one_gets_in_its_time(
+    monkeypatch, town, views, far_mps, whole
+):
+    monkeypatch.setattr("infgen.sources.towns.scenes.MAP_REACH_M", 2.0)
+    monkeypatch.setattr("infgen.sources.towns.scenes.FAR_MPS", far_mps)
+
+    scene = record("made", town, views[0], 40, PLACE, np.random.default_rng(1))
+
+    kept, there = len(scene.road_map.feature_id), len(town.road_map.feature_id)
+    assert 0 < kept <= there
+    assert (kept == there) == whole
+
+
 def test_lights_are_recorded_while_they_are_near(town):
     eye_m = np.array([[0.0, 0.0], [SEEN_M + 30.0, 0.0], [0.0, 0.0]])
 

@@ -1,0 +1,126 @@
+"""The road tokens near a place, without looking at all of a map.
+
+A map may be a town of ten thousand tokens, of which a few hundred are near anybody. They
+are sorted into squares once per map. Who looks for the nearest looks at the squares around
+it, which lie row by row one after the other, and finds exactly what a look at all of them
+would find.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor
+
+from infgen.model.relations import BLOCK_PAIRS, Neighbours, nearest_listed
+
+SIDE_M = 10.0
+"""Of a square."""
+MARGIN_M = 0.1
+"""Looked farther than asked, so that rounding loses nothing at the rim."""
+
+
+@dataclass(frozen=True, slots=True)
+class RoadGrid:
+    """Road tokens of some maps, sorted into squares.
+
+    Attributes:
+        corner_m: Corner of each map's first square.
+        size: Squares along x and y: of the largest map.
+        start: Where each square's tokens begin in ``order``; then their number.
+        order: Tokens by square, those that are none last.
+        xy_m: Where the tokens are, in their own order.
+    """
+
+    corner_m: Float32[Tensor, "scene 2"]
+    size: tuple[int, int]
+    start: Int64[Tensor, "scene bound"]
+    order: Int64[Tensor, "scene road"]
+    xy_m: Float32[Tensor, "scene road 2"]
+
+    @classmethod
+    @torch.no_grad()
+    def of(
+        cls, pose: Float32[Tensor, "scene road 3"], real: Bool[Tensor, "scene road"]
+    ) -> "RoadGrid":
+        """Sort the real tokens of maps."""
+        xy_m = pose[..., :2].contiguous()
+        shown_m = torch.where(real[..., None], xy_m, torch.inf)
+        corner_m = shown_m.amin(dim=1) if real.shape[1] else xy_m.new_zeros(len(xy_m), 2)
+        corner_m = torch.where(corner_m.isfinite(), corner_m, 0.0)
+        column, row = _squares(xy_m - corner_m[:, None]).unbind(-1)
+        columns = 1 + int(column[real].max()) if real.any() else 1
+        rows = 1 + int(row[real].max()) if real.any() else 1
+        square = torch.where(real, row * columns + column, rows * columns)
+        ordered, order = square.sort(dim=1, stable=True)
+        squares = torch.arange(rows * columns + 1, device=pose.device)
+        start = torch.searchsorted(ordered, squares.expand(len(pose), -1).contiguous())
+        return cls(corner_m, (columns, rows), start, order, xy_m)
+
+    @torch.no_grad()
+    def nearest(
+        self,
+        xy_m: Float32[Tensor, "row 2"],
+        scene: Int64[Tensor, " row"],
+        radius_m: float,
+        count: int,
+        *,
+        itself: Int64[Tensor, " row"] | None = None,
+    ) -> Neighbours:
+        """Find the ``count`` nearest tokens of each row's map, as ``relations.nearest``.
+
+        Args:
+            xy_m: From where.
+            scene: On which map.
+            radius_m: How far.
+            count: How many.
+            itself: A token that does not count.
+
+        Returns:
+            Neighbours of a single group.
+        """
+        count = min(count, self.order.shape[1])
+        if not count:
+            empty = scene.new_zeros((1, len(scene), 0))
+            return Neighbours(empty, empty.bool())
+        across = math.ceil(2 * radius_m / SIDE_M) + 1
+        block = max(1, BLOCK_PAIRS // (across * across * 4))
+        parts = []
+        for at in range(0, max(1, len(xy_m)), block):
+            part = slice(at, at + block)
+            place, there = self._listed(xy_m[part], scene[part], radius_m)
+            if itself is not None:
+                there &= place != itself[part, None]
+            source_m = self.xy_m[scene[part][:, None], place]
+            parts.append((xy_m[part], source_m, place, there))
+        return nearest_listed(parts, radius_m, count)
+
+    def _listed(
+        self, xy_m: Tensor, scene: Tensor, radius_m: float
+    ) -> tuple[Tensor, Tensor]:
+        """Tokens [row, listed] of the squares that a circle touches; which there are."""
+        columns, rows = self.size
+        here_m, reach_m = xy_m - self.corner_m[scene], radius_m + MARGIN_M
+        low, high = _squares(here_m - reach_m), _squares(here_m + reach_m)
+        left = low[:, 0].clamp(0, columns)
+        right = high[:, 0].clamp(-1, columns - 1) + 1
+        most = math.ceil(2 * reach_m / SIDE_M) + 1
+        row = low[:, 1:] + torch.arange(most, device=xy_m.device)  # [target, row]
+        touched = (row >= 0) & (row < rows) & (row <= high[:, 1:])
+        touched &= (left < right)[:, None]
+        first = torch.where(touched, row * columns, 0)
+        start = self.start[scene]
+        begin = start.gather(1, first + torch.where(touched, left[:, None], 0))
+        end = start.gather(1, first + torch.where(touched, right[:, None], 0))
+        length = (end - begin) * touched
+        steps = torch.arange(
+            max(1, int(length.max())) if len(row) else 1, device=row.device
+        )
+        there = steps < length[..., None]  # [target, row, step]
+        at = torch.where(there, begin[..., None] + steps, 0).flatten(1)
+        return self.order[scene[:, None], at], there.flatten(1)
+
+
+def _squares(away_m: Tensor) -> Tensor:
+    return (away_m / SIDE_M).floor().long()
