@@ -19,9 +19,10 @@ from infgen.sources.towns.views import View
 NOW = 10
 MAP_REACH_M = 115.0
 """A log has the map features that come so near to the recording car ..."""
+SHORT_STEPS = 91
 FAR_MPS = 15.0
-"""... or, if it is long, as far as one gets at this speed in its time: who plays it may
-turn where the log did not, and must not come to where the map ends."""
+"""... or, if it is longer than WOMD's, as far as one gets at this speed in its time: who
+plays it may turn where the log did not, and must not come to where the map ends."""
 MIN_VALID_STEPS = 3
 """Tracks seen for less are not in the record."""
 EGO_WIDTH_M, EGO_HEIGHT_M = 2.3, 2.2
@@ -165,6 +166,8 @@ def _reaches(
 
 def _map_reach_m(num_steps: int) -> float:
     """How far from the recording car a log of so many steps still has a map."""
+    if num_steps <= SHORT_STEPS:
+        return MAP_REACH_M
     return max(MAP_REACH_M, FAR_MPS * num_steps * CLOCK.step_s)
 
 

@@ -12,7 +12,7 @@ from infgen.sources.towns.roads import Furniture, draw_map
 from infgen.sources.towns.scenes import NOW, Place, record
 from infgen.sources.towns.surroundings import Surroundings
 from infgen.sources.towns.town import Town, stream
-from infgen.sources.towns.views import draw_views
+from infgen.sources.towns.views import View, draw_views
 
 STEPS = 120
 PLACE = Place(0.7, np.array([100.0, -50.0]), np.array([0.01, 0.0]), 5.0)
@@ -136,14 +136,17 @@ def test_the_map_is_of_the_same_place(scene):
     assert 1.7 < np.linalg.norm(from_ego_m, axis=1).min() < 1.9
 
 
-@pytest.mark.parametrize(("far_mps", "whole"), [(1.0, False), (50.0, True)])
+@pytest.mark.parametrize(
+    ("steps", "far_mps", "whole"), [(92, 0.1, False), (92, 50.0, True), (91, 50.0, False)]
+)
 def test_a_long_log_has_the_map_as_far_as_one_gets_in_its_time(
-    monkeypatch, town, views, far_mps, whole
+    monkeypatch, town, views, steps, far_mps, whole
 ):
     monkeypatch.setattr("infgen.sources.towns.scenes.MAP_REACH_M", 2.0)
     monkeypatch.setattr("infgen.sources.towns.scenes.FAR_MPS", far_mps)
 
-    scene = record("made", town, views[0], 40, PLACE, np.random.default_rng(1))
+    view = View(views[0].ego, 0)
+    scene = record("made", town, view, steps, PLACE, np.random.default_rng(1))
 
     kept, there = len(scene.road_map.feature_id), len(town.road_map.feature_id)
     assert 0 < kept <= there
