@@ -111,6 +111,9 @@ class ModelSettings:
             leads; 0 for a logit per move, each learned alone, as in the paper.
         tell_ego: Whether the ego's embedding says that it is the ego: whoever records is
             under way, where one that looks the same may be parked.
+        step_lights: Whether agents see traffic lights as they are in each half second, not
+            as they were at the end of the history; in rollouts, ``rollout.lights`` says
+            what they show.
     """
 
     width: int = 128
@@ -143,6 +146,7 @@ class ModelSettings:
     ground_width: int = 0
     move_width: int = 0
     tell_ego: bool = False
+    step_lights: bool = False
 
 
 @dataclass(frozen=True, slots=True)

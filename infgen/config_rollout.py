@@ -57,6 +57,9 @@ class RolloutSettings:
         remove: Whether agents may leave; the mode's if None.
         leave_radius_m: Whoever gets farther from the ego leaves, if anyone may; 0 for
             nobody. For weights that do not say who leaves (SPEC 7).
+        lights: What traffic lights show after the history, to weights that see them change:
+            ``now`` for what they showed last, ``log`` for what they do in the log (where it
+            has an end, the last of it). Not in mode ``wosac``, which forbids to look.
         patterns: Whether agents are seen and lost as by a detector, with weights that have
             learned validity patterns.
         top_moves: Most likely moves that are sampled from; 0 for all.
@@ -95,6 +98,7 @@ class RolloutSettings:
     insert: bool | None = None
     remove: bool | None = None
     leave_radius_m: float = 0.0
+    lights: str = "now"
     patterns: bool = False
     top_moves: int = 5
     top_cells: int = 10
@@ -130,6 +134,13 @@ class RolloutSettings:
                     f"rollout.{name} is {given}, but rollout.mode={self.mode} is played "
                     f"with {fixed}; say so, leave it out, or choose another mode"
                 )
+        if self.lights not in ("now", "log"):
+            raise ConfigError(f"rollout.lights is {self.lights!r}; expected now or log")
+        if self.lights == "log" and self.mode == "wosac":
+            raise ConfigError(
+                "rollout.lights=log looks into the future, which rollout.mode=wosac "
+                "forbids; say rollout.lights=now"
+            )
         self._check_numbers()
 
     def _check_numbers(self) -> None:

@@ -197,7 +197,7 @@ def _starts(
 ) -> "tuple[list[Start], list[str]]":
     """Tokenize the histories; scenes that cannot be played are named with the reason."""
     from infgen.rollout.trace import Start  # noqa: PLC0415
-    from infgen.tokens.tokenizer import tokenize_scene  # noqa: PLC0415
+    from infgen.tokens.tokenizer import read_lights, tokenize_scene  # noqa: PLC0415
     from pipeline.ingest import read_scenes  # noqa: PLC0415
 
     first, count = unit.task["first"], unit.task["count"]
@@ -213,7 +213,10 @@ def _starts(
         except ValueError as error:
             refused.append(f"{scene.scenario_id}: {error}")
             continue
-        starts += [Start(scene, history, at, settings.seed) for at in range(settings.count)]
+        lights = read_lights(scene) if settings.lights == "log" else None
+        starts += [
+            Start(scene, history, at, settings.seed, lights) for at in range(settings.count)
+        ]
     return starts, refused
 
 

@@ -19,16 +19,16 @@ from jaxtyping import Bool, Float32, Int16, Int64, Integer
 from torch import Tensor
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.model.padding import NOBODY, Arrays, pad
 from infgen.model.tensors import map_tensors
 from infgen.model.window import SceneWindow, cut_window, disturb
 from infgen.tokens.grid import Grid, encode_heading, make_grid, to_grid
 from infgen.tokens.noise import Noise, exchange_roads
-from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE, Presence, SceneTokens
+from infgen.tokens.scene_tokens import NO_CELL, Presence, SceneTokens
+from infgen.tokens.signals import Lights
 
 T = TypeVar("T")
 
-NOBODY = -1
-"""Agent of an empty slot."""
 OUTSIDE = 1 << 15
 """Turn of a newcomer that is in no cell: no query may see it yet."""
 PICKED_SHARE = 0.15
@@ -87,6 +87,8 @@ class Roads:
         point_kind: ``PointKind``.
         line_kind: ``LineKind``.
         signal: ``SignalClass`` at the end of the history.
+        light: The traffic light of its lane, counted from 1; 0 for none.
+        shown: ``SignalClass`` of those lights at the end of each half second.
         follows: Whether the road token before it is its predecessor on the same line.
         picked: Whether it is hidden where road tokens are predicted.
     """
@@ -97,6 +99,8 @@ class Roads:
     point_kind: Int64[Tensor, "scene road"]
     line_kind: Int64[Tensor, "scene road"]
     signal: Int64[Tensor, "scene road"]
+    light: Int64[Tensor, "scene road"]
+    shown: Int64[Tensor, "scene light token"]
     follows: Bool[Tensor, "scene road"]
     picked: Bool[Tensor, "scene road"]
 
@@ -202,21 +206,36 @@ def collate(
     scenes = [_scene(record, limits, draw, noise) for record in records]
     return Batch(
         scenario_ids=tuple(record.scenario_id for record in records),
-        agents=_pad([scene[0] for scene in scenes], Agents),
-        roads=_pad([scene[1] for scene in scenes], Roads),
-        entries=_pad([scene[2] for scene in scenes], Entries),
-        details=_pad([scene[3] for scene in scenes], Details),
+        agents=pad([scene[0] for scene in scenes], Agents),
+        roads=pad([scene[1] for scene in scenes], Roads),
+        entries=pad([scene[2] for scene in scenes], Entries),
+        details=pad([scene[3] for scene in scenes], Details),
     )
 
 
-def collate_roads(records: Sequence[SceneTokens], max_roads: int) -> Roads:
-    """Put only the maps of scenes side by side, with nothing hidden."""
+def collate_roads(
+    records: Sequence[SceneTokens],
+    max_roads: int,
+    lights: Sequence[Lights | None] | None = None,
+) -> Roads:
+    """Put only the maps of scenes side by side, with nothing hidden.
+
+    Args:
+        records: The scenes.
+        max_roads: Road tokens of each.
+        lights: What the lights of each show, if that is known for longer than the record.
+    """
     maps = []
-    for record in records:
+    for at, record in enumerate(records):
         window = cut_window(record, 0, record.num_tokens, record.num_agents, max_roads)
         token = record.road_token[window.roads]
-        maps.append(_roads(window, token, np.zeros(len(token), dtype=bool)))
-    return _pad(maps, Roads)
+        arrays = _roads(window, token, np.zeros(len(token), dtype=bool))
+        known = lights[at] if lights else None
+        if known is not None:
+            line = record.road_line[window.roads]
+            arrays |= {"light": _lights(line, known.line), "shown": known.shown}
+        maps.append(arrays)
+    return _last_shown(pad(maps, Roads), maps)
 
 
 def describe(
@@ -235,12 +254,9 @@ def to_device(batch: T, device: torch.device) -> T:
     return map_tensors(batch, lambda x: x.to(device))
 
 
-_Arrays = dict[str, np.ndarray]
-
-
 def _scene(
     record: SceneTokens, limits: Limits, draw: int, noise: Noise | None
-) -> tuple[_Arrays, _Arrays, _Arrays, _Arrays]:
+) -> tuple[Arrays, Arrays, Arrays, Arrays]:
     """Arrays of agents, roads, entries and details of one scene."""
     random = _keyed(f"{draw}/{record.scenario_id}")
     chance = _keyed(f"noise/{draw}/{record.scenario_id}")  # Noise moves no other draw.
@@ -266,7 +282,7 @@ def _keyed(key: str) -> np.random.Generator:
     return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
 
 
-def _agents(window: SceneWindow, turn: np.ndarray) -> _Arrays:
+def _agents(window: SceneWindow, turn: np.ndarray) -> Arrays:
     return {
         "kind": window.kind,
         "size_lwh_m": window.size_lwh_m,
@@ -282,7 +298,7 @@ def _agents(window: SceneWindow, turn: np.ndarray) -> _Arrays:
     }
 
 
-def _roads(window: SceneWindow, token: np.ndarray, picked: np.ndarray) -> _Arrays:
+def _roads(window: SceneWindow, token: np.ndarray, picked: np.ndarray) -> Arrays:
     record, rows = window.record, window.roads
     line = record.road_line[rows]
     follows = np.zeros(len(rows), dtype=bool)
@@ -294,9 +310,28 @@ def _roads(window: SceneWindow, token: np.ndarray, picked: np.ndarray) -> _Array
         "point_kind": record.road_point_kind[rows],
         "line_kind": record.road_line_kind[rows],
         "signal": record.road_signal[rows],
+        "light": _lights(line, record.signal_line),
+        "shown": window.shown,
         "follows": follows,
         "picked": picked,
     }
+
+
+def _last_shown(roads: Roads, maps: Sequence[Arrays]) -> Roads:
+    """Let what a scene's lights show last go on where another scene's are known longer."""
+    for row, one in enumerate(maps):
+        lights, tokens = one["shown"].shape
+        if lights and tokens:
+            roads.shown[row, :, tokens:] = roads.shown[row, :, tokens - 1, None]
+    return roads
+
+
+def _lights(line: np.ndarray, signal_line: np.ndarray) -> np.ndarray:
+    """Number of the light of each road token's line, from 1; 0 where it has none."""
+    if not len(signal_line):
+        return np.zeros(len(line), dtype=np.int64)
+    at = np.minimum(np.searchsorted(signal_line, line), len(signal_line) - 1)
+    return np.where(signal_line[at] == line, at + 1, 0)
 
 
 def _turns(window: SceneWindow) -> np.ndarray:
@@ -311,7 +346,7 @@ def _turns(window: SceneWindow) -> np.ndarray:
     return turn
 
 
-def _entries(window: SceneWindow, turn: np.ndarray, limit: int) -> _Arrays:
+def _entries(window: SceneWindow, turn: np.ndarray, limit: int) -> Arrays:
     tokens = turn.shape[1]
     inside = (turn >= 0) & (turn < OUTSIDE)
     asked = np.arange(tokens) > 0
@@ -325,8 +360,8 @@ def _entries(window: SceneWindow, turn: np.ndarray, limit: int) -> _Arrays:
 
 
 def _details(
-    window: SceneWindow, entries: _Arrays, grid: Grid, random: np.random.Generator
-) -> _Arrays:
+    window: SceneWindow, entries: Arrays, grid: Grid, random: np.random.Generator
+) -> Arrays:
     """Newcomers in order, then agents that are there already and play the part."""
     token, turn = np.nonzero(entries["agent"] >= 0)
     row = entries["agent"][token, turn]
@@ -354,27 +389,3 @@ def _details(
         "heading": heading,
         "offset_m": offset_m,
     }
-
-
-_PADDING = {
-    "move": NO_MOVE,
-    "label": NO_MOVE,
-    "cell": NO_CELL,
-    "turn": -1,
-    "agent": NOBODY,
-}
-
-
-def _pad(scenes: Sequence[_Arrays], kind: type[T]) -> T:
-    """Stack arrays of different sizes, filled up at their ends."""
-    tensors = {}
-    for name in scenes[0]:
-        parts = [scene[name] for scene in scenes]
-        shape = np.max([part.shape for part in parts], axis=0)
-        dtype = parts[0].dtype if parts[0].dtype.kind in "fb" else np.dtype(np.int64)
-        fill = _PADDING.get(name, 0)
-        padded = np.full((len(parts), *shape), fill, dtype=dtype)
-        for row, part in enumerate(parts):
-            padded[row][tuple(slice(size) for size in part.shape)] = part
-        tensors[name] = torch.from_numpy(padded)
-    return kind(**tensors)

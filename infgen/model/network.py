@@ -116,11 +116,11 @@ class Network(nn.Module):
         visible = visible.flatten(0, 1)
         others = ~torch.eye(visible.shape[1], dtype=torch.bool, device=visible.device)
         past_index, past_present, past_relation = self._past(agents, rows)
-        reach = self.motion.roads_reach()
+        reach, token = self.motion.roads_reach(), _tokens(agents, rows)
         sight = Sight(
             past_relation,
             past_present,
-            see_roads(reach, by_scene, agents.pose.flatten(1, 2), roads, scene),
+            see_roads(reach, by_scene, agents.pose.flatten(1, 2), roads, scene, token),
             look_around(
                 self.motion.agents_reach(),
                 by_token,
@@ -215,6 +215,12 @@ def _details(
     x = stack(cell, roads_seen, around.seen(raw))
     kind = wanted.pack(details.kind)
     return stack.answer(wanted, x, kind, pose, Lying.near(roads, roads_seen))
+
+
+def _tokens(agents: Agents, rows: Rows) -> Tensor:
+    """Half second of every row."""
+    _, tokens, places = agents.visible.shape
+    return rows.at // places % tokens
 
 
 def _count(like: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from infgen.model.batch import Roads
 from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.relations import Rows, relation_embedding
 from infgen.model.road_grid import RoadGrid
-from infgen.model.sight import Around, Reach, RoadFeatures
+from infgen.model.sight import Around, Lamps, Reach, RoadFeatures
 from infgen.tokens.codebook import RoadCodebook
 from infgen.tokens.roads import LineKind, PointKind
 from infgen.tokens.scene_tokens import SignalClass
@@ -40,6 +40,7 @@ class RoadEncoder(nn.Module):
         super().__init__()
         width = settings.width
         self.radius_m = settings.map_map_radius_m
+        self.step_lights = settings.step_lights
         self.neighbours = settings.map_map_neighbours
         curve_m = torch.from_numpy(codebook.curve_m.copy())
         self.register_buffer("curve_m", curve_m, persistent=False)
@@ -78,7 +79,11 @@ class RoadEncoder(nn.Module):
         x = self._embed(roads, sight.rows)
         for block in self.blocks:
             x = block(x, around.seen(normed(x)))
-        return RoadFeatures(sight.rows, normed(x), roads.pose, roads.real, sight.grid)
+        rows, features, lamps = sight.rows, normed(x), None
+        if self.step_lights:
+            looks, lamps = self._lamps(roads, rows, x)
+            features = torch.cat([features, looks])
+        return RoadFeatures(rows, features, roads.pose, roads.real, sight.grid, lamps)
 
     def predict_hidden(self, roads: Roads, covered: RoadFeatures) -> tuple[Tensor, Tensor]:
         """Predict hidden road tokens from their predecessors, which did not see them.
@@ -103,4 +108,15 @@ class RoadEncoder(nn.Module):
         embedded: Tensor = gather(shapes, rows.pack(roads.token))
         embedded = embedded + self.point_kind(rows.pack(roads.point_kind))
         embedded = embedded + self.line_kind(rows.pack(roads.line_kind))
+        if self.step_lights:
+            return embedded
         return embedded + self.signal(rows.pack(roads.signal))
+
+    def _lamps(self, roads: Roads, rows: Rows, x: Tensor) -> tuple[Tensor, Lamps]:
+        """Say what road tokens with a light look like under each class of it."""
+        lit = rows.pack(roads.light).nonzero()[:, 0]
+        looks = normed(x[lit, None] + self.signal.weight)  # [lit, class, D]
+        first = torch.zeros_like(rows.at)
+        behind = torch.arange(len(lit), device=x.device) * looks.shape[1]
+        first[lit] = len(x) + behind
+        return looks.flatten(0, 1), Lamps(first, roads.light, roads.shown)

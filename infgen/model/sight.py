@@ -102,6 +102,7 @@ class RoadFeatures:
         pose: Poses of the padded maps [scene, road, 3].
         real: Which places of the padded maps hold a road token [scene, road].
         grid: The same tokens by where they are.
+        lamps: What those with a traffic light look like, if that is seen as it changes.
     """
 
     rows: Rows
@@ -109,6 +110,39 @@ class RoadFeatures:
     pose: Tensor
     real: Tensor
     grid: RoadGrid
+    lamps: "Lamps | None"
+
+    def at(self, scene: Tensor, place: Tensor, token: Tensor | None) -> Tensor:
+        """Rows [N, K] of the features of places [N, K] of maps [N], at half seconds [N]."""
+        row = self.rows.number[scene[:, None], place]
+        if self.lamps is None or token is None:
+            return row
+        return self.lamps.lit(row, scene, place, token)
+
+
+@dataclass(frozen=True, slots=True)
+class Lamps:
+    """Road tokens as they look under each class of light: rows behind those of the maps.
+
+    Attributes:
+        first: Row of the first class of each road token's looks [row].
+        light: Its light, counted from 1; 0 for none [scene, road].
+        shown: ``SignalClass`` of those by the half second; the last one lasts
+            [scene, light, token].
+    """
+
+    first: Tensor
+    light: Tensor
+    shown: Tensor
+
+    def lit(self, row: Tensor, scene: Tensor, place: Tensor, token: Tensor) -> Tensor:
+        """Rows of road tokens under their lights at half seconds [N]; others as given."""
+        if not self.shown.numel():
+            return row
+        scene = scene[:, None]
+        light, token = self.light[scene, place], token.clamp(max=self.shown.shape[2] - 1)
+        shown = self.shown[scene, (light - 1).clamp(min=0), token[:, None]]
+        return torch.where(light > 0, self.first[row] + shown, row)
 
 
 def look_around(
@@ -152,14 +186,24 @@ def see_roads(
     target_pose: Float32[Tensor, "group target 3"],
     roads: RoadFeatures,
     scene: Int64[Tensor, " group"],
+    token: Int64[Tensor, " row"] | None = None,
 ) -> Seen:
-    """Show every target row the road tokens around it; ``scene`` is each group's map."""
+    """Show every target row the road tokens around it.
+
+    Args:
+        reach: How far and how many.
+        targets: Which places of [group, target] are rows.
+        target_pose: Poses of targets.
+        roads: All maps.
+        scene: Each group's map.
+        token: Half second of each row: it sees the lights of then. Without, it sees none.
+    """
     pose, on = targets.pack(target_pose), scene[targets.at // target_pose.shape[1]]
     found = roads.grid.nearest(reach.centre_m(pose), on, reach.radius_m, reach.count)
     place, present = found.index[0], found.present[0]
     return Seen(
         roads.features,
-        roads.rows.number[on[:, None], place],
+        roads.at(on, place, token),
         reach.describe(pose, roads.pose[on[:, None], place]),
         present,
     )

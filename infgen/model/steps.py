@@ -381,7 +381,10 @@ class Stepper:
             rows.number,
             visible[:, None] & visible[:, :, None] & others,
         )
-        roads = see_roads(self._roads_reach, rows, column.pose, memory.roads, memory.scene)
+        token = torch.full_like(rows.at, memory.columns)
+        roads = see_roads(
+            self._roads_reach, rows, column.pose, memory.roads, memory.scene, token
+        )
         place = torch.arange(memory.window, device=visible.device)
         ago = (place - memory.columns) % memory.window - memory.window  # -window ... -1
         described = relations(rows.pack(column.pose), rows.pack(memory.pose))

@@ -21,6 +21,7 @@ class SceneWindow:
         record: The whole scene.
         label: The move to learn for each token: ``move`` until agents are led astray.
         roads: Rows of the record's road tokens that are kept, ascending.
+        shown: ``SignalClass`` of each of the record's lights at each token's end.
         kind, size_lwh_m, near, pose, move, presence, observed, pattern, cell: As in the
             record.
         entry_row: Row of each newcomer whose agent is kept ...
@@ -30,6 +31,7 @@ class SceneWindow:
 
     record: SceneTokens
     roads: Int64[np.ndarray, " road"]
+    shown: Int8[np.ndarray, "light token"]
     kind: Int8[np.ndarray, " agent"]
     size_lwh_m: Float32[np.ndarray, "agent 3"]
     near: Bool[np.ndarray, " agent"]
@@ -64,6 +66,7 @@ def cut_window(
     return SceneWindow(
         record=record,
         roads=roads,
+        shown=record.signal_state[:, start:stop],
         kind=record.kind[rows],
         size_lwh_m=record.size_lwh_m[rows],
         near=record.near[rows],

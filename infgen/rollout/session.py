@@ -219,11 +219,15 @@ def _begin(
     player: Player, starts: Sequence[Start], streams: Sequence[Stream], first: Population
 ) -> tuple[Memory, Asking]:
     """Encode every map once, however many rollouts of it there are."""
-    maps = {start.scene.scenario_id: start.history for start in starts}
+    maps = {start.scene.scenario_id: start for start in starts}
     number = {name: at for at, name in enumerate(maps)}
     scene = np.array([number[start.scene.scenario_id] for start in starts], dtype=np.int64)
-    histories = list(maps.values())
-    roads = collate_roads(histories, max(history.num_roads for history in histories))
+    histories = [start.history for start in maps.values()]
+    roads = collate_roads(
+        histories,
+        max(history.num_roads for history in histories),
+        [start.lights for start in maps.values()],
+    )
     memory = player.stepper.begin(roads, player.tensor(scene), first.life.shape[1])
     settings, room = player.settings, None
     if settings.entry_mask:

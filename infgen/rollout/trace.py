@@ -15,6 +15,7 @@ from infgen.rollout.heights import ground_z_m
 from infgen.rollout.rollout import NEVER, Rollout
 from infgen.scene import Scene
 from infgen.tokens.scene_tokens import SceneTokens
+from infgen.tokens.signals import Lights
 
 NOBODY = -1
 """Life of a free row."""
@@ -56,12 +57,15 @@ class Start:
         history: Its tokens up to now, nothing later in them.
         index: Which of the scene's rollouts this is.
         seed: Seed of its random streams.
+        lights: What traffic lights show in every half second from the history's first on,
+            for weights that see it; None to leave them as they were last.
     """
 
     scene: Scene
     history: SceneTokens
     index: int
     seed: int
+    lights: Lights | None = None
 
     @property
     def logged_row(self) -> Int32[np.ndarray, " agent"]:

@@ -1,5 +1,7 @@
 """Traffic lights as classes: what a driver does about them (SPEC 1.4)."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Int8, Int32, Int64
 
@@ -51,6 +53,18 @@ def signals_at(
     )
     shown[lane[rows], column[rows]] = merge_states(signals.state[rows])
     return shown
+
+
+class Lights(NamedTuple):
+    """What the traffic lights of a scene show.
+
+    Attributes:
+        line: Lines of road tokens that ever have a light, ascending.
+        shown: ``SignalClass`` of each at the end of each half second.
+    """
+
+    line: Int32[np.ndarray, " light"]
+    shown: Int8[np.ndarray, "light token"]
 
 
 def signal_lines(

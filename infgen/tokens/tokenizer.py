@@ -15,7 +15,7 @@ from infgen.tokens.presence import makes_a_move, seen_tokens
 from infgen.tokens.roads import match_roads, road_pieces
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.sequence import write_words
-from infgen.tokens.signals import signal_lines, signals_at
+from infgen.tokens.signals import Lights, signal_lines, signals_at
 from infgen.tokens.tracks import Paths, read_paths
 
 
@@ -84,6 +84,18 @@ def tokenize_scene(
         anchor_pose=anchors.pose,
         **road_fields,
     )
+
+
+def read_lights(scene: Scene, clock: Clock = CLOCK) -> Lights:
+    """Read what a log's traffic lights show in all of its half seconds.
+
+    A history that is tokenized alone ends at ``now``, and its lights with it. Whoever plays
+    on may let them change as they did in the log.
+    """
+    pieces, last = road_pieces(scene.road_map), scene.tracks.num_steps - 1
+    line, lane_id = signal_lines(scene.signals, pieces.line, pieces.feature_id, last)
+    ends = np.arange(clock.steps_per_token, last + 1, clock.steps_per_token)
+    return Lights(line, signals_at(scene.signals, lane_id, ends))
 
 
 def _roads(

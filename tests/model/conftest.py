@@ -44,6 +44,7 @@ TINY = ModelSettings(
     ground_width=6,
     move_width=10,
     tell_ego=True,
+    step_lights=True,
 )
 
 VARIANTS = {
@@ -58,6 +59,7 @@ VARIANTS = {
         "ground_width": 0,
         "move_width": 0,
         "tell_ego": False,
+        "step_lights": False,
         "map_agent_ahead_m": 0.0,
         "map_agent_across": False,
     },
@@ -172,8 +174,8 @@ def _record(name, kind, pose, move, presence, roads, random):
         road_line_kind=random.integers(4, size=roads).astype(np.int8),
         road_line=line.astype(np.int32),
         road_signal=random.integers(len(SignalClass), size=roads).astype(np.int8),
-        signal_line=none.astype(np.int32),
-        signal_state=np.empty((0, tokens), dtype=np.int8),
+        signal_line=np.unique(line)[1::3].astype(np.int32),
+        signal_state=_any_signal((len(np.unique(line)[1::3]), tokens)),
         word=none.astype(np.uint8),
         word_value=none.astype(np.int16),
         word_agent=none.astype(np.int16),
@@ -182,6 +184,11 @@ def _record(name, kind, pose, move, presence, roads, random):
         anchor_token=none.astype(np.int16),
         anchor_pose=np.empty((0, 3), dtype=np.float32),
     )
+
+
+def _any_signal(shape):
+    lit = np.random.default_rng(2).integers(len(SignalClass), size=shape)
+    return lit.astype(np.int8)
 
 
 def _any_pattern(shape):

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from infgen.config import TrainSettings
-from infgen.model.batch import NOBODY, OUTSIDE, collate, collate_roads, to_device
+from infgen.model.batch import OUTSIDE, collate, collate_roads, to_device
+from infgen.model.padding import NOBODY
 from infgen.model.window import cut_window
 from infgen.tokens.grid import decode_cell, encode_cell, from_grid, make_grid, to_grid
 from infgen.tokens.moves import advance, make_move_table, nearest_moves

@@ -205,7 +205,8 @@ def test_hidden_road_tokens_are_not_seen(network, record, limits):
     assert torch.equal(logits, before.roads.logits)
 
 
-def test_signals_and_presence_are_seen(network, record, limits):
+def test_signals_as_they_were_last_are_seen(new_network, tiny, record, limits):
+    network = new_network(replace(tiny, step_lights=False)).eval()
     batch, before = run(network, [record(1)], limits)
     signal = (batch.roads.signal + 1) % 5
 
@@ -213,6 +214,20 @@ def test_signals_and_presence_are_seen(network, record, limits):
         after = network(replace(batch, roads=replace(batch.roads, signal=signal)))
 
     assert (after.motion.move_logits - before.motion.move_logits).abs().max() > 1e-4
+
+
+def test_a_light_that_changes_is_seen_from_then_on_and_not_before(network, record, limits):
+    batch, before = run(network, [record(1)], limits)
+    assert (batch.roads.light > 0).any()
+    shown = batch.roads.shown.clone()
+    shown[:, :, 4] = (shown[:, :, 4] + 1) % 5
+
+    with torch.no_grad():
+        after = network(replace(batch, roads=replace(batch.roads, shown=shown)))
+
+    gap = before.motion.rows.spread(after.motion.move_logits - before.motion.move_logits)
+    assert gap[0, :4].abs().max() == 0
+    assert gap[0, 4].abs().max() > 1e-3
 
 
 def test_the_ego_alone_is_told_that_it_is(new_network, record, limits):
