@@ -22,7 +22,7 @@ WAVES = 9
 """... down to a quarter of a metre."""
 TURN_WAVES = 6
 """Waves of the heading, of which each turns twice as fast as the one before it."""
-SPEED_M = 10.0
+UNIT_M = 10.0
 """Metres are told in tens, to be of the size of the waves."""
 
 
@@ -69,7 +69,7 @@ def _waves(
     per_m = 2 * math.pi / LONGEST_WAVE_M * 2.0 ** np.arange(WAVES)
     phase = [end_pose[..., axis, None] * per_m for axis in (0, 1)]
     phase.append(end_pose[..., 2, None] * 2.0 ** np.arange(TURN_WAVES))
-    plain = end_pose / np.array([SPEED_M, SPEED_M, 1.0])
+    plain = end_pose / np.array([UNIT_M, UNIT_M, 1.0])
     turns = np.concatenate(phase, axis=-1)
     told = np.concatenate([plain, np.cos(turns), np.sin(turns)], axis=-1)
     return told.astype(np.float32)

@@ -86,14 +86,16 @@ class RoadGrid:
             return Neighbours(empty, empty.bool())
         across = math.ceil(2 * radius_m / SIDE_M) + 1
         block = max(1, BLOCK_PAIRS // (across * across * 4))
-        parts = []
-        for at in range(0, max(1, len(xy_m)), block):
+
+        def listed(at: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             part = slice(at, at + block)
             place, there = self._listed(xy_m[part], scene[part], radius_m)
             if itself is not None:
                 there &= place != itself[part, None]
-            source_m = self.xy_m[scene[part][:, None], place]
-            parts.append((xy_m[part], source_m, place, there))
+            return xy_m[part], self.xy_m[scene[part][:, None], place], place, there
+
+        # One at a time: what a part lists stays in the cache until it is searched.
+        parts = map(listed, range(0, max(1, len(xy_m)), block))
         return nearest_listed(parts, radius_m, count)
 
     def _listed(
