@@ -113,7 +113,8 @@ class ModelSettings:
             under way, where one that looks the same may be parked.
         step_lights: Whether agents see traffic lights as they are in each half second, not
             as they were at the end of the history; in rollouts, ``rollout.lights`` says
-            what they show.
+            what they show. In half of the scenes of a training nobody looks at them after
+            the history, so that rollouts may go on without.
     """
 
     width: int = 128

@@ -58,8 +58,8 @@ class RolloutSettings:
         leave_radius_m: Whoever gets farther from the ego leaves, if anyone may; 0 for
             nobody. For weights that do not say who leaves (SPEC 7).
         lights: What traffic lights show after the history, to weights that see them change:
-            ``now`` for what they showed last, ``log`` for what they do in the log (where it
-            has an end, the last of it). Not in mode ``wosac``, which forbids to look.
+            ``now`` for nothing but what they showed last, ``log`` for what they do in the
+            log while it goes on. Not in mode ``wosac``, which forbids to look.
         patterns: Whether agents are seen and lost as by a detector, with weights that have
             learned validity patterns.
         top_moves: Most likely moves that are sampled from; 0 for all.

@@ -21,11 +21,11 @@ from torch import Tensor
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
 from infgen.model.padding import NOBODY, Arrays, pad
 from infgen.model.tensors import map_tensors
-from infgen.model.window import SceneWindow, cut_window, disturb
+from infgen.model.window import SceneWindow, cut_window, disturb, look_away
 from infgen.tokens.grid import Grid, encode_heading, make_grid, to_grid
 from infgen.tokens.noise import Noise, exchange_roads
 from infgen.tokens.scene_tokens import NO_CELL, Presence, SceneTokens
-from infgen.tokens.signals import Lights
+from infgen.tokens.signals import Lights, remember
 
 T = TypeVar("T")
 
@@ -34,6 +34,8 @@ OUTSIDE = 1 << 15
 PICKED_SHARE = 0.15
 """Share of road tokens that are hidden to be predicted: few, as everyone else does without
 them in the same pass."""
+FORGOTTEN_SHARE = 0.5
+"""Share of scenes in which nobody looks at traffic lights after the history."""
 PSEUDO_PER_TOKEN = 2
 """Agents per half second that play newcomers, to learn headings and offsets from."""
 
@@ -88,7 +90,8 @@ class Roads:
         line_kind: ``LineKind``.
         signal: ``SignalClass`` at the end of the history.
         light: The traffic light of its lane, counted from 1; 0 for none.
-        shown: ``SignalClass`` of those lights at the end of each half second.
+        shown: ``SignalClass`` of those lights at the end of each half second, or
+            ``REMEMBERED`` ones.
         follows: Whether the road token before it is its predecessor on the same line.
         picked: Whether it is hidden where road tokens are predicted.
     """
@@ -223,17 +226,20 @@ def collate_roads(
     Args:
         records: The scenes.
         max_roads: Road tokens of each.
-        lights: What the lights of each show, if that is known for longer than the record.
+        lights: What the lights of each show, if that is known for longer than the record;
+            afterwards they are remembered as they were last.
     """
     maps = []
     for at, record in enumerate(records):
         window = cut_window(record, 0, record.num_tokens, record.num_agents, max_roads)
         token = record.road_token[window.roads]
         arrays = _roads(window, token, np.zeros(len(token), dtype=bool))
-        known = lights[at] if lights else None
-        if known is not None:
-            line = record.road_line[window.roads]
-            arrays |= {"light": _lights(line, known.line), "shown": known.shown}
+        known = (lights[at] if lights else None) or Lights(
+            record.signal_line, record.signal_state
+        )
+        tokens = known.shown.shape[1]
+        arrays["light"] = _lights(record.road_line[window.roads], known.line)
+        arrays["shown"] = remember(known.shown, tokens, tokens + 1)
         maps.append(arrays)
     return _last_shown(pad(maps, Roads), maps)
 
@@ -266,6 +272,8 @@ def _scene(
     window = cut_window(record, start, limits.tokens, limits.agents, limits.roads)
     if noise and noise.moves:
         window = disturb(window, noise, grid, chance)
+    if _keyed(f"lights/{draw}/{record.scenario_id}").random() < FORGOTTEN_SHARE:
+        window = look_away(window, record.now + 1)
     turn = _turns(window)
     entries = _entries(window, turn, limits.entries)
     details = _details(window, entries, grid, random)

@@ -14,6 +14,7 @@ from infgen.model.sight import Around, Lamps, Reach, RoadFeatures
 from infgen.tokens.codebook import RoadCodebook
 from infgen.tokens.roads import LineKind, PointKind
 from infgen.tokens.scene_tokens import SignalClass
+from infgen.tokens.signals import REMEMBERED
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,8 @@ class RoadEncoder(nn.Module):
         self.curve = embedding_mlp(codebook.curve_m[0].size, width)
         self.point_kind = nn.Embedding(len(PointKind), width)
         self.line_kind = nn.Embedding(len(LineKind), width)
-        self.signal = nn.Embedding(len(SignalClass), width)
+        looks = len(SignalClass) + (REMEMBERED if self.step_lights else 0)
+        self.signal = nn.Embedding(looks, width)
         self.relation = relation_embedding(self.radius_m, settings.fourier_bands, width)
         self.blocks = nn.ModuleList(
             Attention(width, settings.heads, settings.dropout, bipartite=False)

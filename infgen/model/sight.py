@@ -127,8 +127,8 @@ class Lamps:
     Attributes:
         first: Row of the first class of each road token's looks [row].
         light: Its light, counted from 1; 0 for none [scene, road].
-        shown: ``SignalClass`` of those by the half second; the last one lasts
-            [scene, light, token].
+        shown: ``SignalClass`` of those by the half second, ``REMEMBERED`` or not; the last
+            one lasts [scene, light, token].
     """
 
     first: Tensor

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float32, Int8, Int16, Int64, UInt8
 from infgen.tokens.grid import Grid, encode_cell, to_grid
 from infgen.tokens.noise import Noise, lead_astray
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, Presence, SceneTokens
+from infgen.tokens.signals import remember
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +22,8 @@ class SceneWindow:
         record: The whole scene.
         label: The move to learn for each token: ``move`` until agents are led astray.
         roads: Rows of the record's road tokens that are kept, ascending.
-        shown: ``SignalClass`` of each of the record's lights at each token's end.
+        shown: ``SignalClass`` of each of the record's lights at each token's end, or what
+            it showed when it was last looked at, ``REMEMBERED``.
         kind, size_lwh_m, near, pose, move, presence, observed, pattern, cell: As in the
             record.
         entry_row: Row of each newcomer whose agent is kept ...
@@ -107,6 +109,12 @@ def disturb(
         cell=cell,
         entry_cell=cell[window.entry_row, window.entry_token],
     )
+
+
+def look_away(window: SceneWindow, known: int) -> SceneWindow:
+    """Let nobody look at traffic lights after the first ``known`` half seconds."""
+    tokens = window.shown.shape[1]
+    return replace(window, shown=remember(window.shown, min(known, tokens), tokens))
 
 
 def _begin_at(

@@ -21,6 +21,9 @@ _CLASS_OF = {
 }
 _CLASSES = np.array([_CLASS_OF[state] for state in SignalState], dtype=np.int8)
 
+REMEMBERED = len(SignalClass)
+"""Added to the class of a light that nobody has looked at since: it may have changed."""
+
 
 def merge_states(state: Int8[np.ndarray, " signal"]) -> Int8[np.ndarray, " signal"]:
     """Give each ``SignalState`` its ``SignalClass``; an unheard-of state is unknown."""
@@ -53,6 +56,20 @@ def signals_at(
     )
     shown[lane[rows], column[rows]] = merge_states(signals.state[rows])
     return shown
+
+
+def remember(
+    shown: Int8[np.ndarray, "light token"], known: int, tokens: int
+) -> Int8[np.ndarray, "light all_tokens"]:
+    """Return what lights show while they are looked at, then what they showed last.
+
+    Args:
+        shown: ``SignalClass`` of each at the end of each half second.
+        known: Half seconds in which they are looked at, at least one.
+        tokens: Half seconds to tell of; from ``known`` on, classes are ``REMEMBERED``.
+    """
+    seen, last = shown[:, :known], shown[:, known - 1 : known] + np.int8(REMEMBERED)
+    return np.concatenate([seen, np.repeat(last, tokens - known, axis=1)], axis=1)
 
 
 class Lights(NamedTuple):

@@ -14,6 +14,7 @@ from infgen.tokens.grid import decode_cell, encode_cell, from_grid, make_grid, t
 from infgen.tokens.moves import advance, make_move_table, nearest_moves
 from infgen.tokens.noise import make_noise
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_MOVE, Presence
+from infgen.tokens.signals import REMEMBERED
 
 
 def parts(batch):
@@ -401,6 +402,32 @@ def test_maps_alone_are_whole_and_hide_nothing(record):
 
     assert roads.real.sum(dim=1).tolist() == [7, 5]
     assert not roads.picked.any()
+
+
+def test_lights_of_maps_alone_are_seen_as_long_as_they_are_known_then_remembered(record):
+    scenes = [record(0, tokens=7), record(1, tokens=9)]
+
+    shown = collate_roads(scenes, 100).shown.numpy()
+
+    for at, scene in enumerate(scenes):
+        state = scene.signal_state
+        lights, tokens = state.shape
+        assert lights
+        np.testing.assert_array_equal(shown[at, :lights, :tokens], state)
+        assert (state[:, -1] + REMEMBERED == shown[at, :lights, tokens:].T).all()
+
+
+def test_in_half_of_the_scenes_nobody_looks_at_lights_after_the_history(record, limits):
+    scene = record(1)
+    state, now = scene.signal_state, scene.now
+
+    batches = [collate([scene], limits, draw).roads.shown[0].numpy() for draw in range(40)]
+
+    looked = [np.array_equal(shown, state) for shown in batches]
+    assert 12 < sum(looked) < 28
+    for shown in (shown for shown, seen in zip(batches, looked, strict=True) if not seen):
+        np.testing.assert_array_equal(shown[:, : now + 1], state[:, : now + 1])
+        assert (state[:, now] + REMEMBERED == shown[:, now + 1 :].T).all()
 
 
 def test_batches_move_whole(record, limits):

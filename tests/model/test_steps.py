@@ -52,7 +52,8 @@ def play(network, batch, records):
     stepper = Stepper(network)
     scenes = len(records)
     rows = batch.agents.kind.shape[1]
-    memory = stepper.begin(collate_roads(records, 10_000), torch.arange(scenes), rows)
+    maps = replace(collate_roads(records, 10_000), shown=batch.roads.shown)
+    memory = stepper.begin(maps, torch.arange(scenes), rows)
     motion, queries, details = [], {}, {}
     slots, by_cell = batch.entries.agent.shape[2], network.settings.cell_token
     for token in range(batch.agents.pose.shape[1]):

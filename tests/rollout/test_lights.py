@@ -81,6 +81,16 @@ def test_without_a_word_lights_stay_as_they_were_last(lit, play):
         torch.testing.assert_close(a, b)
 
 
+def test_a_light_nobody_looks_at_any_more_looks_like_no_light_that_is_seen(lit, play):
+    kept = read_lights(lit)
+    held = Lights(kept.line, np.repeat(kept.shown[:, 1:2], kept.shown.shape[1], axis=1))
+
+    one, other = play(lit, held), play(lit, None)
+
+    for token, (a, b) in enumerate(zip(one, other, strict=True), start=1):
+        assert torch.equal(a, b) == (token < 2)
+
+
 def test_weights_that_do_not_see_lights_change_are_not_told(lit, play):
     lights = read_lights(lit)
 

@@ -3,7 +3,13 @@ import pytest
 
 from infgen.scene import SignalState
 from infgen.tokens.scene_tokens import SignalClass
-from infgen.tokens.signals import merge_states, signal_lines, signals_at
+from infgen.tokens.signals import (
+    REMEMBERED,
+    merge_states,
+    remember,
+    signal_lines,
+    signals_at,
+)
 
 
 @pytest.mark.parametrize("state", SignalState)
@@ -64,3 +70,12 @@ def test_lines_with_a_light_are_listed_once_and_only_until_a_step(build_signals)
     assert lines.tolist() == [0, 2]
     assert lanes.tolist() == [70, 80]
     assert early.tolist() == [0]
+
+
+def test_a_light_that_is_looked_at_no_more_is_remembered_as_it_was_last():
+    shown = np.array([[0, 1, 2, 3], [4, 0, 0, 1]], np.int8)
+
+    assert remember(shown, 2, 5).tolist() == [[0, 1, 6, 6, 6], [4, 0, 5, 5, 5]]
+    np.testing.assert_array_equal(remember(shown, 4, 4), shown)
+    assert remember(shown, 2, 5).dtype == np.int8
+    assert len(SignalClass) == REMEMBERED
