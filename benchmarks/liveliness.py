@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from infgen.clock import CLOCK
-from infgen.config import TokenSettings
+from infgen.config import TokenSettings, build
 from infgen.metrics.binned import edges_of
 from infgen.metrics.kinematics import speed, speed_valid
 from infgen.metrics.placement import count_per_token
@@ -33,6 +33,7 @@ from infgen.metrics.traffic import Traffic, from_log, from_rollout
 from infgen.scene import AgentKind
 from infgen.tokens.tracks import TokensError
 from pipeline.logs import open_logs, unit_folders
+from pipeline.manifest import read_manifest
 from pipeline.rollout import read_rollouts
 from pipeline.screen import show_table
 
@@ -115,7 +116,7 @@ def take(side: Side, traffic: Traffic, edges: RoadEdges | None, look: Look) -> N
             row, step = np.nonzero(those[rows, some])
             side.add(name, at_s[::STEPS_PER_S][step], off[row, step], look.span_s)
     _take_events(side, traffic, len(steps), look)
-    _take_newcomers(side, traffic, edges, speed_mps, known)
+    _take_newcomers(side, traffic, edges, speed_mps, known, near)
 
 
 def _take_events(side: Side, traffic: Traffic, num_steps: int, look: Look) -> None:
@@ -136,14 +137,15 @@ def _take_newcomers(
     edges: RoadEdges | None,
     speed_mps: np.ndarray,
     known: np.ndarray,
+    near: np.ndarray,
 ) -> None:
-    """Measure who comes after now, and is seen for a second at least."""
-    valid, now = traffic.motion.valid[0], traffic.now
-    first = valid.argmax(axis=1)
-    rows = np.flatnonzero(valid.any(axis=1) & (first > now))
-    rows = rows[first[rows] + STEPS_PER_S < valid.shape[1]]
+    """Measure who comes after now, from when it is near; whoever is seen for a second."""
+    late = traffic.motion.valid[0].argmax(axis=1) > traffic.now
+    first = near.argmax(axis=1)
+    rows = np.flatnonzero(near.any(axis=1) & late)
+    rows = rows[first[rows] + STEPS_PER_S < near.shape[1]]
     second = first[rows, None] + np.arange(1, STEPS_PER_S)
-    there = known[rows[:, None], second]
+    there = (near & known)[rows[:, None], second]
     mps = np.where(there, speed_mps[rows[:, None], second], 0.0).sum(axis=1)
     seen = there.any(axis=1)
     side.first_mps.append((mps / np.maximum(there.sum(axis=1), 1))[seen].astype(float))
@@ -174,6 +176,7 @@ def measure(root: Path, look: Look) -> tuple[Side, Side]:
         FileNotFoundError: if there are none.
     """
     logs = open_logs([str((root / "latest" / "ingest").resolve())])
+    tokens = _tokens_of(root / "latest" / "tokenize")
     units = unit_folders(root / "latest" / "rollout") or []
     rollouts = (one for unit in units for one in read_rollouts(unit))
     sides: list[Side] = []
@@ -185,7 +188,7 @@ def measure(root: Path, look: Look) -> tuple[Side, Side]:
             spans = max(1, round(steps * CLOCK.step_s / look.span_s))
             sides = [_empty(spans), _empty(spans)]
         try:
-            take(sides[0], from_log(scene, TokenSettings()), edges, look)
+            take(sides[0], from_log(scene, tokens), edges, look)
         except TokensError as error:
             print(f"<!-- no log of {scenario_id}: {error} -->")
         for traffic in played:
@@ -193,6 +196,14 @@ def measure(root: Path, look: Look) -> tuple[Side, Side]:
     if not sides:
         raise FileNotFoundError(f"{root} has no rollouts")
     return sides[0], sides[1]
+
+
+def _tokens_of(folder: Path) -> TokenSettings:
+    """Settings of a root's tokens: who enters a log, and when, hangs on them."""
+    if not folder.exists():
+        return TokenSettings()
+    values = read_manifest(folder)["settings"]["tokenize"]
+    return build(TokenSettings, values, "tokenize")
 
 
 def _empty(spans: int) -> Side:

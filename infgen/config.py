@@ -36,6 +36,10 @@ class TokenSettings:
     Attributes:
         max_gap_s: Longer gaps in a track are kept as gaps; shorter ones are filled.
         max_distance_m: An agent farther from the ego is not observed.
+        enter_distance_m: Who comes after the history is not observed before it has been
+            within it of the ego, and enters there; 0 for wherever it is first seen, as in
+            the paper. A simulation can put newcomers into the grid only: it never has
+            those who come from beyond, and whoever learns with them misses them.
         near_distance_m: Agents never within it get no motion loss.
         grid_radius_m: Radius of the ego's grid of cells.
         grid_step_m: Spacing of its cells.
@@ -45,6 +49,7 @@ class TokenSettings:
 
     max_gap_s: float = 1.0
     max_distance_m: float = 150.0
+    enter_distance_m: float = 0.0
     near_distance_m: float = 100.0
     grid_radius_m: float = 75.0
     grid_step_m: float = 3.0

@@ -102,6 +102,10 @@ def read_paths(
     away_m = filled.xyz_m[..., :2] - filled.xyz_m[ego, :, :2]
     distance_m = np.hypot(away_m[..., 0], away_m[..., 1])  # [agent, step]
     known = filled.valid & filled.valid[ego] & (distance_m < settings.max_distance_m)
+    if settings.enter_distance_m > 0:
+        arrived = known & (distance_m < settings.enter_distance_m)
+        arrived[:, scene.now] |= known[:, scene.now]
+        known &= np.logical_or.accumulate(arrived, axis=1) | known[:, [scene.now]]
     near = (known & (distance_m < settings.near_distance_m)).any(axis=1)
 
     pose, valid = _at_borders(filled, known, scene.now, tokens, clock)

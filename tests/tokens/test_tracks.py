@@ -125,6 +125,33 @@ def test_agents_are_cut_where_they_are_too_far_from_the_ego(build_scene):
     )
 
 
+@pytest.mark.parametrize(
+    ("span", "enters_m", "expected"),
+    [
+        ((20, 91), 0.0, range(4, 18)),  # Where it is first seen, 80 m away.
+        ((20, 91), 40.0, range(12, 18)),  # It comes within 40 m at step 61.
+        ((0, 91), 40.0, range(18)),  # It is there now, however far.
+        ((20, 60), 40.0, ()),  # It never comes near.
+    ],
+)
+def test_who_comes_from_beyond_is_observed_from_within_on(
+    build_scene, span, enters_m, expected
+):
+    valid = np.stack([np.ones(91, bool), shown(91, span)])
+    path = np.stack([line(velocity_mps=(0, 0)), line((100, 0), (-9.99, 0))])
+    settings = dataclasses.replace(SETTINGS, enter_distance_m=enters_m)
+
+    assert tokens_of(build_scene(path, [CAR, CAR], valid), settings) == list(expected)
+
+
+def test_who_has_come_near_is_observed_however_far_it_then_goes(build_scene):
+    valid = np.stack([np.ones(91, bool), shown(91, (20, 91))])
+    path = np.stack([line(velocity_mps=(0, 0)), line((10, 0), (10, 0))])
+    settings = dataclasses.replace(SETTINGS, enter_distance_m=40.0)
+
+    assert tokens_of(build_scene(path, [CAR, CAR], valid), settings) == list(range(4, 18))
+
+
 def test_an_agent_that_is_never_near_is_told_apart(build_scene):
     path = np.stack([line(), line((0, 99)), line((0, 101))])
 
