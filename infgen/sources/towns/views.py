@@ -13,6 +13,9 @@ START_EVERY = 20
 FROM_RIM_M = 125.0
 """The recording car keeps so far away from where streets end."""
 LONGEST_EGO_M = 5.6
+DRIVE_STEPS = 311
+"""Cars are chosen by how far they go in so many steps at least. Chosen by nine seconds,
+hardly one would stand: short recordings are to be as parts of long ones are."""
 STANDING_M = 2.0
 """A car that stands all the time is chosen as if it went so far."""
 BUSY_M, BUSY_MPS = 60.0, 3.0
@@ -32,16 +35,17 @@ def draw_views(
 ) -> list[View]:
     """Draw views, no two of one car at one time; fewer if the town has not so many.
 
-    A car is drawn the more likely the farther it goes.
+    A car is drawn the more likely the farther it goes, then and in the seconds after it.
     """
     able = _able(town)
-    starts = np.arange(0, town.num_steps - num_steps + 1, START_EVERY)
+    drive = max(num_steps, min(DRIVE_STEPS, town.num_steps - num_steps))
+    starts = np.arange(0, town.num_steps - drive + 1, START_EVERY)
     lasting = np.stack(
         [able[:, start : start + num_steps].all(axis=1) for start in starts], axis=1
     )
     speed_mps = np.linalg.norm(town.bodies.velocity_mps, axis=-1)
     far_m = np.pad(np.cumsum(speed_mps, axis=1), ((0, 0), (1, 0))) * CLOCK.step_s
-    way_m = far_m[:, starts + num_steps - 1] - far_m[:, starts]
+    way_m = far_m[:, starts + drive - 1] - far_m[:, starts]
     busy = 1 + _moving_near(town, starts + num_steps // 2, speed_mps)
     weight = np.where(lasting, (STANDING_M + way_m) * busy, 0.0)
     views: list[View] = []
