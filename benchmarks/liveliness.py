@@ -7,8 +7,8 @@ Reads the logs and the rollouts of a root, however long they are::
 The first table has the rollouts, span by span, beside the logs as far as they go: agents
 around the ego, its speed and that of vehicles, the share of vehicles that are off the road
 (most are parked there), that of those that drive, entries and exits per half second. The
-second has who comes after now: speed in the first second, and whether vehicles begin off
-the road. The last line is one JSON object.
+second has who comes after now, from when it is near: speed in the first second, and whether
+vehicles begin off the road. The last line is one JSON object.
 """
 
 import argparse

@@ -1,5 +1,7 @@
 """From a town and its traffic to a scene: a town made by hand around a crossing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -75,6 +77,18 @@ def long_arms(town):
 def test_the_car_that_moves_records(views):
     assert views[0].ego == 0
     assert views[0].start % 20 == 0
+
+
+def test_who_sets_off_later_is_chosen_while_it_still_stands(town):
+    velocity_mps = np.zeros((2, STEPS, 2))
+    velocity_mps[1, 60:, 0] = 10.0
+    waits = replace(town, bodies=replace(town.bodies, velocity_mps=velocity_mps))
+
+    drawn = [draw_views(waits, 1, 40, np.random.default_rng(at))[0] for at in range(200)]
+
+    # By the way it goes while it is recorded, one in a hundred.
+    assert 0.05 < np.mean([view == View(1, 0) for view in drawn]) < 0.2
+    assert np.mean([view.ego == 0 for view in drawn]) < 0.1
 
 
 def test_no_two_views_are_of_one_car_at_one_time(town):
