@@ -172,8 +172,9 @@ def _signed_m(points_m, start_m, way_m):
 
 
 def test_vehicles_hardly_ever_overlap(scenes):
-    # Some cut a corner past who waits there, as recorders often do.
-    shares = []
+    # Some touch one that stands, and are counted as long as it does: of the first 100 of
+    # `infgen towns --scenes 2000` 0.09 %, of these few more.
+    shares, driving = [], []
     for scene in scenes:
         tracks = scene.tracks
         cars = np.flatnonzero(tracks.kind == AgentKind.VEHICLE)
@@ -183,8 +184,12 @@ def test_vehicles_hardly_ever_overlap(scenes):
                 [tracks.xyz_m[rows, step, :2], tracks.heading_rad[rows, step]]
             )
             corners_m = box_corners(pose, 0.97 * tracks.size_lwh_m[rows, step, :2])
-            shares += _overlaps(corners_m).any(axis=1).tolist()
+            overlaps = _overlaps(corners_m)
+            shares += overlaps.any(axis=1).tolist()
+            drives = np.linalg.norm(tracks.velocity_mps[rows, step], axis=-1) > 1.0
+            driving += overlaps[drives][:, drives].any(axis=1).tolist()
     assert np.mean(shares) < 0.005
+    assert np.mean(driving) < 0.001
 
 
 def _overlaps(corners_m):
