@@ -162,7 +162,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=3,
+    version=4,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,

@@ -15,29 +15,31 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int16, Int64, Integer
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
-from infgen.model.padding import NOBODY, Arrays, pad
+from infgen.model.newcomers import detail_arrays, entry_arrays, turns_of
+from infgen.model.padding import Arrays, pad
 from infgen.model.tensors import map_tensors
-from infgen.model.window import SceneWindow, cut_window, disturb, look_away
-from infgen.tokens.grid import Grid, encode_heading, make_grid, to_grid
+from infgen.model.window import SceneWindow, cut_window, disturb, hide_far, look_away
+from infgen.tokens.grid import make_grid
 from infgen.tokens.noise import Noise, exchange_roads
-from infgen.tokens.scene_tokens import NO_CELL, Presence, SceneTokens
+from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.signals import Lights, remember
 
 T = TypeVar("T")
 
-OUTSIDE = 1 << 15
-"""Turn of a newcomer that is in no cell: no query may see it yet."""
 PICKED_SHARE = 0.15
 """Share of road tokens that are hidden to be predicted: few, as everyone else does without
 them in the same pass."""
 FORGOTTEN_SHARE = 0.5
 """Share of scenes in which nobody looks at traffic lights after the history."""
-PSEUDO_PER_TOKEN = 2
-"""Agents per half second that play newcomers, to learn headings and offsets from."""
+BARE_RIM_SHARE = 0.5
+"""Share of scenes in which nobody from beyond the rim is there from the beginning, as in a
+rollout after its first seconds."""
+LEFT_TOKENS = 2
+"""Who is not seen for so many half seconds has left: at a log's end one cannot tell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +60,7 @@ class Agents:
         cell: Cell of the ego's grid, or ``NO_CELL``.
         turn: Of an agent that enters at this token, its turn among those that do; -1 for
             all others, ``OUTSIDE`` for who enters outside the grid.
+        told: Whether the log goes on for long enough to tell who leaves at this token.
     """
 
     kind: Int64[Tensor, "scene agent"]
@@ -71,6 +74,7 @@ class Agents:
     pattern: Int64[Tensor, "scene token agent"]
     cell: Int64[Tensor, "scene token agent"]
     turn: Int64[Tensor, "scene token agent"]
+    told: Bool[Tensor, "scene token"]
 
     @property
     def visible(self) -> Bool[Tensor, "scene token agent"]:
@@ -113,7 +117,8 @@ class Entries:
     """Who enters when.
 
     Attributes:
-        asked: Whether newcomers are asked for at this token (never at the first).
+        asked: Whether newcomers are asked for at this token (never at the first, nor at
+            the last of a log).
         count: Newcomers within the grid at this token, also those beyond the last slot.
         agent: The newcomer of each turn, or ``NOBODY``.
         cell: Its cell; 0 where there is nobody.
@@ -244,17 +249,6 @@ def collate_roads(
     return _last_shown(pad(maps, Roads), maps)
 
 
-def describe(
-    pose: Float32[np.ndarray, "*batch 3"],
-    ego_pose: Float32[np.ndarray, "*batch 3"],
-    cell: Integer[np.ndarray, "*batch"],
-    grid: Grid,
-) -> tuple[Int16[np.ndarray, "*batch"], Float32[np.ndarray, "*batch 2"]]:
-    """Return heading bins and offsets within their cells of agents beside egos."""
-    heading = encode_heading(pose[..., 2] - ego_pose[..., 2], grid)
-    return heading, to_grid(pose[..., :2], ego_pose) - grid.centre_m[cell]
-
-
 def to_device(batch: T, device: torch.device) -> T:
     """Move every tensor of a batch, or of a part of one."""
     return map_tensors(batch, lambda x: x.to(device))
@@ -270,13 +264,15 @@ def _scene(
     spare = max(0, record.num_tokens - limits.tokens)
     start = int(random.integers(spare + 1))
     window = cut_window(record, start, limits.tokens, limits.agents, limits.roads)
+    if _keyed(f"rim/{draw}/{record.scenario_id}").random() < BARE_RIM_SHARE:
+        window = hide_far(window, limits.grid, record.now + 1 - start)
     if noise and noise.moves:
         window = disturb(window, noise, grid, chance)
     if _keyed(f"lights/{draw}/{record.scenario_id}").random() < FORGOTTEN_SHARE:
         window = look_away(window, record.now + 1)
-    turn = _turns(window)
-    entries = _entries(window, turn, limits.entries)
-    details = _details(window, entries, grid, random)
+    turn = turns_of(window)
+    entries = entry_arrays(window, turn, limits.entries)
+    details = detail_arrays(window, entries, grid, random)
     picked = random.random(len(window.roads)) < PICKED_SHARE
     token = record.road_token[window.roads]
     if noise:
@@ -303,6 +299,7 @@ def _agents(window: SceneWindow, turn: np.ndarray) -> Arrays:
         "pattern": window.pattern.T,
         "cell": window.cell.T,
         "turn": turn.T,
+        "told": np.arange(len(turn.T)) + LEFT_TOKENS < len(turn.T) + window.after,
     }
 
 
@@ -340,60 +337,3 @@ def _lights(line: np.ndarray, signal_line: np.ndarray) -> np.ndarray:
         return np.zeros(len(line), dtype=np.int64)
     at = np.minimum(np.searchsorted(signal_line, line), len(signal_line) - 1)
     return np.where(signal_line[at] == line, at + 1, 0)
-
-
-def _turns(window: SceneWindow) -> np.ndarray:
-    """Turn of every agent among the newcomers of its token [agent, token]."""
-    turn = np.full(window.presence.shape, -1, dtype=np.int64)
-    turn[window.presence == Presence.ENTERING] = OUTSIDE
-    turn[0] = -1  # The ego is always there to be seen.
-    inside = (window.entry_cell != NO_CELL) & (window.entry_row > 0)
-    row, token = window.entry_row[inside], window.entry_token[inside]
-    first = np.searchsorted(token, token)  # Tokens ascend: first newcomer of each.
-    turn[row, token] = np.arange(len(token)) - first
-    return turn
-
-
-def _entries(window: SceneWindow, turn: np.ndarray, limit: int) -> Arrays:
-    tokens = turn.shape[1]
-    inside = (turn >= 0) & (turn < OUTSIDE)
-    asked = np.arange(tokens) > 0
-    count = inside.sum(axis=0)
-    slots = 1 + min(limit, int(count[1:].max(initial=0)))
-    agent = np.full((tokens, slots), NOBODY, dtype=np.int64)
-    row, token = np.nonzero(inside & (turn < slots) & asked)
-    agent[token, turn[row, token]] = row
-    cell = np.where(agent >= 0, window.cell[agent, np.arange(tokens)[:, None]], 0)
-    return {"asked": asked, "count": count, "agent": agent, "cell": cell}
-
-
-def _details(
-    window: SceneWindow, entries: Arrays, grid: Grid, random: np.random.Generator
-) -> Arrays:
-    """Newcomers in order, then agents that are there already and play the part."""
-    token, turn = np.nonzero(entries["agent"] >= 0)
-    row = entries["agent"][token, turn]
-    there = (window.presence == Presence.PRESENT) & window.observed
-    there &= window.cell != NO_CELL
-    there[0], there[:, 0] = False, False
-    players = np.argwhere(there)  # [player, (agent, token)]
-    few = min(len(players), PSEUDO_PER_TOKEN * (there.shape[1] - 1))
-    players = players[np.sort(random.permutation(len(players))[:few])]
-
-    rows = np.concatenate([row, players[:, 0]])
-    tokens = np.concatenate([token, players[:, 1]])
-    pose, ego_pose = window.pose[rows, tokens], window.pose[0, tokens]
-    cell = window.cell[rows, tokens]
-    heading, offset_m = describe(pose, ego_pose, cell, grid)
-    return {
-        "present": np.ones(len(rows), dtype=bool),
-        "newcomer": np.arange(len(rows)) < len(row),
-        "agent": rows,
-        "token": tokens,
-        "turn": np.concatenate([turn, np.zeros(few, dtype=np.int64)]),
-        "cell": cell,
-        "kind": window.kind[rows],
-        "size_lwh_m": window.size_lwh_m[rows],
-        "heading": heading,
-        "offset_m": offset_m,
-    }

@@ -13,10 +13,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from infgen.model.batch import Agents, Batch, Details, Entries, describe
+from infgen.model.batch import Agents, Batch, Details, Entries
 from infgen.model.columns import Column
 from infgen.model.matching import MoveEnds, nearest, nearest_of, to_local, to_world
 from infgen.model.network import EGO, Network
+from infgen.model.newcomers import describe
 from infgen.model.steps import Stepper
 from infgen.tokens.grid import Grid, encode_cell, to_grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence

@@ -131,9 +131,9 @@ def stay_mask(agents: Agents) -> Tensor:
     """Tell which tokens [scene, token, agent] decide between staying and leaving.
 
     All from entering to the last but one at which the agent is seen. Not the ego: it never
-    leaves.
+    leaves. Nor at a log's end, where who is lost for a moment does not come back.
     """
-    mask = pattern_mask(agents)
+    mask = pattern_mask(agents) & _next(agents.told, False)[..., None]
     mask[:, :, EGO] = False
     return mask
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int16, Int64, UInt8
 
+from infgen.config import TokenSettings
+from infgen.tokens.entries import entry_key
 from infgen.tokens.grid import Grid, encode_cell, to_grid
 from infgen.tokens.noise import Noise, lead_astray
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, Presence, SceneTokens
@@ -20,6 +22,7 @@ class SceneWindow:
 
     Attributes:
         record: The whole scene.
+        after: Half seconds that the log goes on for afterwards.
         label: The move to learn for each token: ``move`` until agents are led astray.
         roads: Rows of the record's road tokens that are kept, ascending.
         shown: ``SignalClass`` of each of the record's lights at each token's end, or what
@@ -32,6 +35,7 @@ class SceneWindow:
     """
 
     record: SceneTokens
+    after: int
     roads: Int64[np.ndarray, " road"]
     shown: Int8[np.ndarray, "light token"]
     kind: Int8[np.ndarray, " agent"]
@@ -67,6 +71,7 @@ def cut_window(
     kept &= entry_token < stop - start
     return SceneWindow(
         record=record,
+        after=record.num_tokens - stop,
         roads=roads,
         shown=record.signal_state[:, start:stop],
         kind=record.kind[rows],
@@ -111,6 +116,43 @@ def disturb(
     )
 
 
+def hide_far(window: SceneWindow, settings: TokenSettings, known: int) -> SceneWindow:
+    """Let who is beyond ``enter_distance_m`` at first not be there before it comes within.
+
+    It then enters, as who comes later does already; who never comes never is.
+
+    Args:
+        window: What is known.
+        settings: The distance (0: nobody is hidden), and the order of newcomers.
+        known: Half seconds of the history.
+    """
+    if not settings.enter_distance_m or known < 1:
+        return window
+    away_m = window.pose[..., :2] - window.pose[0, :, :2]
+    visible = window.observed | (window.presence == Presence.ENTERING)
+    inside = np.hypot(away_m[..., 0], away_m[..., 1]) < settings.enter_distance_m
+    inside &= visible
+    born = visible.argmax(axis=1)
+    # Who is there as the history ends is seen from the half second after it on at latest.
+    far = (born <= known) & ~inside[np.arange(len(inside)), born]
+    far[0] = False
+
+    came = np.zeros_like(inside)
+    came[:, 1:] = np.logical_or.accumulate(inside, axis=1)[:, :-1]
+    presence, observed, move = _enter_late(
+        (window.presence, window.observed, window.move), far, window.observed & came
+    )
+    changed = replace(
+        window,
+        presence=presence,
+        observed=observed,
+        move=move,
+        label=move,
+        pattern=np.where(presence == Presence.ABSENT, np.uint8(0), window.pattern),
+    )
+    return _with_entries(changed, far, settings.entry_order)
+
+
 def look_away(window: SceneWindow, known: int) -> SceneWindow:
     """Let nobody look at traffic lights after the first ``known`` half seconds."""
     tokens = window.shown.shape[1]
@@ -125,23 +167,48 @@ def _begin_at(
     Who is not observed then enters when it is next observed. Who leaves at the first token
     has no second one and is dropped.
     """
-    presence = record.presence[:, start:stop].copy()
-    observed = record.observed[:, start:stop].copy()
-    move = record.move[:, start:stop].copy()
+    presence = record.presence[:, start:stop]
+    observed = record.observed[:, start:stop]
+    move = record.move[:, start:stop]
     if start == 0:
         return presence, observed, move
-    columns = np.arange(presence.shape[1])
     before = record.presence[:, start - 1]
     running = np.isin(before, (Presence.PRESENT, Presence.ENTERING))
-    first = np.where(observed.any(axis=1), observed.argmax(axis=1), len(columns))
-    leaves = presence[np.arange(len(first)), first.clip(max=len(columns) - 1)]
-    gone = running & ((first == len(columns)) | (leaves == Presence.LEAVING))
+    return _enter_late((presence, observed, move), running, observed)
 
-    unseen = running[:, None] & (columns < first[:, None]) | gone[:, None]
+
+def _enter_late(
+    life: tuple[np.ndarray, np.ndarray, np.ndarray], who: np.ndarray, able: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Presence, observed and move of agents of whom some enter as soon as they are able.
+
+    Who never is, or is to leave then, is not there at all: it would have no second token.
+    """
+    presence, observed, move = (values.copy() for values in life)
+    columns = np.arange(presence.shape[1])
+    first = np.where(able.any(axis=1), able.argmax(axis=1), len(columns))
+    leaves = presence[np.arange(len(first)), first.clip(max=len(columns) - 1)]
+    gone = who & ((first == len(columns)) | (leaves == Presence.LEAVING))
+
+    unseen = who[:, None] & (columns < first[:, None]) | gone[:, None]
     presence[unseen], observed[unseen] = Presence.ABSENT, False
-    enters = running[:, None] & ~gone[:, None] & (columns == first[:, None])
+    enters = (who & ~gone)[:, None] & (columns == first[:, None])
     presence[enters], observed[enters], move[enters] = Presence.ENTERING, False, FIRST_MOVE
     return presence, observed, move
+
+
+def _with_entries(window: SceneWindow, who: np.ndarray, order: str) -> SceneWindow:
+    """List the entries of some agents anew, among those of all others."""
+    row, token = np.nonzero((window.presence == Presence.ENTERING) & who[:, None])
+    kept = ~who[window.entry_row]
+    row = np.concatenate([window.entry_row[kept], row])
+    token = np.concatenate([window.entry_token[kept], token])
+    key = entry_key(window.pose[row, token], window.pose[0, token], order)
+    sorted_ = np.lexsort((key, token))
+    row, token = row[sorted_], token[sorted_]
+    return replace(
+        window, entry_row=row, entry_token=token, entry_cell=window.cell[row, token]
+    )
 
 
 def _nearest_agents(pose: np.ndarray, visible: np.ndarray, ego: int) -> np.ndarray:

@@ -89,7 +89,16 @@ def decode_entries(
 def entry_order(
     pose: Float32[np.ndarray, "entry 3"], ego_pose: Float32[np.ndarray, "3"], order: str
 ) -> Int64[np.ndarray, " entry"]:
-    """Order newcomers of one token.
+    """Order newcomers of one token by their ``entry_key``."""
+    return np.argsort(entry_key(pose, ego_pose, order), kind="stable")
+
+
+def entry_key(
+    pose: Float32[np.ndarray, "entry 3"],
+    ego_pose: Float32[np.ndarray, "*#entry 3"],
+    order: str,
+) -> Float32[np.ndarray, " entry"]:
+    """Return what newcomers of one token are ordered by, ascending.
 
     Args:
         pose: Where they are.
@@ -97,12 +106,10 @@ def entry_order(
         order: ``distance``, near to far, or ``bearing``, from behind over the right, the
             front and the left to behind again.
     """
-    away_m = pose[:, :2] - ego_pose[:2]
+    away_m = pose[:, :2] - ego_pose[..., :2]
     if order == "distance":
-        key = np.hypot(away_m[:, 0], away_m[:, 1])
-    else:
-        key = wrap_angle(np.arctan2(away_m[:, 1], away_m[:, 0]) - ego_pose[2])
-    return np.argsort(key, kind="stable")
+        return np.hypot(away_m[:, 0], away_m[:, 1])
+    return wrap_angle(np.arctan2(away_m[:, 1], away_m[:, 0]) - ego_pose[..., 2])
 
 
 def join_entries(parts: list[Entries]) -> Entries:

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from infgen.config import TrainSettings
-from infgen.model.batch import OUTSIDE, collate, collate_roads, to_device
+from infgen.config import TokenSettings, TrainSettings
+from infgen.model.batch import collate, collate_roads, to_device
+from infgen.model.newcomers import OUTSIDE
 from infgen.model.padding import NOBODY
-from infgen.model.window import cut_window
+from infgen.model.window import cut_window, hide_far
 from infgen.tokens.grid import decode_cell, encode_cell, from_grid, make_grid, to_grid
 from infgen.tokens.moves import advance, make_move_table, nearest_moves
 from infgen.tokens.noise import make_noise
-from infgen.tokens.scene_tokens import FIRST_MOVE, NO_MOVE, Presence
+from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
 from infgen.tokens.signals import REMEMBERED
 
 
@@ -120,7 +121,7 @@ def test_newcomers_take_turns_from_near_to_far(record, limits):
     batch = collate([scene], limits, 0)
 
     entries, agents = batch.entries, batch.agents
-    assert entries.asked[0].tolist() == [False, True, True, True, True]
+    assert entries.asked[0].tolist() == [False, True, True, True, False]
     assert entries.count[0, 1:].tolist() == [0, 2, 1, 0]
     first, second = entries.agent[0, 2, :2].tolist()
     away_m = (agents.pose[0, 2] - agents.pose[0, 2, 0])[:, :2].norm(dim=-1)
@@ -393,6 +394,79 @@ def test_who_is_in_a_gap_when_a_window_begins_enters_after_it(record):
 
     wanted = [Presence.ABSENT] * 2 + [Presence.ENTERING] + [Presence.PRESENT] * 4
     assert part.presence[1].tolist() == wanted
+
+
+@pytest.fixture
+def coming(record):
+    """Window of agents beyond 40 m at first: one nears, one never, one leaves as it does.
+
+    A fourth comes near with the third token, which begins as the history ends.
+    """
+    scene = record(2, tokens=8, lives=[(0, 7), (0, 7), (0, 3), (2, 7)])
+    pose = np.zeros_like(scene.pose)
+    pose[1:, :, 0] = 50.0
+    pose[1:3, :, 1] = np.array([[0.0], [9.0]])
+    pose[[1, 3], 2:, 0] = 30.0
+    pose[4, :, 0] = np.linspace(54.0, 33.0, 8)
+    grid = make_grid(TokenSettings())
+    cell = encode_cell(to_grid(pose[..., :2], pose[:1]), grid)
+    cell = np.where(scene.presence == Presence.ABSENT, NO_CELL, cell)
+    scene = replace(scene, pose=pose, cell=cell.astype(np.int16))
+    return scene, cut_window(scene, 0, 8, 99, 99)
+
+
+def hidden(coming, known=2, enter_m=40.0):
+    scene, part = coming
+    settings = TokenSettings(enter_distance_m=enter_m)
+    part = hide_far(part, settings, known)
+    rows = [row_in(part, scene, row) for row in range(1, len(scene.pose))]
+    return part, rows
+
+
+def test_who_is_beyond_the_rim_at_first_enters_once_it_has_come_within(coming):
+    part, (near, never, leaver, late) = hidden(coming)
+
+    # Within at the end of token 2, so observed within from token 3 on.
+    assert part.presence[near].tolist() == [0, 0, 0, 2, 1, 1, 1, 1]
+    assert part.observed[near].tolist() == [False] * 4 + [True] * 4
+    assert part.move[near, 3] == part.label[near, 3] == FIRST_MOVE
+    assert not part.presence[never].any()
+    assert not part.presence[leaver].any()  # It would enter as it leaves.
+    assert part.presence[late].tolist() == [0] * 6 + [2, 1]
+    assert (part.pattern[part.presence == Presence.ABSENT] == 0).all()
+    assert (part.presence[0] == coming[1].presence[0]).all()
+
+
+def test_entries_are_listed_where_they_now_are(coming):
+    part, (near, _, _, late) = hidden(coming)
+
+    listed = list(zip(part.entry_token.tolist(), part.entry_row.tolist(), strict=True))
+
+    assert listed == [(0, 0), (3, near), (6, late)]
+    np.testing.assert_array_equal(
+        part.entry_cell, part.cell[part.entry_row, part.entry_token]
+    )
+
+
+@pytest.mark.parametrize(("known", "enter_m"), [(2, 0.0), (2, 60.0), (0, 40.0)])
+def test_nobody_is_hidden_without_a_rim_or_within_it_or_after_the_history(
+    coming, known, enter_m
+):
+    part, _ = hidden(coming, known, enter_m)
+
+    for name in ("presence", "observed", "move", "label", "pattern", "entry_row"):
+        np.testing.assert_array_equal(getattr(part, name), getattr(coming[1], name))
+
+
+def test_in_half_of_the_scenes_the_rim_is_bare(coming, limits):
+    rimmed = replace(limits, grid=TokenSettings(enter_distance_m=40.0))
+
+    bare = [
+        not collate([coming[0]], rimmed, draw).agents.visible[0, 0, 1:].any()
+        for draw in range(64)
+    ]
+
+    assert 20 < sum(bare) < 44
 
 
 def test_maps_alone_are_whole_and_hide_nothing(record):

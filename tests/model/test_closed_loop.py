@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from infgen.config import TrainSettings
-from infgen.model.batch import OUTSIDE, collate
+from infgen.model.batch import collate
 from infgen.model.closed_loop import close_loop
 from infgen.model.losses import losses, total
+from infgen.model.newcomers import OUTSIDE
 from infgen.tokens.grid import decode_cell, encode_cell, from_grid, make_grid, to_grid
 from infgen.tokens.moves import advance, follow, make_move_table, nearest_moves
 from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE, Presence

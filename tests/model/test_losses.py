@@ -66,16 +66,36 @@ def test_agents_that_are_never_near_have_no_motion_loss(record, limits):
 @pytest.mark.parametrize(
     ("life", "decided"),
     [
-        ("Epppp", "xxxx."),  # The log ends: that is no exit.
-        ("EppL.", "xxx.."),  # Up to the token before the last, nothing after.
-        ("..EL.", "..x.."),
+        ("Epppp", "xx..."),  # The log ends: who is lost as it does may have come back.
+        ("EppL.", "xx..."),
+        ("EppL..", "xxx..."),  # Up to the token before the last, nothing after.
+        ("..EL..", "..x..."),
         ("EL...", "x...."),
         ("....E", "....."),
-        ("Ep-pL", "xx.x."),  # No decision where the agent is not seen.
+        ("Ep-pL..", "xx.x..."),  # No decision where the agent is not seen.
     ],
 )
 def test_decisions_to_stay_or_leave(record, limits, life, decided):
     assert marks(stay_mask(agents_of(record, limits, life))) == decided
+
+
+@pytest.mark.parametrize(("after", "decided"), [(0, 1), (1, 2), (2, 3), (3, 3)])
+def test_a_part_of_a_log_ends_later_than_it_seems(record, limits, after, decided):
+    scene = record(0, agents=2, tokens=4 + after, lives=[(0, 3 + after)])
+
+    part = _scene_from_its_start(scene, limits, tokens=4)
+
+    assert stay_mask(part.agents)[0, :, 1].sum() == decided
+    assert part.entries.asked[0].tolist() == [False, True, True, after > 0]
+
+
+def _scene_from_its_start(scene, limits, tokens):
+    """Its first tokens alone: which part of a log is taken is up to the draw."""
+    for draw in range(99):
+        part = collate([scene], replace(limits, tokens=tokens), draw)
+        if np.allclose(part.agents.pose[0, :, 0], scene.pose[0, :tokens]):
+            return part
+    raise AssertionError("no draw begins with the log")
 
 
 def test_the_ego_never_decides_to_leave(record, limits):
@@ -94,8 +114,8 @@ def terms_of(network, scenes, limits, settings):
 
 
 def test_add_is_asked_once_per_newcomer_and_begin_once(network, record, limits, settings):
-    # Two newcomers at token 2, none at 1 and 3.
-    scene = record(8, tokens=4, lives=[(0, 3), (2, 3), (2, 3)], spread_m=20.0)
+    # Two newcomers at token 2, none at 1 and 3; at the last token nobody can come.
+    scene = record(8, tokens=5, lives=[(0, 4), (2, 4), (2, 4)], spread_m=20.0)
 
     _, _, terms = terms_of(network, [scene], limits, settings)
 
@@ -107,11 +127,11 @@ def test_add_is_asked_once_per_newcomer_and_begin_once(network, record, limits, 
 
 
 def test_more_newcomers_than_slots_leave_begin_unasked(network, record, limits, settings):
-    scene = record(8, tokens=3, lives=[(1, 2)] * 6, spread_m=20.0)
+    scene = record(8, tokens=4, lives=[(1, 3)] * 6, spread_m=20.0)
 
     batch, _, terms = terms_of(network, [scene], limits, settings)
 
-    assert batch.entries.count.tolist() == [[0, 6, 0]]
+    assert batch.entries.count.tolist() == [[0, 6, 0, 0]]
     assert float(terms["add"].count) == (limits.entries + 1) + 1
     assert float(terms["add"].event) == limits.entries + 1
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from infgen.model.batch import OUTSIDE, collate, collate_roads
+from infgen.model.batch import collate, collate_roads
 from infgen.model.columns import Column
+from infgen.model.newcomers import OUTSIDE
 from infgen.model.sight import grid_place
 from infgen.model.steps import Stepper
 from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE, Presence

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from infgen.model.agents import KINDS
-from infgen.model.batch import OUTSIDE, Agents, Batch, Details, Entries, collate_roads
+from infgen.model.batch import Agents, Batch, Details, Entries, collate_roads
 from infgen.model.columns import Column, EntryDetails, EntryQuery, MotionStep
+from infgen.model.newcomers import OUTSIDE
 from infgen.model.outputs import DetailOutputs, EntryOutputs, MotionOutputs
 from infgen.model.steps import Stepper
 from infgen.rollout.population import settle
@@ -175,6 +176,7 @@ def _agents(played):
         pattern=torch.zeros_like(presence),
         cell=told("cell", NO_CELL),
         turn=_turns(presence, played.now),
+        told=torch.ones(presence.shape[:2], dtype=torch.bool),
     )
 
 

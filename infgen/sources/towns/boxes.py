@@ -31,15 +31,21 @@ def clear_way(
     size_lw_m: Float64[np.ndarray, "body 2"],
 ) -> Boxes:
     """Take away parked cars that stand in the way of somebody, wherever they come by."""
-    cells = np.floor(parked[:, :2] / _CELL_M).astype(np.int64)
-    steps = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
-    taken = np.unique(_numbered(cells[:, None] + steps))
-    by = np.isin(_numbered(np.floor(pose[:, :2] / _CELL_M).astype(np.int64)), taken)
-    bodies = np.column_stack([pose[by], size_lw_m[by], np.zeros(by.sum())])
+    cells = _numbered(np.floor(parked[:, :2] / _CELL_M).astype(np.int64))
+    number = _numbered(np.floor(pose[:, :2] / _CELL_M).astype(np.int64))
+    order = np.argsort(number, kind="stable")
+    number = number[order]
+    # Cells above each other have consecutive numbers: three runs hold all nine around one.
+    columns = cells[:, None] + _MANY * np.array([-1, 0, 1])
+    start = np.searchsorted(number, columns - 1, side="left")
+    stop = np.searchsorted(number, columns + 1, side="right")
     met = np.zeros(len(parked), bool)
     for row, box in enumerate(parked):
-        near = bodies[np.abs(bodies[:, :2] - box[:2]).max(axis=1) < _CELL_M]
-        met[row] = meet(box[None], near).any()
+        runs = [order[slice(*run)] for run in zip(start[row], stop[row], strict=True)]
+        around = np.concatenate(runs)
+        near = around[np.abs(pose[around, :2] - box[:2]).max(axis=1) < _CELL_M]
+        bodies = np.column_stack([pose[near], size_lw_m[near], np.zeros(len(near))])
+        met[row] = meet(box[None], bodies).any()
     return parked[~met]
 
 

@@ -8,10 +8,15 @@ from infgen.sources.towns.scenes import draw_place, record
 from infgen.sources.towns.town import Town, make_town, stream
 from infgen.sources.towns.views import View, draw_views
 
+FROM_RIM_M = 125.0
+"""The recording car of a town of common width keeps so far from where streets end."""
 SCENES_PER_TOWN = 10
 """Recorded in each town: other cars, other times."""
 LEAST_STEPS = 500
 """A town is played for at least so long, after it has warmed up."""
+WIDE_STEPS = 311
+"""For longer records towns are wider: whoever plays them shall not come to where streets
+end. Who turns now and then gets as far as the root of time."""
 
 
 def draw_scenes(
@@ -45,12 +50,14 @@ def draw_scenes(
 
 def _find_town(name: str, num_steps: int) -> tuple[Town, list[View]]:
     """Draw towns until one has enough to record."""
+    spread = max(1.0, num_steps / WIDE_STEPS) ** 0.5
     attempt = 0
     while True:
         town = make_town(
-            stream(name, "town", attempt), max(LEAST_STEPS, 3 * num_steps // 2)
+            stream(name, "town", attempt), max(LEAST_STEPS, 3 * num_steps // 2), spread
         )
-        views = draw_views(town, SCENES_PER_TOWN, num_steps, stream(name, "views", attempt))
+        rng = stream(name, "views", attempt)
+        views = draw_views(town, SCENES_PER_TOWN, num_steps, spread * FROM_RIM_M, rng)
         if len(views) == SCENES_PER_TOWN:
             return town, views
         attempt += 1

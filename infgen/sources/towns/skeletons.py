@@ -41,12 +41,13 @@ class Skeleton:
         return np.bincount(self.link.ravel(), minlength=len(self.xy_m))
 
 
-def draw_skeleton(folder: Path, rng: np.random.Generator) -> Skeleton:
+def draw_skeleton(folder: Path, rng: np.random.Generator, spread: float = 1.0) -> Skeleton:
     """Draw where streets run; dead ends are cut off, and some streets lead out of town.
 
     Args:
         folder: Where to put netgenerate's files.
         rng: Of all that is drawn.
+        spread: How many times as many blocks there are from one rim to the other.
 
     Raises:
         SumoError: if netgenerate fails.
@@ -56,7 +57,7 @@ def draw_skeleton(folder: Path, rng: np.random.Generator) -> Skeleton:
     run_program(
         "netgenerate",
         {
-            **_options(pattern, rng),
+            **_options(pattern, spread, rng),
             "seed": int(rng.integers(_MOST_SEED)),
             "plain-output-prefix": prefix,
             "output-file": folder / "skeleton.net.xml",
@@ -66,21 +67,23 @@ def draw_skeleton(folder: Path, rng: np.random.Generator) -> Skeleton:
     return _with_ways_out(_stirred(drawn, pattern, rng), rng)
 
 
-def _options(pattern: Pattern, rng: np.random.Generator) -> dict[str, object]:
+def _options(
+    pattern: Pattern, spread: float, rng: np.random.Generator
+) -> dict[str, object]:
     match pattern:
         case Pattern.GRID:
             return {
                 "grid": True,
-                "grid.x-number": int(rng.integers(4, 6)),
-                "grid.y-number": int(rng.integers(4, 6)),
+                "grid.x-number": round(spread * int(rng.integers(4, 6))),
+                "grid.y-number": round(spread * int(rng.integers(4, 6))),
                 "grid.x-length": round(float(rng.uniform(85.0, 170.0)), 1),
                 "grid.y-length": round(float(rng.uniform(85.0, 170.0)), 1),
             }
         case Pattern.SPIDER:
             return {
                 "spider": True,
-                "spider.arm-number": int(rng.integers(5, 8)),
-                "spider.circle-number": int(rng.integers(3, 5)),
+                "spider.arm-number": round(spread**0.5 * int(rng.integers(5, 8))),
+                "spider.circle-number": round(spread * int(rng.integers(3, 5))),
                 "spider.space-radius": round(float(rng.uniform(85.0, 120.0)), 1),
                 "spider.omit-center": True,
             }
@@ -88,7 +91,7 @@ def _options(pattern: Pattern, rng: np.random.Generator) -> dict[str, object]:
             least_m = round(float(rng.uniform(70.0, 105.0)), 1)
             return {
                 "rand": True,
-                "rand.iterations": int(rng.integers(45, 75)),
+                "rand.iterations": round(spread**1.4 * int(rng.integers(45, 75))),
                 "rand.min-distance": least_m,
                 "rand.max-distance": round(2.0 * least_m, 1),
                 "rand.min-angle": 50,

@@ -72,15 +72,20 @@ def stream(*words: object) -> np.random.Generator:
     return np.random.default_rng(np.frombuffer(digest, np.uint32).tolist())
 
 
-def make_town(rng: np.random.Generator, num_steps: int) -> Town:
+def make_town(rng: np.random.Generator, num_steps: int, spread: float = 1.0) -> Town:
     """Draw a town and record its traffic for so many steps.
+
+    Args:
+        rng: Of all that is drawn.
+        num_steps: How long its traffic is recorded.
+        spread: How many times as wide as most it is.
 
     Raises:
         SumoError: if SUMO is missing or fails.
     """
     with TemporaryDirectory(prefix="infgen-town-") as name:
         folder = Path(name)
-        layout = draw_layout(draw_skeleton(folder, rng), rng)
+        layout = draw_layout(draw_skeleton(folder, rng, spread), rng)
         net = build_net(layout, folder, rng)
         network = read_network(net)
         streets = {

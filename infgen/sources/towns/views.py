@@ -10,8 +10,6 @@ from infgen.sources.towns.town import Town
 
 START_EVERY = 20
 """Recordings begin at steps that are multiples of it."""
-FROM_RIM_M = 125.0
-"""The recording car keeps so far away from where streets end."""
 LONGEST_EGO_M = 5.6
 DRIVE_STEPS = 311
 """Cars are chosen by how far they go in so many steps at least. Chosen by nine seconds,
@@ -31,13 +29,20 @@ class View:
 
 
 def draw_views(
-    town: Town, count: int, num_steps: int, rng: np.random.Generator
+    town: Town, count: int, num_steps: int, from_rim_m: float, rng: np.random.Generator
 ) -> list[View]:
     """Draw views, no two of one car at one time; fewer if the town has not so many.
 
     A car is drawn the more likely the farther it goes, then and in the seconds after it.
+
+    Args:
+        town: Where.
+        count: How many.
+        num_steps: Length of each.
+        from_rim_m: How far the car keeps away from where streets end.
+        rng: Of all that is drawn.
     """
-    able = _able(town)
+    able = _able(town, from_rim_m)
     drive = max(num_steps, min(DRIVE_STEPS, town.num_steps - num_steps))
     starts = np.arange(0, town.num_steps - drive + 1, START_EVERY)
     lasting = np.stack(
@@ -74,12 +79,12 @@ def _moving_near(
     return found
 
 
-def _able(town: Town) -> Bool[np.ndarray, "trip step"]:
+def _able(town: Town, from_rim_m: float) -> Bool[np.ndarray, "trip step"]:
     """Which cars could record at which step."""
     ends_m = np.array([town.network.places_m[name] for name in sorted(town.network.ends)])
     car = town.car & (town.size_lwh_m[:, 0] < LONGEST_EGO_M)
     able = town.bodies.present & car[:, None]
     for end_m in ends_m:
         apart_m = np.linalg.norm(town.bodies.pose[..., :2] - end_m, axis=-1)
-        able &= apart_m > FROM_RIM_M
+        able &= apart_m > from_rim_m
     return able

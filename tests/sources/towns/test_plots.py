@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from infgen.geometry import box_corners
 from infgen.sources.towns.boxes import clear_way, meet
@@ -81,6 +83,23 @@ def test_cars_in_the_way_of_traffic_are_taken_away():
     kept = clear_way(parked, passing, np.full((len(x_m), 2), [4.5, 1.9]))
 
     assert kept[:, 0].tolist() == [0, 100]
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=30)
+def test_who_stands_in_the_way_is_found_as_if_everyone_were_asked(seed):
+    rng = np.random.default_rng(seed)
+    parked, passing = (
+        np.column_stack([rng.uniform(-45, 45, (n, 2)), rng.uniform(-4, 4, n)])
+        for n in (40, 60)
+    )
+    size_lwh_m = rng.uniform(1, 6, (60, 3))
+    boxes = np.column_stack([parked, rng.uniform(1, 6, (40, 3))])
+    others = np.column_stack([passing, size_lwh_m])
+
+    kept = clear_way(boxes, passing, size_lwh_m[:, :2])
+
+    np.testing.assert_array_equal(kept, boxes[~meet(boxes, others).any(axis=1)])
 
 
 def test_around_a_crossing_nothing_overlaps_and_nobody_parks_near_the_junction(crossing):
