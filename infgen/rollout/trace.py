@@ -208,9 +208,10 @@ def _ground_at_knots(start: Start, lives: _Lives) -> Float32[np.ndarray, "life k
     """Road height at the end of every half second from now on, held where nobody is."""
     knots = np.arange(start.scene.now, lives.valid.shape[1], CLOCK.steps_per_token)
     history, there = start.history, lives.there[:, knots]
-    xy_m = lives.pose[:, knots, :2].reshape(-1, 2)
-    ground_m = ground_z_m(xy_m, history.road_pose[:, :2], history.road_z_m)
+    ground_m = np.zeros(there.shape, dtype=np.float32)
+    xy_m = lives.pose[:, knots, :2][there]
+    ground_m[there] = ground_z_m(xy_m, history.road_pose[:, :2], history.road_z_m)
     # Hold the last known height after an exit, the first known one before an entry.
     last = np.maximum.accumulate(np.where(there, np.arange(len(knots)), -1), axis=1)
     held = np.where(last < 0, there.argmax(axis=1)[:, None], last)
-    return np.take_along_axis(ground_m.reshape(there.shape), held, axis=1)
+    return np.take_along_axis(ground_m, held, axis=1)
