@@ -4,7 +4,10 @@ A pose is [..., 3]: x and y in metres, heading in radians counter-clockwise from
 """
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
+
+SQUARE_ROWS = 1 << 20
+"""Squares above each other before the next column: more than any map has."""
 
 
 def wrap_angle(angle_rad: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -82,3 +85,14 @@ def _tells_apart(
     )
     apart: np.ndarray = (away_m >= reach_m + size_lw_m / 2).any(axis=-1)
     return apart
+
+
+def squares_of(
+    xy_m: Float[np.ndarray, "*shape 2"], side_m: float
+) -> Int64[np.ndarray, "*shape"]:
+    """Number the squares of the plane that points are in.
+
+    Those above each other are consecutive, those beside each other ``SQUARE_ROWS`` apart.
+    """
+    at = np.floor(xy_m / side_m).astype(np.int64)
+    return at[..., 0] * SQUARE_ROWS + at[..., 1]

@@ -3,7 +3,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infgen.geometry import box_corners, boxes_overlap, to_local
+from infgen.geometry import (
+    SQUARE_ROWS,
+    box_corners,
+    boxes_overlap,
+    squares_of,
+    to_local,
+)
 
 CAR = np.array([4.0, 2.0])
 FLAT = np.array([[0.0, 0.0, 0.0]])
@@ -59,3 +65,11 @@ def points_in_both(one, size, other, other_size):
     ).reshape(-1, 2)
     local = to_local(np.pad(points, ((0, 0), (0, 1))), np.tile(other, (len(points), 1)))
     return (np.abs(local[:, :2]) < other_size / 2 - 1e-9).all(axis=1).any()
+
+
+def test_squares_above_each_other_are_consecutive_and_columns_far_apart():
+    xy_m = np.array([[[1.0, 1.0], [9.9, 0.0]], [[1.0, 11.0], [-0.1, 1.0]]])
+
+    number = squares_of(xy_m, 10.0)
+
+    assert number.tolist() == [[0, 0], [1, -SQUARE_ROWS]]

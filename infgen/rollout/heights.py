@@ -3,10 +3,10 @@
 import numpy as np
 from jaxtyping import Float32
 
+from infgen.geometry import squares_of
+
 SQUARE_M = 16.0
 """Points are looked up by squares: to all in one, few road points can be the nearest."""
-_MANY = 1 << 20
-"""More squares than a map has from side to side."""
 _SLACK_M = 0.1
 """Room for rounding, where it is decided which road points can be."""
 
@@ -21,12 +21,11 @@ def ground_z_m(
     if not len(road_xy_m) or not len(xy_m):
         return found
     square_m2 = (road_xy_m**2).sum(axis=1) / 2
-    at = np.floor(xy_m / SQUARE_M).astype(np.int64)
-    number = at[:, 0] * _MANY + at[:, 1]
+    number = squares_of(xy_m, SQUARE_M)
     order = np.argsort(number, kind="stable")
     starts = np.flatnonzero(np.diff(number[order], prepend=number[order[0]] - 1))
     for rows in np.split(order, starts[1:]):
-        middle_m = (at[rows[0]] + 0.5) * SQUARE_M
+        middle_m = (np.floor(xy_m[rows[0]] / SQUARE_M) + 0.5) * SQUARE_M
         away_m = np.hypot(*(road_xy_m - middle_m.astype(np.float32)).T)
         (near,) = np.nonzero(away_m <= away_m.min() + SQUARE_M * 2**0.5 + _SLACK_M)
         nearest = (square_m2[near] - xy_m[rows] @ road_xy_m[near].T).argmin(axis=1)

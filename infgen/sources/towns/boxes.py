@@ -1,15 +1,14 @@
 """Boxes that do not move: [x, y, heading, length, width, height]."""
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 
-from infgen.geometry import boxes_overlap
+from infgen.geometry import SQUARE_ROWS, boxes_overlap, squares_of
 
 Boxes = Float64[np.ndarray, "_ 6"]
 
 _CELL_M = 10.0
 """Bodies whose middles are farther apart do not meet parked cars."""
-_MANY = 1 << 20
 
 
 def meet(
@@ -31,12 +30,12 @@ def clear_way(
     size_lw_m: Float64[np.ndarray, "body 2"],
 ) -> Boxes:
     """Take away parked cars that stand in the way of somebody, wherever they come by."""
-    cells = _numbered(np.floor(parked[:, :2] / _CELL_M).astype(np.int64))
-    number = _numbered(np.floor(pose[:, :2] / _CELL_M).astype(np.int64))
+    cells = squares_of(parked[:, :2], _CELL_M)
+    number = squares_of(pose[:, :2], _CELL_M)
     order = np.argsort(number, kind="stable")
     number = number[order]
-    # Cells above each other have consecutive numbers: three runs hold all nine around one.
-    columns = cells[:, None] + _MANY * np.array([-1, 0, 1])
+    # Three runs of consecutive numbers hold all nine squares around one.
+    columns = cells[:, None] + SQUARE_ROWS * np.array([-1, 0, 1])
     start = np.searchsorted(number, columns - 1, side="left")
     stop = np.searchsorted(number, columns + 1, side="right")
     met = np.zeros(len(parked), bool)
@@ -47,8 +46,3 @@ def clear_way(
         bodies = np.column_stack([pose[near], size_lw_m[near], np.zeros(len(near))])
         met[row] = meet(box[None], bodies).any()
     return parked[~met]
-
-
-def _numbered(cells: Int64[np.ndarray, "*shape 2"]) -> Int64[np.ndarray, "*shape"]:
-    """Give every cell of the plane a number of its own."""
-    return cells[..., 0] * _MANY + cells[..., 1]
