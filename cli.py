@@ -121,6 +121,11 @@ _stage_verb("build-vocab", "Cluster the vocabularies of moves and road pieces.")
 _stage_verb("tokenize", "Write scenes as tokens.")
 _stage_verb("train", "Train the network; goes on where a killed run stopped.")
 _stage_verb(
+    "calibrate",
+    "Find what rollouts add to their odds, so that as many come and go as in logs.",
+    " -s calibrate.by=play --dask local:2",
+)
+_stage_verb(
     "rollout",
     "Play futures of the held-out scenes; settings are those of rollout.* in stages.yaml.",
     " --dask local:8 -s rollout.mode=wosac -s rollout.count=32",

@@ -12,6 +12,7 @@ from infgen.coerce import build as build
 from infgen.coerce import check_bounds, free
 from infgen.coerce import decisive as decisive
 from infgen.coerce import settle as settle
+from infgen.config_calibrate import CalibrateSettings as CalibrateSettings
 from infgen.config_rollout import RolloutSettings as RolloutSettings
 from infgen.config_vocab import VocabSettings as VocabSettings
 

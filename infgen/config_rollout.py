@@ -68,16 +68,18 @@ class RolloutSettings:
             the most likely first; 1 for all. Moves that stand still and those that do not
             have a nucleus each and keep their probability: who seldom sets off still does.
         cell_nucleus: The same for cells.
+        move_tries: Moves that are drawn for who would run into somebody ahead within 1.5 s,
+            everybody going on alike, until one does not lead there; 1 for whatever is drawn
+            first, as in the paper.
         move_temperature: Logits of moves are divided by it: below 1 the likely become
             likelier.
         cell_temperature: The same for cells.
         heading_temperature: The same for heading bins.
-        calibrate: Whether log-odds of entering and leaving are shifted so that the weights'
-            held-out rates are those of the logs, as their last validation found.
-        add_bias: Added, on top, to the log-odds that one more agent enters.
-        leave_bias: Added, on top, to the log-odds that an agent leaves.
-        entry_mask: Whether newcomers are kept off other boxes, and vehicles near lanes. The
-            paper lets them in anywhere.
+        add_bias: Added to the log-odds that one more agent enters, on top of what stage
+            ``calibrate`` finds.
+        leave_bias: The same for an agent's leaving.
+        entry_mask: Whether newcomers are kept off other boxes, also off where these will be
+            in half a second, and vehicles near lanes. The paper lets them in anywhere.
         entry_lane_m: Farthest from a lane's middle that a vehicle may enter. Most logged
             newcomers are parked cars that come into view: of all, 47 % are within 5 m, 69 %
             within 10 m, 78 % within 15 m; of those that drive, 96, 97 and 97 %.
@@ -104,10 +106,10 @@ class RolloutSettings:
     top_cells: int = 10
     move_nucleus: float = 1.0
     cell_nucleus: float = 1.0
+    move_tries: int = 1
     move_temperature: float = 1.0
     cell_temperature: float = 1.0
     heading_temperature: float = 1.0
-    calibrate: bool = True
     add_bias: float = 0.0
     leave_bias: float = 0.0
     entry_mask: bool = True
@@ -163,6 +165,7 @@ class RolloutSettings:
             ("leave_radius_m", 0, math.inf),
             ("top_moves", 0, math.inf),
             ("top_cells", 0, math.inf),
+            ("move_tries", 1, math.inf),
             ("entry_lane_m", 0, math.inf),
             ("entry_tries", 1, math.inf),
             ("max_entries", 0, math.inf),

@@ -1,20 +1,24 @@
-"""What to add to log-odds so that as many agents enter and leave as in held-out logs.
+"""What to add to log-odds so that decisions are right half second by half second.
 
 The last validation of a training run has its decisions sorted by their probability. A
 network that was shown few scenes often is too sure of them; shifting its log-odds until the
 held-out rates are right keeps what it tells apart and mends how many there are (SPEC 3.6).
 """
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from infgen.config import RolloutSettings
+from pipeline.folders import StoreError, write_json
 from pipeline.train_log import read_log
 
 LOG = "train.jsonl"
+FOUND = "biases.json"
 FEWEST = 100
 """Fewer decisions, or fewer of either outcome than a tenth of it, decide nothing."""
 LARGEST = 3.0
@@ -33,6 +37,35 @@ class Biases:
 
     add: float = 0.0
     leave: float = 0.0
+
+    def over(self, settings: RolloutSettings) -> RolloutSettings:
+        """Add them to what the settings add themselves."""
+        return replace(
+            settings,
+            add_bias=settings.add_bias + self.add,
+            leave_bias=settings.leave_bias + self.leave,
+        )
+
+
+def write_found(folder: Path, biases: Biases) -> None:
+    """Leave the biases that rollouts are to have."""
+    write_json(folder / FOUND, asdict(biases))
+
+
+def read_found(folder: Path) -> Biases:
+    """Read the biases that rollouts are to have.
+
+    Raises:
+        StoreError: if the file is damaged.
+    """
+    path = folder / FOUND
+    try:
+        return Biases(**{k: float(v) for k, v in json.loads(path.read_text()).items()})
+    except (ValueError, TypeError, AttributeError) as error:
+        raise StoreError(
+            f"{path} does not hold two biases ({error}); make it again: "
+            "infgen run calibrate --force"
+        ) from error
 
 
 def read_biases(folder: Path) -> Biases:

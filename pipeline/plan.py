@@ -148,10 +148,12 @@ def _settle(
     root: Root,
 ) -> Planned:
     stage = _load(entry)
-    sections = {
+    sections: Mapping[str, Any] = {
         section: _build(kind, chosen.values.get(section, {}))
         for section, kind in stage.settings.items()
     }
+    if stage.narrow is not None:
+        sections = stage.narrow(sections)
     values = {section: decisive(settings) for section, settings in sections.items()}
     only = next(iter(sections.values())) if len(sections) == 1 else sections
     read = sources if SOURCES in entry.deps else ()

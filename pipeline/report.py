@@ -19,7 +19,16 @@ if TYPE_CHECKING:
     from infgen.metrics.reference import Counts
     from infgen.views.tables import Table
 
-STAGES = ("ingest", "build-vocab", "tokenize", "train", "rollout", "reference", "score")
+STAGES = (
+    "ingest",
+    "build-vocab",
+    "tokenize",
+    "train",
+    "calibrate",
+    "rollout",
+    "reference",
+    "score",
+)
 LOWEST = 10
 TABLES = "tables"
 PASSPORT = "passport.html"

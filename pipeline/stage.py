@@ -119,6 +119,8 @@ class Stage:
         finish: Gathers the units into the stage's own folder ``target`` (index, tables).
         reads: Finds what the stage's settings name that no other stage of the plan makes,
             in the root folder of the experiment or elsewhere; it then counts as a source.
+        narrow: Sets what decides nothing here to its default, section by section, before
+            there is a key; for stages that read the settings of others.
         modules: Modules whose code decides the bytes; their hash is recorded.
         resumes: ``work`` finds what a killed try left below ``target`` and goes on from it.
         in_driver: Units run in the driver's process, whatever the workers (training).
@@ -131,6 +133,7 @@ class Stage:
     work: "Callable[[Unit, Path, Any, Progress], Report]"
     finish: "Callable[[Inputs, Sequence[Done], Path, Any, Progress], Report]"
     reads: "Callable[[Path, Any], Sequence[Source]] | None" = None
+    narrow: "Callable[[Mapping[str, Any]], Mapping[str, Any]] | None" = None
     modules: Sequence[str] = field(default=())
     resumes: bool = False
     in_driver: bool = False

@@ -9,6 +9,7 @@ MODULES = {
     "build-vocab": "pipeline.vocabulary",
     "tokenize": "pipeline.tokenize",
     "train": "pipeline.train",
+    "calibrate": "pipeline.calibrate",
     "rollout": "pipeline.rollout",
     "reference": "pipeline.reference",
     "score": "pipeline.score",

@@ -29,7 +29,7 @@ profiles:
 VERBS = [
     *("run", "ingest", "build-vocab", "tokenize", "train", "rollout", "score", "report"),
     *("plan", "status", "dag", "gc", "verify", "show", "diff", "init", "doctor", "demo"),
-    *("towns", "reference", "wosac", "export", "view"),
+    *("towns", "calibrate", "reference", "wosac", "export", "view"),
 ]
 
 

@@ -1,6 +1,7 @@
-"""Where a newcomer may stand: on nobody's box, and a vehicle near a lane.
+"""Where a newcomer may stand: in nobody's way, and a vehicle near a lane.
 
-Pedestrians may stand on pedestrians: groups walk closer together than their boxes.
+In somebody's way is whoever stands where its box is, or will be in half a second if it goes
+on as in the last one. Pedestrians may stand on pedestrians: groups walk closer than boxes.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ from jaxtyping import Bool, Float32, Int64
 from infgen.geometry import boxes_overlap, to_world
 from infgen.rollout.population import EGO_ROW, Newcomers, Population, entry_pose
 from infgen.scene import AgentKind
-from infgen.tokens.codebook import RoadCodebook
+from infgen.tokens.codebook import MotionCodebook, RoadCodebook
 from infgen.tokens.roads import LineKind
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 
@@ -29,12 +30,14 @@ class Room:
         along_m: From there to its last point.
         scene: Map of each rollout.
         lane_m: Farthest from a lane that a vehicle may enter, on a map that has lanes.
+        end_pose: Where each kind's moves end.
     """
 
     start_m: Float32[np.ndarray, "scene lane 2"]
     along_m: Float32[np.ndarray, "scene lane 2"]
     scene: Int64[np.ndarray, " rollout"]
     lane_m: float
+    end_pose: Float32[np.ndarray, "3 move 3"]
 
     def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "Room":
         """Go on with some rollouts only."""
@@ -45,19 +48,29 @@ class Room:
     ) -> Bool[np.ndarray, " rollout"]:
         """Tell which newcomers may stand where they are to enter."""
         pose = entry_pose(population.pose[:, EGO_ROW], newcomers)
-        on_somebody = boxes_overlap(
-            pose[:, None],
-            newcomers.size_lwh_m[:, None, :2],
-            population.pose,
-            population.size_lwh_m[..., :2],
-        )
-        on_somebody &= population.presence != Presence.ABSENT
         on_foot = newcomers.kind == AgentKind.PEDESTRIAN
-        on_somebody &= ~(on_foot[:, None] & (population.kind == AgentKind.PEDESTRIAN))
+        passed = on_foot[:, None] & (population.kind == AgentKind.PEDESTRIAN)
+        in_the_way = np.zeros(len(pose), dtype=bool)
+        for everyone in (population.pose, self._soon(population)):
+            on_somebody = boxes_overlap(
+                pose[:, None],
+                newcomers.size_lwh_m[:, None, :2],
+                everyone,
+                population.size_lwh_m[..., :2],
+            )
+            on_somebody &= (population.presence != Presence.ABSENT) & ~passed
+            in_the_way |= on_somebody.any(axis=1)
         laneless = (self.start_m == NOWHERE_M).all(axis=(1, 2))[self.scene]
         by_a_lane = self.lane_distance_m(pose[:, :2]) <= self.lane_m
         by_a_lane |= laneless | (newcomers.kind != AgentKind.VEHICLE)
-        return by_a_lane & ~on_somebody.any(axis=1)
+        return by_a_lane & ~in_the_way
+
+    def _soon(self, population: Population) -> Float32[np.ndarray, "rollout row 3"]:
+        """Where everybody is in half a second who moves as in the last; others stand."""
+        moves = population.move >= 0
+        move = np.where(moves, population.move, 0)
+        step = self.end_pose[population.kind, move] * moves[..., None]
+        return to_world(step, population.pose)
 
     def lane_distance_m(
         self, xy_m: Float32[np.ndarray, "rollout 2"]
@@ -73,11 +86,12 @@ class Room:
 
 def make_room(
     maps: Sequence[SceneTokens],
-    roads: RoadCodebook,
+    books: tuple[MotionCodebook, RoadCodebook],
     scene: Int64[np.ndarray, " rollout"],
     lane_m: float,
 ) -> Room:
     """Lay out the lanes of some maps; ``scene`` is the map of each rollout."""
+    moves, roads = books
     lanes = [_lanes(tokens, roads) for tokens in maps]
     shape = (len(maps), max(len(start_m) for start_m, _ in lanes), 2)
     start_m = np.full(shape, NOWHERE_M)
@@ -85,7 +99,7 @@ def make_room(
     for at, (first_m, step_m) in enumerate(lanes):
         start_m[at, : len(first_m)] = first_m
         along_m[at, : len(first_m)] = step_m
-    return Room(start_m, along_m, scene, lane_m)
+    return Room(start_m, along_m, scene, lane_m, moves.end_pose)
 
 
 def _lanes(tokens: SceneTokens, roads: RoadCodebook) -> tuple[np.ndarray, np.ndarray]:

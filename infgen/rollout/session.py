@@ -24,6 +24,7 @@ from infgen.model.batch import collate_roads
 from infgen.model.columns import MotionStep
 from infgen.model.relations import Rows
 from infgen.model.steps import Memory
+from infgen.rollout.clearance import find_hits, repeat
 from infgen.rollout.newcomers import Asking, add_newcomers
 from infgen.rollout.player import Player
 from infgen.rollout.population import (
@@ -39,6 +40,9 @@ from infgen.rollout.streams import Purpose, Stream
 from infgen.rollout.trace import NOBODY, Frame, Start
 from infgen.tokens.moves import follow, make_move_table
 from infgen.tokens.scene_tokens import Presence
+
+HALF_SECONDS_AHEAD = 3
+"""How long everybody is taken to go on alike when moves are drawn again."""
 
 
 class Session:
@@ -155,7 +159,13 @@ class Session:
             target, pose = ego_path[:, -1], before.pose[:, EGO_ROW]
             kind = before.kind[:, EGO_ROW]
             move[:, EGO_ROW], _ = follow(target, pose, kind, self._table)
-        moved, path = move_on(before, move, self._leaves(said, token), player.codebook)
+        leave = self._leaves(said, token)
+        for attempt in range(1, settings.move_tries):
+            again = self._run_into_others(before, move, ego_path is not None)
+            if not again.any():
+                break
+            move = self._moves_again(before, said, token, attempt, move, again)
+        moved, path = move_on(before, move, leave, player.codebook)
         if settings.removes and settings.leave_radius_m:
             moved = leave_beyond(before, moved, settings.leave_radius_m)
         if ego_path is not None:
@@ -166,18 +176,56 @@ class Session:
     def _moves(
         self, before: Population, said: MotionStep, token: int
     ) -> Int64[np.ndarray, "rollout row"]:
-        """Sample moves. Who seldom sets off still does: standing has its own nucleus."""
-        settings, packed = self._player.settings, said.packed
+        """Sample everyone's move."""
+        packed = said.packed
         kind = packed.rows.pack(self._player.tensor(before.kind).long())
-        drawn = choose(
-            packed.move_logits,
-            self._luck(packed.rows, token, Purpose.MOVE),
+        luck = self._luck(packed.rows, token, Purpose.MOVE)
+        drawn = self._draw(packed.move_logits, kind, luck)
+        return packed.rows.spread(drawn).cpu().numpy()
+
+    def _moves_again(
+        self,
+        before: Population,
+        said: MotionStep,
+        token: int,
+        attempt: int,
+        move: Int64[np.ndarray, "rollout row"],
+        again: Bool[np.ndarray, "rollout row"],
+    ) -> Int64[np.ndarray, "rollout row"]:
+        """Sample the moves of some rows anew."""
+        player, rows = self._player, said.packed.rows
+        which = rows.pack(player.tensor(again))
+        luck = self._luck(rows, token, Purpose.MOVE, attempt)[which]
+        kind = rows.pack(player.tensor(before.kind).long())[which]
+        drawn = rows.pack(player.tensor(move))
+        drawn[which] = self._draw(said.packed.move_logits[which], kind, luck)
+        return rows.spread(drawn).cpu().numpy()
+
+    def _draw(self, logits: Tensor, kind: Tensor, luck: Tensor) -> Tensor:
+        """Sample a move. Who seldom sets off still does: standing has its own nucleus."""
+        settings = self._player.settings
+        return choose(
+            logits,
+            luck,
             settings.top_moves,
             nucleus=settings.move_nucleus,
             temperature=settings.move_temperature,
             apart=self._standing[kind] if settings.move_nucleus < 1 else None,
         )
-        return packed.rows.spread(drawn).cpu().numpy()
+
+    def _run_into_others(
+        self, before: Population, move: Int64[np.ndarray, "rollout row"], ego_driven: bool
+    ) -> Bool[np.ndarray, "rollout row"]:
+        """Tell whose move leads into somebody; who stands, or is driven, keeps it."""
+        player = self._player
+        there = (before.presence != Presence.ABSENT) & (before.presence != Presence.LEAVING)
+        hits = find_hits(
+            before, there, repeat(before, move, player.codebook, HALF_SECONDS_AHEAD)
+        )
+        hits &= ~player.codebook.standing[before.kind, move]
+        if ego_driven:
+            hits[:, EGO_ROW] = False
+        return hits
 
     def _leaves(self, said: MotionStep, token: int) -> Bool[np.ndarray, "rollout row"]:
         settings, packed = self._player.settings, said.packed
@@ -187,10 +235,10 @@ class Session:
         leave = happens(packed.leave_logit, luck, settings.leave_bias)
         return packed.rows.spread(leave).cpu().numpy()
 
-    def _luck(self, rows: Rows, token: int, purpose: Purpose) -> Tensor:
+    def _luck(self, rows: Rows, token: int, purpose: Purpose, attempt: int = 0) -> Tensor:
         """Draw a number for each of some rows; it does not depend on the others."""
         each = self.population.life.shape[1]
-        return rows.pack(self._player.luck(self._streams, token, purpose, each))
+        return rows.pack(self._player.luck(self._streams, token, purpose, each, attempt))
 
     def _shown(
         self, before: Population, moved: Population, said: MotionStep, token: int
@@ -231,5 +279,7 @@ def _begin(
     memory = player.stepper.begin(roads, player.tensor(scene), first.life.shape[1])
     settings, room = player.settings, None
     if settings.entry_mask:
-        room = make_room(histories, player.roads, scene, settings.entry_lane_m)
+        room = make_room(
+            histories, (player.codebook, player.roads), scene, settings.entry_lane_m
+        )
     return memory, Asking(player, streams, room)

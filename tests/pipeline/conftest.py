@@ -7,8 +7,10 @@ from itertools import islice
 from pathlib import Path
 
 import pytest
+import torch
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.model.network import Network
 from infgen.sources.towns import builtin_records
 from infgen.sources.womd import iter_scenes
 from infgen.tokens.codebook import MotionCodebook, RoadCodebook
@@ -23,6 +25,8 @@ from pipeline.runner import Orders, Result, run
 from pipeline.stage import Unit
 from pipeline.store import write_records
 from pipeline.tokenize import SCHEMA
+from pipeline.weights import save_network, state_of
+from tests.pipeline.finished import TINY
 
 TOYS = Path(__file__).with_name("toys")
 STAGES = """\
@@ -205,3 +209,14 @@ def quiet():
         assert 0 <= done <= total
 
     return tell
+
+
+@pytest.fixture
+def weights(tmp_path, metre_moves, bent_roads):
+    """A stage folder with the weights of a tiny network that has learned nothing."""
+    torch.manual_seed(0)
+    network = Network(TINY, metre_moves, bent_roads, TokenSettings())
+    folder = tmp_path / "train"
+    folder.mkdir()
+    save_network(folder, network, state_of(network), step=7)
+    return folder

@@ -8,7 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.calibration import LARGEST, Biases, find_bias, read_biases
+from infgen.config import RolloutSettings
+from pipeline.calibration import (
+    LARGEST,
+    Biases,
+    find_bias,
+    read_biases,
+    read_found,
+    write_found,
+)
+from pipeline.folders import StoreError
 
 
 def bins(count, predicted, happened):
@@ -68,3 +77,23 @@ def test_the_last_validation_of_the_log_counts(tmp_path):
 
 def test_weights_without_a_log_are_played_as_they_are(tmp_path):
     assert read_biases(tmp_path) == Biases()
+
+
+def test_biases_go_on_top_of_those_of_the_settings():
+    played = Biases(add=0.5, leave=-0.25).over(RolloutSettings(add_bias=0.25))
+
+    assert (played.add_bias, played.leave_bias) == (0.75, -0.25)
+
+
+def test_biases_are_read_as_they_were_written(tmp_path):
+    write_found(tmp_path, Biases(add=0.1234, leave=-2.0))
+
+    assert read_found(tmp_path) == Biases(add=0.1234, leave=-2.0)
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"add": "much"}', '{"stay": 1}'])
+def test_a_damaged_file_of_biases_is_named(tmp_path, text):
+    (tmp_path / "biases.json").write_text(text)
+
+    with pytest.raises(StoreError, match=r"biases\.json does not hold two biases"):
+        read_found(tmp_path)

@@ -166,6 +166,8 @@ def finished(root: Path) -> Inputs:
     write_json(root / "build-vocab" / "report.json", {"motion": {"vehicle": {"real": 12}}})
     manifest(root, "tokenize", {"tokenize": asdict(TokenSettings())}, {"words": 5})
     manifest(root, "train", {"train": {"steps": 3}}, {"weights": "feedc0ffee"})
+    (root / "calibrate").mkdir()
+    manifest(root, "calibrate", {"calibrate": {"by": "odds"}}, {"add_bias": 0.25})
     manifest(
         root, "rollout", {"rollout": asdict(RolloutSettings())}, {"rollouts": 4}, [played]
     )

@@ -1,61 +1,25 @@
 import dataclasses
-import json
-import math
-import shutil
 
 import numpy as np
 import polars as pl
 import pytest
-import torch
 
-from infgen.config import ModelSettings, RolloutSettings, TokenSettings
+from infgen.config import RolloutSettings, TokenSettings
 from infgen.model.network import Network
 from infgen.scene import Scene
 from pipeline import ingest
 from pipeline import rollout as stage
+from pipeline.calibration import Biases, write_found
 from pipeline.stage import Done
 from pipeline.store import write_records
 from pipeline.weights import save_network, state_of
+from tests.pipeline.finished import TINY, Finished
 
-TINY = ModelSettings(
-    width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4
-)
 SETTINGS = RolloutSettings(seconds=2.0, count=2, scenes_per_task=2, batch=3, max_agents=16)
-
-
-class Finished:
-    """Inputs of the stage: what earlier stages left on disk."""
-
-    sources = ()
-
-    def __init__(self, scenes, weights):
-        self.scenes, self.weights = scenes, weights
-
-    def units(self, name):
-        return {"ingest": self.scenes}[name]
-
-    def folder(self, name):
-        return {"train": self.weights}[name]
-
-    def content(self, name, *names):
-        return f"content of {name}"
-
-    def key(self, name):
-        raise AssertionError("a key changes more often than what the stage reads")
 
 
 def no_progress(done, total, note=""):
     pass
-
-
-@pytest.fixture
-def weights(tmp_path, metre_moves, bent_roads):
-    torch.manual_seed(0)
-    network = Network(TINY, metre_moves, bent_roads, TokenSettings())
-    folder = tmp_path / "train"
-    folder.mkdir()
-    save_network(folder, network, state_of(network), step=7)
-    return folder
 
 
 @pytest.fixture
@@ -124,23 +88,15 @@ def test_the_pace_is_told_and_kept_apart_from_what_is_reproducible(inputs, tmp_p
     assert report["run"]["rollouts_per_s"] > 0
 
 
-def test_rates_that_were_wrong_on_held_out_scenes_are_put_right(inputs, tmp_path):
-    weights = tmp_path / "weights"
-    shutil.copytree(inputs.weights, weights)
-    bins = {"count": [400], "predicted": [200], "happened": [300]}
-    line = {"step": 1, "validation": {"add_bins": bins}}
-    (weights / "train.jsonl").write_text(json.dumps(line) + "\n")
-    known = Finished(inputs.scenes, weights)
+def test_the_calibrated_biases_are_added_to_those_of_the_settings(inputs, tmp_path):
+    write_found(inputs.calibrated, Biases(add=0.75, leave=-0.5))
     settings = dataclasses.replace(SETTINGS, scenes=1, add_bias=1.0)
 
-    (unit,) = stage.STAGE.plan(known, settings)
-    (plain,) = stage.STAGE.plan(known, dataclasses.replace(settings, calibrate=False))
+    (unit,) = stage.STAGE.plan(inputs, settings)
     report, _ = play(unit, tmp_path / "calibrated", settings)
 
-    assert unit.task["biases"] == {"add": pytest.approx(math.log(3), abs=1e-4), "leave": 0}
-    assert plain.task["biases"] == {"add": 0, "leave": 0}
-    assert report["add_bias"] == pytest.approx(1 + math.log(3), abs=1e-4)
-    assert report["leave_bias"] == 0
+    assert unit.task["biases"] == {"add": 0.75, "leave": -0.5}
+    assert (report["add_bias"], report["leave_bias"]) == (1.75, -0.5)
 
 
 def test_scenes_may_be_limited(inputs):

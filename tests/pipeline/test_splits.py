@@ -1,6 +1,9 @@
+from pathlib import Path
+
 import pytest
 
-from pipeline.splits import in_split, split_of
+from pipeline.splits import in_split, shares, split_of
+from pipeline.stage import Done
 
 
 @pytest.mark.parametrize(
@@ -27,3 +30,12 @@ def test_a_file_is_of_its_own_split_only():
 
     assert in_split(name, "training_20s")
     assert not in_split(name, "training")
+
+
+@pytest.mark.parametrize(
+    ("most", "taken"), [(0, [9, 1, 4]), (14, [9, 1, 4]), (7, [4, 1, 2]), (1, [0, 0, 1])]
+)
+def test_of_all_files_alike_some_scenes_are_taken(most, taken):
+    files = [Done(str(at), "key", Path(), {"scenes": n}) for at, n in enumerate((9, 1, 4))]
+
+    assert shares(files, most) == taken

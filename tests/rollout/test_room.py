@@ -8,6 +8,7 @@ from infgen.rollout.population import Newcomers, settle
 from infgen.rollout.room import make_room
 from infgen.scene import AgentKind
 from infgen.tokens.roads import LineKind
+from infgen.tokens.scene_tokens import FIRST_MOVE
 
 CAR, WALKER = AgentKind.VEHICLE, AgentKind.PEDESTRIAN
 SIZE = {CAR: (4.0, 2.0, 1.5), WALKER: (1.0, 1.0, 1.7)}
@@ -31,8 +32,13 @@ def newcomer(x_m, y_m, kind=CAR, turned_rad=0.0):
     )
 
 
-def room_of(begin, roads, lane_m):
-    return make_room([begin.history], roads, np.zeros(1, dtype=np.int64), lane_m)
+@pytest.fixture
+def books(metre_moves, bent_roads):
+    return metre_moves, bent_roads
+
+
+def room_of(begin, books, lane_m):
+    return make_room([begin.history], books, np.zeros(1, dtype=np.int64), lane_m)
 
 
 @pytest.mark.parametrize(
@@ -51,17 +57,17 @@ def room_of(begin, roads, lane_m):
     ],
 )
 def test_newcomers_stand_on_nobody_and_vehicles_by_a_lane(
-    begun, bent_roads, newcomer_at, allowed
+    begun, books, newcomer_at, allowed
 ):
     begin, population = begun
-    room = room_of(begin, bent_roads, lane_m=5.0)
+    room = room_of(begin, books, lane_m=5.0)
 
     assert room.allows(population, newcomer(*newcomer_at)).tolist() == [allowed]
 
 
-def test_pedestrians_may_walk_close_together(begun, bent_roads):
+def test_pedestrians_may_walk_close_together(begun, books):
     begin, population = begun
-    room = room_of(begin, bent_roads, lane_m=5.0)
+    room = room_of(begin, books, lane_m=5.0)
     population.kind[0, 1] = WALKER
     population.size_lwh_m[0, 1] = SIZE[WALKER]
 
@@ -69,17 +75,34 @@ def test_pedestrians_may_walk_close_together(begun, bent_roads):
     assert not room.allows(population, newcomer(8.3, -2, CAR)).any()
 
 
-def test_places_that_nobody_holds_are_free(begun, bent_roads):
+def test_nobody_enters_where_another_will_be_in_half_a_second(begun, books):
+    """The car at (8, -2), 4.8 m long, drives on by 5 m: newcomers are 4 m long."""
     begin, population = begun
-    room = room_of(begin, bent_roads, lane_m=1e6)
+    room = room_of(begin, books, lane_m=1e6)
+    ahead = [newcomer(x_m, -2) for x_m in (12.5, 17.3, 17.5)]
+
+    population.move[0, 1] = 0
+    stands = [room.allows(population, one).item() for one in ahead]
+    population.move[0, 1] = 5
+    drives = [room.allows(population, one).item() for one in ahead]
+    population.move[0, 1] = FIRST_MOVE
+    enters = [room.allows(population, one).item() for one in ahead]
+
+    assert stands == enters == [True, True, True]
+    assert drives == [False, False, True]
+
+
+def test_places_that_nobody_holds_are_free(begun, books):
+    begin, population = begun
+    room = room_of(begin, books, lane_m=1e6)
     population.presence[0, 1] = 0
 
     assert room.allows(population, newcomer(8, -2)).all()
 
 
-def test_lanes_are_measured_along_their_whole_length(begun, bent_roads):
+def test_lanes_are_measured_along_their_whole_length(begun, books):
     begin, _ = begun
-    room = room_of(begin, bent_roads, lane_m=5.0)
+    room = room_of(begin, books, lane_m=5.0)
 
     # Road tokens start every five metres: halfway between two the lane is as near.
     for x_m in (10.0, 11.0, 12.5):
@@ -87,11 +110,11 @@ def test_lanes_are_measured_along_their_whole_length(begun, bent_roads):
         np.testing.assert_allclose(gap_m, 3.0, atol=0.05)
 
 
-def test_each_rollout_is_asked_on_its_own_map(parked, drive, start, bent_roads, build_map):
+def test_each_rollout_is_asked_on_its_own_map(parked, drive, start, books, build_map):
     here = start(parked(1))
     elsewhere = start(drive(road_map=build_map([])))
     room = make_room(
-        [here.history, elsewhere.history], bent_roads, np.array([1, 0, 0]), lane_m=5.0
+        [here.history, elsewhere.history], books, np.array([1, 0, 0]), lane_m=5.0
     )
     population = settle([elsewhere, here, here], min_rows=4)[-1]
     far = newcomer(30, 20)
@@ -104,9 +127,9 @@ def test_each_rollout_is_asked_on_its_own_map(parked, drive, start, bent_roads, 
     assert room.allows(population, three).tolist() == [True, False, False]
 
 
-def test_overlap_is_that_of_the_boxes_in_the_scene(begun, bent_roads):
+def test_overlap_is_that_of_the_boxes_in_the_scene(begun, books):
     begin, population = begun
-    room = room_of(begin, bent_roads, lane_m=1e6)
+    room = room_of(begin, books, lane_m=1e6)
     random = np.random.default_rng(0)
     for x_m, y_m, turned_rad in random.uniform([-8, -6, -3], [16, 6, 3], size=(200, 3)):
         pose = np.array([[x_m, y_m, turned_rad]], dtype=np.float32)

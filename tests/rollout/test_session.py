@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from infgen.rollout.clearance import find_hits
 from infgen.rollout.session import Session
 from infgen.rollout.simulate import simulate
 from infgen.rollout.trace import collect
+from infgen.tokens.scene_tokens import Presence
 
 ALONE = {"insert": False, "remove": False, "max_agents": 6}
 
@@ -135,3 +137,57 @@ def test_newcomers_enter_around_the_driven_ego(crossing, start, player, force):
     entering = now.presence[0] == 2
     assert entering.any()
     assert (np.linalg.norm(away_m[entering], axis=1) < 75.6).all()
+
+
+def new_hits(playing, begin, tokens=8):
+    """How often somebody runs into another in a row of cars, all rollouts together."""
+    session, count = Session(playing, begin), 0
+    for _ in range(tokens):
+        before = session.population
+        way = session.step().path[:, :, [2, 4]]
+        there = before.presence != Presence.ABSENT
+        count += int(find_hits(before, there, way).sum())
+    return count
+
+
+def test_who_would_run_into_somebody_draws_again(parked, start, player):
+    """Moves of an untrained network are as good as drawn by lot; many cars are near."""
+    begin = [start(parked(5), at) for at in range(12)]
+    still = {"insert": False, "remove": False, "top_moves": 0}
+
+    careless = new_hits(player(**still), begin)
+    careful = new_hits(player(**still, move_tries=20), begin)
+
+    assert careless > 20
+    assert careful < careless / 5
+
+
+def test_where_nobody_would_run_into_anybody_nothing_changes(drive, start, player):
+    begin = [start(drive(), at) for at in range(4)]
+    alone = {"insert": False, "remove": False}
+
+    careless, careful = (
+        Session(player(**alone, move_tries=tries), begin).step() for tries in (1, 20)
+    )
+
+    np.testing.assert_array_equal(careless.path, careful.path)
+
+
+def test_who_is_driven_is_never_drawn_for(parked, start, player):
+    driven = Session(player(move_tries=5, insert=False, remove=False), start(parked(1)))
+
+    frame = driven.step(pose(8.0, -2.0))
+
+    np.testing.assert_allclose(frame.path[0, 0, -1], [8.0, -2.0, 0.0], atol=1e-5)
+
+
+def test_drawing_again_does_not_depend_on_other_rollouts(parked, start, player):
+    playing = player(move_tries=5, insert=False, remove=False, top_moves=0)
+    begin = [start(parked(5), at) for at in range(4)]
+
+    together = Session(playing, begin)
+    alone = Session(playing, begin[2])
+    for _ in range(4):
+        many, one = together.step(), alone.step()
+
+    np.testing.assert_allclose(many.path[2], one.path[0], atol=1e-4)

@@ -1,0 +1,89 @@
+"""How many agents are around the ego, come and go: the same for logs and rollouts.
+
+Whoever is within a radius for the first time has come, whoever was there for the last time
+has gone, however that came about: an agent that drives in from beyond arrives as one does
+that enters there. So those there now, plus who comes, less who goes, are there at the end;
+a rollout in which both rates are those of its log has as many agents as the log.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from infgen.clock import CLOCK
+from infgen.metrics.traffic import Traffic
+
+UNSEEN_TOKENS = 2
+"""In a log's last second nobody can be told gone from lost for a moment."""
+
+
+@dataclass(frozen=True, slots=True)
+class Turnover:
+    """Counts of some logs or rollouts.
+
+    Attributes:
+        came: Who was not there, and then was.
+        went: Who was there, and never again.
+        agents: Who was there at the end of a half second, added up over all.
+        tokens: Half seconds that were looked at.
+    """
+
+    came: int = 0
+    went: int = 0
+    agents: int = 0
+    tokens: int = 0
+
+    def __add__(self, other: "Turnover") -> "Turnover":
+        return Turnover(
+            self.came + other.came,
+            self.went + other.went,
+            self.agents + other.agents,
+            self.tokens + other.tokens,
+        )
+
+    def per_token(self, count: int) -> float:
+        """One of its counts per half second; NaN if none was looked at."""
+        return count / self.tokens if self.tokens else np.nan
+
+
+def count_turnover(traffic: Traffic, radius_m: float) -> Turnover:
+    """Count who is around the ego, comes and goes after now, but in the last second.
+
+    Args:
+        traffic: A log or a rollout.
+        radius_m: Whoever is nearer to the ego is around it.
+    """
+    motion, future = traffic.motion, traffic.future
+    tokens = max(0, (future.stop - future.start) // CLOCK.steps_per_token - UNSEEN_TOKENS)
+    x_m, y_m = motion.x_m[0], motion.y_m[0]
+    away_m = np.hypot(x_m - x_m[traffic.ego], y_m - y_m[traffic.ego])
+    near = motion.valid[0] & (away_m < radius_m)
+    near[traffic.ego] = False
+    ends = traffic.now + CLOCK.steps_per_token * np.arange(1, tokens + 1)
+    first, last = _first_and_last(near)
+    came, went = first > traffic.now, last >= traffic.now
+    return Turnover(
+        came=_within(first[came] - future.start, tokens),
+        went=_within(last[went] + 1 - future.start, tokens),
+        agents=int(near[:, ends].sum()),
+        tokens=tokens,
+    )
+
+
+def _first_and_last(
+    near: Bool[np.ndarray, "agent step"],
+) -> tuple[Int64[np.ndarray, " there"], Int64[np.ndarray, " there"]]:
+    """First and last step of each agent that is ever there."""
+    there = near[near.any(axis=1)]
+    return there.argmax(axis=1), near.shape[1] - 1 - there[:, ::-1].argmax(axis=1)
+
+
+def _within(steps_after: Int64[np.ndarray, " event"], tokens: int) -> int:
+    return int((steps_after < tokens * CLOCK.steps_per_token).sum())
+
+
+def add_up(turnovers: Iterable[Turnover]) -> Turnover:
+    """Counts of all of them together."""
+    return sum(turnovers, Turnover())
