@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from infgen.scene import (
     AgentKind,
@@ -17,6 +18,9 @@ from infgen.scene import (
     Tracks,
 )
 from infgen.tokens.codebook import BOX_LW_M, MotionCodebook, RoadCodebook
+
+settings.register_profile("infgen", deadline=None)
+settings.load_profile("infgen")  # How long an example takes is a matter of the machine.
 
 STEP_S = 0.1
 BOX_LWH_M = {

@@ -99,7 +99,7 @@ def _outline(motion, agent, points=80):
     return xy @ np.array([[c, s], [-s, c]]) + centre
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_disjoint_boxes_are_as_far_apart_as_their_outlines(seed):
     random = np.random.default_rng(seed)
@@ -116,7 +116,7 @@ def test_disjoint_boxes_are_as_far_apart_as_their_outlines(seed):
         assert found[row] == pytest.approx(brute_force_m(motion, row), abs=0.08)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_pruning_never_changes_the_nearest_distance(seed):
     random = np.random.default_rng(seed)

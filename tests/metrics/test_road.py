@@ -113,7 +113,7 @@ def every_distance_m(points, start, along):
     return np.linalg.norm(gap, axis=-1)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**32 - 1),
     segments=st.integers(1, 300),

@@ -192,7 +192,7 @@ def test_floats_that_are_not_packed_are_read(read):
     assert one.x_m.min() == one.z_m.max() == 2.0
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_flipped_and_cut_bytes_never_crash_the_reader(tmp_path_factory, data):
     good = bytearray(submission(scenario(rollouts=2, steps=3), scenario("def", rollouts=2)))

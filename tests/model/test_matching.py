@@ -33,7 +33,7 @@ def poses(rng, rows, far_m=30.0):
     st.sampled_from([0, 1, 40, 2500]),
 )
 @example(0, 300.0, 2500)
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 def test_the_nearest_move_is_the_same_on_tensors(seed, stray, rows):
     rng = np.random.default_rng(seed)
     codebook = random_codebook(rng)
@@ -51,7 +51,7 @@ def test_the_nearest_move_is_the_same_on_tensors(seed, stray, rows):
 
 
 @given(st.integers(0, 2**32))
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 def test_the_nearest_of_all_moves_is_the_nearest(seed):
     rng = np.random.default_rng(seed)
     ends = MoveEnds.of(random_codebook(rng), CPU)

@@ -81,7 +81,7 @@ def test_nobody_sees_nobody(targets, sources):
     assert not found.present.any()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 1000), st.integers(1, 12), st.integers(1, 30), st.integers(1, 8))
 def test_neighbours_are_those_that_sorting_all_distances_finds(seed, rows, many, count):
     torch.manual_seed(seed)

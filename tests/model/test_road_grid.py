@@ -31,7 +31,7 @@ def by_looking_at_all(pose, real, xy_m, scene, radius_m, count, itself=None):
     st.sampled_from([1.0, SIDE_M, 30.0, 500.0]),
     st.integers(1, 70),
 )
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_neighbours_are_those_of_the_whole_map(seed, roads, radius_m, count):
     pose, real = maps(*roads, seed=seed)
     xy_m = torch.rand(20, 2) * 200 - 40  # Some of it beside the map.

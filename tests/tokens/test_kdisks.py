@@ -86,7 +86,7 @@ def test_far_is_the_mean_distance_of_points():
     np.testing.assert_allclose(gap_m(square, np.zeros((2, 2))), [2.0, 1.5])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.integers(0, 2**32),
     st.integers(0, 300),

@@ -105,7 +105,7 @@ def test_the_move_to_learn_makes_good_what_the_last_one_missed():
 
 
 @given(st.integers(0, 2**32), st.sampled_from([1, 2, 5, 31]))
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 def test_poses_follow_moves_and_labels_are_the_nearest_moves(seed, few):
     codebook = straight_moves()
     noise = noise_of(codebook, few)
@@ -123,7 +123,7 @@ def test_poses_follow_moves_and_labels_are_the_nearest_moves(seed, few):
 
 
 @given(st.integers(0, 2**32))
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 def test_who_makes_no_move_is_where_it_should_be_and_starts_from_there(seed):
     drives = _, pose, move, moving = random_drives(straight_moves(), seed)
 

@@ -280,7 +280,7 @@ def loop_pieces(points):
     return found
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.integers(0, 2**32), st.integers(2, 60), st.sampled_from([0.5, 1.3, 4.0, 9.0]))
 @example(0, 2, 4.0)
 def test_pieces_are_those_of_the_plain_loop(pieces_of, seed, many, spacing_m):
@@ -302,7 +302,7 @@ def test_pieces_are_those_of_the_plain_loop(pieces_of, seed, many, spacing_m):
         )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32), st.floats(-3, 3), st.floats(-200, 200))
 def test_tokens_do_not_change_when_the_map_is_turned_and_moved(
     pieces_of, bent_roads, seed, turn, far
@@ -332,7 +332,7 @@ def test_a_shape_of_the_codebook_is_matched_to_itself():
 
 
 @given(st.integers(0, 2**32))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_the_match_has_the_least_sum_of_squared_gaps(bent_roads, seed):
     rng = np.random.default_rng(seed)
     wanted = rng.normal(0, 2, (700, 11, 2)).astype(np.float32)

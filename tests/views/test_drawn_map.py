@@ -30,7 +30,7 @@ def test_a_corner_stays():
     np.testing.assert_array_equal(thin(line, 0.01), line[[0, 2, 4]])
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(POINTS, st.sampled_from([0.1, 1.0, 10.0]))
 def test_no_point_is_farther_from_the_thinned_line_than_the_tolerance(line, tolerance_m):
     kept = thin(line, tolerance_m)

@@ -4,7 +4,7 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -15,7 +15,6 @@ COLUMN = st.sampled_from([np.int8, np.int16, np.int32]).flatmap(
 )
 
 
-@settings(deadline=None)
 @given(st.dictionaries(st.text(max_size=4), COLUMN, max_size=4))
 def test_columns_come_back_as_they_were(columns):
     about, found = unpack_columns(pack_columns({"<a>": ["</script>", 1.5]}, columns))
