@@ -17,7 +17,8 @@ class CalibrateSettings:
             half second, as their last validation found them. That does not bring right
             counts: in a rollout the network meets its own choices. ``play`` starts from
             there, plays some scenes with several biases, and takes those with which as many
-            agents come and go as in their logs; where nobody may come or go it is ``odds``.
+            agents come, go and are there as in their logs; where nobody may come or go it
+            is ``odds``.
             ``none`` adds nothing.
         split: Split whose scenes are played for it (start of the file name): never that of
             the rollouts that are scored.

@@ -2,15 +2,17 @@
 
 Odds that are right half second by half second thin a street out, or fill it, once the
 network plays on its own. So a unit plays some scenes with one pair of biases and counts who
-came and went, beside their logs; ``finish`` finds the pair with which both are alike. Where
-the last validation of the training is to decide, there are no units.
+came, went and was there, beside their logs; ``finish`` finds the pair with which both are
+alike. Where the last validation of the training is to decide, there are no units.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from infgen.clock import CLOCK
 from infgen.config import CalibrateSettings, RolloutSettings, TokenSettings
 from pipeline.calibration import Biases, read_biases, write_found
 from pipeline.playing import begin, load_player, play_all, read_some
@@ -108,7 +110,8 @@ def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Re
     played = Biases(**unit.task["biases"]).over(settings["rollout"])
     folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
     player, weights = load_player(folder, identity, played)
-    starts, logs, refused = [], [], []
+    starts, lengths, logs, refused = [], [], [], []
+    longest = CLOCK.tokens_in(player.settings.length_s)
     for scene in _scenes(unit):
         try:
             logged = from_log(scene, settings["tokenize"])
@@ -116,15 +119,17 @@ def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Re
         except ValueError as error:
             refused.append(f"{scene.scenario_id}: {error}")
             continue
-        logs.append(count_turnover(logged, how.count_radius_m))
+        # The longer of a log and its rollouts is cut into windows as long as the shorter.
+        lengths.append(min(longest, logged.future_tokens))
+        logs.append(count_turnover(logged, how.count_radius_m, longest))
 
     def tell(done: float) -> None:
         progress(done, len(starts), "rollouts")
 
+    rollouts = chain.from_iterable(play_all(player, starts, weights, tell))
     plays = [
-        count_turnover(from_rollout(rollout), how.count_radius_m)
-        for rollouts in play_all(player, starts, weights, tell)
-        for rollout in rollouts
+        count_turnover(from_rollout(rollout), how.count_radius_m, length)
+        for rollout, length in zip(rollouts, lengths, strict=True)
     ]
     return {
         "point": unit.task["point"],
@@ -184,6 +189,7 @@ def _find(
         "by": "play",
         "came_expected": best.came,
         "went_expected": best.went,
+        "agents_expected": best.agents,
         "at_the_end_of_reach": best.at_the_end,
         **about,
     }

@@ -1,8 +1,9 @@
 """How many come and go with which biases, and the biases with which it is right.
 
-A few plays of the same scenes with different biases are met by a surface: the logarithms of
-who comes and of who goes per half second, quadratic in the bias of entering (where more
-enter, more can leave), linear in that of leaving.
+A few plays of the same scenes with different biases are met by surfaces: the logarithms of
+who comes, who goes and who is there, quadratic in the bias of entering (where more enter,
+more can leave), linear in that of leaving. Where all three are those of the logs, a scene
+lives on as it began.
 """
 
 from collections.abc import Sequence
@@ -49,48 +50,60 @@ class Best:
     Attributes:
         biases: Add to the log-odds.
         came: Who is expected to come with them, as a multiple of the logs'.
-        went: The same for who goes; None where nothing was found out of it.
+        went: The same for who goes; None where too few did to tell.
+        agents: The same for who is there.
         at_the_end: Whether they lie at an end of what may be: better ones lie beyond.
     """
 
     biases: Biases
     came: float
     went: float | None
+    agents: float | None
     at_the_end: bool
 
 
 def find_best(plays: Sequence[Turnover], logs: Turnover, reach: Reach) -> Best | None:
-    """Find the biases with which as many come and go in rollouts as in their logs.
+    """Find the biases with which rollouts are as their logs: who comes, goes and is there.
 
     Args:
-        plays: What came and went at each point of ``DESIGN``.
+        plays: What came, went and was there at each point of ``DESIGN``.
         logs: What did in the logs of the same scenes.
         reach: Where the points lie.
 
     Returns:
-        None if too few came to tell. Where too few went, the bias of leaving stays that of
-        the odds; so it does, nearly, where it makes no difference.
+        None if too few came to tell. Where it makes no difference, the bias of leaving
+        stays nearly that of the odds.
     """
-    if min(logs.came, *(play.came for play in plays)) < FEWEST:
-        return None
-    design = np.array(DESIGN)
     points = _lattice()
-    come = _surface(design, [play.per_token(play.came) for play in plays])
-    came = _terms(points) @ come - np.log(logs.per_token(logs.came))
-    off = came**2 + EASE * (points**2).sum(axis=1)
-    went = None
-    if min(logs.went, *(play.went for play in plays)) >= FEWEST:
-        go = _surface(design, [play.per_token(play.went) for play in plays])
-        went = _terms(points) @ go - np.log(logs.per_token(logs.went))
-        off += went**2
-    at = int(off.argmin())
+    off = {
+        name: _off(name, points, plays, logs)
+        for name in ("came", "went", "agents")
+        if min(getattr(counts, name) for counts in (logs, *plays)) >= FEWEST
+    }
+    if "came" not in off:
+        return None
+    errors = sum(one**2 for one in off.values()) + EASE * (points**2).sum(axis=1)
+    at = int(errors.argmin())
     end = (points[at] == points.min(axis=0)) | (points[at] == points.max(axis=0))
+    times = {name: round(float(np.exp(one[at])), 4) for name, one in off.items()}
     return Best(
         biases=reach.at(*points[at].tolist()),
-        came=round(float(np.exp(came[at])), 4),
-        went=None if went is None else round(float(np.exp(went[at])), 4),
+        came=times["came"],
+        went=times.get("went"),
+        agents=times.get("agents"),
         at_the_end=bool(end.any()),
     )
+
+
+def _off(
+    name: str,
+    points: Float64[np.ndarray, "point 2"],
+    plays: Sequence[Turnover],
+    logs: Turnover,
+) -> Float64[np.ndarray, " point"]:
+    """Logarithm of a count at points, as a multiple of the logs'."""
+    rates = [counts.per_token(getattr(counts, name)) for counts in (logs, *plays)]
+    return _terms(points) @ _surface(np.array(DESIGN), rates[1:]) - np.log(rates[0])
 
 
 def _surface(

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool
 
+from infgen.clock import CLOCK
 from infgen.config import TokenSettings
 from infgen.metrics.motion import Motion
 from infgen.metrics.placement import Events, logged_events, simulated_events
@@ -36,6 +37,11 @@ class Traffic:
     def future(self) -> slice:
         """Steps after now."""
         return slice(self.now + 1, self.motion.x_m.shape[2])
+
+    @property
+    def future_tokens(self) -> int:
+        """Whole half seconds after now."""
+        return (self.motion.x_m.shape[2] - 1 - self.now) // CLOCK.steps_per_token
 
     @property
     def there_now(self) -> Bool[np.ndarray, " agent"]:

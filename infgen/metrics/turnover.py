@@ -48,25 +48,48 @@ class Turnover:
         return count / self.tokens if self.tokens else np.nan
 
 
-def count_turnover(traffic: Traffic, radius_m: float) -> Turnover:
+def count_turnover(
+    traffic: Traffic, radius_m: float, window_tokens: int | None = None
+) -> Turnover:
     """Count who is around the ego, comes and goes after now, but in the last second.
 
     Args:
         traffic: A log or a rollout.
         radius_m: Whoever is nearer to the ego is around it.
+        window_tokens: Count as if there were so many half seconds after now, and as much
+            before as there is, in as many such windows as there is room for. Whoever is
+            away for a while has gone for good in a log that ends before, so long rollouts
+            are compared to short logs in windows as long as these.
     """
-    motion, future = traffic.motion, traffic.future
-    tokens = max(0, (future.stop - future.start) // CLOCK.steps_per_token - UNSEEN_TOKENS)
+    motion, now, tokens = traffic.motion, traffic.now, traffic.future_tokens
+    length = tokens if window_tokens is None else min(tokens, window_tokens)
     x_m, y_m = motion.x_m[0], motion.y_m[0]
     away_m = np.hypot(x_m - x_m[traffic.ego], y_m - y_m[traffic.ego])
     near = motion.valid[0] & (away_m < radius_m)
     near[traffic.ego] = False
-    ends = traffic.now + CLOCK.steps_per_token * np.arange(1, tokens + 1)
+    steps = now + 1 + CLOCK.steps_per_token * length
+    return add_up(
+        _count_window(near[:, first : first + steps], now)
+        for first in CLOCK.steps_per_token * _windows(tokens, length)
+    )
+
+
+def _windows(tokens: int, length: int) -> Int64[np.ndarray, " window"]:
+    """First tokens of windows that lie evenly from the first token to the last."""
+    count = max(1, tokens // max(1, length))
+    return np.rint(np.linspace(0, tokens - length, count)).astype(np.int64)
+
+
+def _count_window(near: Bool[np.ndarray, "agent step"], now: int) -> Turnover:
+    """Count in one window, given who is around the ego at which of its steps."""
+    after = near.shape[1] - 1 - now
+    tokens = max(0, after // CLOCK.steps_per_token - UNSEEN_TOKENS)
+    ends = now + CLOCK.steps_per_token * np.arange(1, tokens + 1)
     first, last = _first_and_last(near)
-    came, went = first > traffic.now, last >= traffic.now
+    came, went = first > now, last >= now
     return Turnover(
-        came=_within(first[came] - future.start, tokens),
-        went=_within(last[went] + 1 - future.start, tokens),
+        came=_within(first[came] - now - 1, tokens),
+        went=_within(last[went] - now, tokens),
         agents=int(near[:, ends].sum()),
         tokens=tokens,
     )

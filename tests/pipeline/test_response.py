@@ -15,13 +15,16 @@ TOKENS = 1_000_000
 LOGS = Turnover(came=TOKENS, went=TOKENS, agents=0, tokens=TOKENS)
 
 
-def plays(come, go):
-    """What comes and goes at the design, given logarithms of rates as functions."""
+def plays(come, go, stay=lambda *_: -99.0):
+    """What comes, goes and is at the design, given logarithms of rates as functions."""
 
     def times(rate):
         return round(TOKENS * math.exp(rate))
 
-    return [Turnover(times(come(*at)), times(go(*at)), 0, TOKENS) for at in DESIGN]
+    return [
+        Turnover(times(come(*at)), times(go(*at)), times(stay(*at)), TOKENS)
+        for at in DESIGN
+    ]
 
 
 def test_the_bias_that_makes_up_for_what_is_missing_is_found():
@@ -72,3 +75,16 @@ def test_too_few_newcomers_decide_nothing(logs):
 
     assert find_best(some, logs, REACH) is None
     assert find_best([*some[:-1], Turnover(0, 9, 0, TOKENS)], LOGS, REACH) is None
+
+
+def test_who_is_there_weighs_as_much_as_who_comes_and_who_goes():
+    """Right rates of both, and e^0.3 times as many: what they disagree about is shared."""
+    crowd = Turnover(TOKENS, TOKENS, TOKENS, TOKENS)
+    some = plays(lambda a, _: a - 0.5, lambda _, b: b, lambda a, _: a - 0.2)
+
+    best = find_best(some, crowd, REACH)
+
+    assert best.biases == Biases(add=0.38, leave=-0.05)  # 0.35 reaches up.
+    assert best.came == pytest.approx(math.exp(-0.15), abs=5e-3)
+    assert best.agents == pytest.approx(math.exp(0.15), abs=5e-3)
+    assert find_best(some, LOGS, REACH).agents is None
