@@ -24,12 +24,12 @@ from jaxtyping import Bool, Float64, Int64
 
 from infgen.clock import CLOCK
 from infgen.config import TokenSettings, build
-from infgen.metrics.binned import edges_of
 from infgen.metrics.kinematics import speed, speed_valid
 from infgen.metrics.placement import count_per_token
 from infgen.metrics.reference import divergence_bits
-from infgen.metrics.road import RoadEdges, road_edge_m
+from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic, from_log, from_rollout
+from infgen.road_edges import RoadEdges, edges_of
 from infgen.scene import AgentKind
 from infgen.tokens.tracks import TokensError
 from pipeline.logs import open_logs, unit_folders

@@ -26,7 +26,7 @@ from records import read_split
 
 from infgen.config import ReferenceSettings, TokenSettings
 from infgen.metrics import wosac
-from infgen.metrics.binned import Binned, bin_traffic, edges_of
+from infgen.metrics.binned import Binned, bin_traffic
 from infgen.metrics.counts import mean_counts
 from infgen.metrics.intervals import scene_mean
 from infgen.metrics.logged import FUTURE_STEPS
@@ -42,6 +42,7 @@ from infgen.metrics.reference import (
 from infgen.metrics.table import Against, LogCounts, make_row, named
 from infgen.metrics.traffic import Traffic, from_log
 from infgen.metrics.windows import Windows, cut_windows
+from infgen.road_edges import edges_of
 from infgen.scene import Scene
 
 LONG_STEPS = 300

@@ -23,14 +23,15 @@ from records import read_split
 
 from infgen.config import ReferenceSettings, TokenSettings
 from infgen.metrics import wosac
-from infgen.metrics.binned import Binned, bin_traffic, edges_of
+from infgen.metrics.binned import Binned, bin_traffic
 from infgen.metrics.interaction import nearest_object_m, time_to_collision_s
 from infgen.metrics.kinematics import measure_kinematics
 from infgen.metrics.logged import HISTORY_STEPS, LOG_STEPS, LogError, LoggedScene
-from infgen.metrics.road import RoadEdges, build_edges, road_edge_m
+from infgen.metrics.road import road_edge_m
 from infgen.metrics.rollouts import Rollouts, played
 from infgen.metrics.signals import build_stop_lines, runs_red_light
 from infgen.metrics.traffic import Traffic, from_log
+from infgen.road_edges import RoadEdges, build_edges, edges_of
 
 ROLLOUTS = 32
 LONG_STEPS = 300

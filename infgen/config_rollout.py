@@ -71,6 +71,8 @@ class RolloutSettings:
         move_tries: Moves that are drawn for who would run into somebody ahead within 1.5 s,
             everybody going on alike, until one does not lead there; 1 for whatever is drawn
             first, as in the paper.
+        stay_on_road: Whether half of these draws are also for vehicles that would leave the
+            road within a second, or go farther off it. Who is more than a metre off may.
         move_temperature: Logits of moves are divided by it: below 1 the likely become
             likelier.
         cell_temperature: The same for cells.
@@ -107,6 +109,7 @@ class RolloutSettings:
     move_nucleus: float = 1.0
     cell_nucleus: float = 1.0
     move_tries: int = 1
+    stay_on_road: bool = False
     move_temperature: float = 1.0
     cell_temperature: float = 1.0
     heading_temperature: float = 1.0
@@ -142,6 +145,11 @@ class RolloutSettings:
             raise ConfigError(
                 "rollout.lights=log looks into the future, which rollout.mode=wosac "
                 "forbids; say rollout.lights=now"
+            )
+        if self.stay_on_road and self.move_tries < 2:
+            raise ConfigError(
+                "rollout.stay_on_road draws moves again, but rollout.move_tries is "
+                f"{self.move_tries}; say rollout.move_tries=32 too"
             )
         self._check_numbers()
 

@@ -218,7 +218,7 @@ def _rates(counts: "Turnover") -> dict[str, float | None]:
 
 STAGE = Stage(
     name="calibrate",
-    version=1,
+    version=2,
     settings={
         "tokenize": TokenSettings,
         "rollout": RolloutSettings,
@@ -233,6 +233,8 @@ STAGE = Stage(
         "infgen.metrics.traffic",
         "infgen.metrics.turnover",
         "infgen.model",
+        "infgen.nearest",
+        "infgen.road_edges",
         "infgen.rollout",
         "infgen.tokens",
         "pipeline.calibrate",

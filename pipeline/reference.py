@@ -67,10 +67,11 @@ def _measure(
     scene: "Scene", tokens: TokenSettings, settings: ReferenceSettings
 ) -> "tuple[Counts, Binned] | str":
     """Count one log, and bin it; or say why it cannot be."""
-    from infgen.metrics.binned import bin_traffic, edges_of  # noqa: PLC0415
+    from infgen.metrics.binned import bin_traffic  # noqa: PLC0415
     from infgen.metrics.reference import count_log  # noqa: PLC0415
     from infgen.metrics.traffic import from_log  # noqa: PLC0415
     from infgen.metrics.windows import cut_windows  # noqa: PLC0415
+    from infgen.road_edges import edges_of  # noqa: PLC0415
 
     after = scene.tracks.num_steps - scene.now - 1
     windows = cut_windows(after, settings.window_s, settings.stride_s)
@@ -110,6 +111,8 @@ STAGE = Stage(
     finish=finish,
     modules=(
         "infgen.metrics",
+        "infgen.nearest",
+        "infgen.road_edges",
         "pipeline.reference",
         "pipeline.reference_files",
         "pipeline.reference_tables",

@@ -182,6 +182,8 @@ STAGE = Stage(
     work=play,
     finish=finish,
     modules=(
+        "infgen.nearest",
+        "infgen.road_edges",
         "infgen.rollout",
         "infgen.model",
         "infgen.tokens",

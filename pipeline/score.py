@@ -115,11 +115,12 @@ class _Scorer:
 
     def take(self, scene: "Scene", rollouts: "Sequence[Rollout]") -> None:
         """Score the rollouts of one scene."""
-        from infgen.metrics.binned import bin_traffic, edges_of  # noqa: PLC0415
+        from infgen.metrics.binned import bin_traffic  # noqa: PLC0415
         from infgen.metrics.radius import live_within  # noqa: PLC0415
         from infgen.metrics.reference import count_simulated  # noqa: PLC0415
         from infgen.metrics.table import make_row  # noqa: PLC0415
         from infgen.metrics.traffic import from_rollout  # noqa: PLC0415
+        from infgen.road_edges import edges_of  # noqa: PLC0415
         from pipeline.score_write import rows_of  # noqa: PLC0415
 
         edges, radius_m = edges_of(scene), self._settings.enter_radius_m
@@ -204,6 +205,8 @@ STAGE = Stage(
     finish=finish,
     modules=(
         "infgen.metrics",
+        "infgen.nearest",
+        "infgen.road_edges",
         "pipeline.reference_files",
         "pipeline.score",
         "pipeline.score_summary",

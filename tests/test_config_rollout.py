@@ -66,6 +66,7 @@ def test_saying_what_the_mode_says_is_no_contradiction():
         ({"move_nucleus": 0.0}, "above 0"),
         ({"entry_tries": 0}, "1 or more"),
         ({"leave_radius_m": -1.0}, "0 or more"),
+        ({"stay_on_road": True}, "say rollout.move_tries=32"),
     ],
 )
 def test_nonsense_is_refused(given, said):

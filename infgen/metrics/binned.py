@@ -19,9 +19,9 @@ from infgen.metrics.protocols import (
     Protocol,
     simulated_boxes,
 )
-from infgen.metrics.road import RoadEdges, build_edges, road_edge_m
+from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic, with_boxes
-from infgen.scene import FeatureKind, Scene
+from infgen.road_edges import RoadEdges
 
 NO_BIN = 255
 """Where an agent has no value: not there, or left out."""
@@ -54,13 +54,6 @@ class Binned:
     exit_distance_m: Float32[np.ndarray, " exit"]
     num_near: Int16[np.ndarray, " step"]
     num_all: Int16[np.ndarray, " step"]
-
-
-def edges_of(scene: Scene) -> RoadEdges | None:
-    """Road edges of a scene, in its own frame; None if it has none."""
-    rows = scene.road_map.rows(FeatureKind.ROAD_EDGE)
-    lines_m = [scene.road_map.points(row) for row in rows.tolist()]
-    return build_edges(lines_m) if any(len(line) >= 2 for line in lines_m) else None
 
 
 def bin_traffic(

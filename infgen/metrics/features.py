@@ -10,8 +10,9 @@ from infgen.metrics.interaction import nearest_object_m, time_to_collision_s
 from infgen.metrics.kinematics import measure_kinematics
 from infgen.metrics.logged import LoggedScene
 from infgen.metrics.motion import Motion
-from infgen.metrics.road import build_edges, road_edge_m
+from infgen.metrics.road import road_edge_m
 from infgen.metrics.signals import build_stop_lines, runs_red_light
+from infgen.road_edges import build_edges
 from infgen.scene import AgentKind
 
 

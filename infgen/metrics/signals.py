@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int64
 
 from infgen.metrics.motion import Motion
-from infgen.metrics.road import project
+from infgen.road_edges import project
 from infgen.scene import SignalState
 
 RED = (SignalState.ARROW_STOP, SignalState.STOP)

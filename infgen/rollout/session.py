@@ -24,7 +24,7 @@ from infgen.model.batch import collate_roads
 from infgen.model.columns import MotionStep
 from infgen.model.relations import Rows
 from infgen.model.steps import Memory
-from infgen.rollout.clearance import find_hits, repeat
+from infgen.rollout.lookout import look_out
 from infgen.rollout.newcomers import Asking, add_newcomers
 from infgen.rollout.player import Player
 from infgen.rollout.population import (
@@ -40,9 +40,6 @@ from infgen.rollout.streams import Purpose, Stream
 from infgen.rollout.trace import NOBODY, Frame, Start
 from infgen.tokens.moves import follow, make_move_table
 from infgen.tokens.scene_tokens import Presence
-
-HALF_SECONDS_AHEAD = 3
-"""How long everybody is taken to go on alike when moves are drawn again."""
 
 
 class Session:
@@ -74,6 +71,9 @@ class Session:
         self.population = history[-1]
         self.token = starts[0].history.now
         self._table = make_move_table(player.codebook)
+        self._lookout = look_out(
+            starts, player.codebook, stay_on_road=player.settings.stay_on_road
+        )
         self._standing = player.tensor(player.codebook.standing)
         self._driven_to: np.ndarray | None = None
 
@@ -160,8 +160,13 @@ class Session:
             kind = before.kind[:, EGO_ROW]
             move[:, EGO_ROW], _ = follow(target, pose, kind, self._table)
         leave = self._leaves(said, token)
+        again = np.ones(move.shape, dtype=bool)
         for attempt in range(1, settings.move_tries):
-            again = self._run_into_others(before, move, ego_path is not None)
+            # Whom the road and the others leave no way out is to spare the others.
+            road = attempt <= settings.move_tries // 2
+            again = self._lookout.go_wrong(before, move, again, road=road)
+            if ego_path is not None:
+                again[:, EGO_ROW] = False
             if not again.any():
                 break
             move = self._moves_again(before, said, token, attempt, move, again)
@@ -212,20 +217,6 @@ class Session:
             temperature=settings.move_temperature,
             apart=self._standing[kind] if settings.move_nucleus < 1 else None,
         )
-
-    def _run_into_others(
-        self, before: Population, move: Int64[np.ndarray, "rollout row"], ego_driven: bool
-    ) -> Bool[np.ndarray, "rollout row"]:
-        """Tell whose move leads into somebody; who stands, or is driven, keeps it."""
-        player = self._player
-        there = (before.presence != Presence.ABSENT) & (before.presence != Presence.LEAVING)
-        hits = find_hits(
-            before, there, repeat(before, move, player.codebook, HALF_SECONDS_AHEAD)
-        )
-        hits &= ~player.codebook.standing[before.kind, move]
-        if ego_driven:
-            hits[:, EGO_ROW] = False
-        return hits
 
     def _leaves(self, said: MotionStep, token: int) -> Bool[np.ndarray, "rollout row"]:
         settings, packed = self._player.settings, said.packed

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from infgen.config import TokenSettings
-from infgen.metrics.binned import NO_BIN, bin_traffic, edges_of
+from infgen.metrics.binned import NO_BIN, bin_traffic
 from infgen.metrics.long_term import score_binned
 from infgen.metrics.protocols import PROTOCOLS, ROW, STEP_FEATURES
 from infgen.metrics.reference import count_log, log_probabilities
 from infgen.metrics.table import Against, LogCounts, make_row
 from infgen.metrics.traffic import LOGGED, from_log
 from infgen.metrics.windows import cut_windows
+from infgen.road_edges import edges_of
 from infgen.scene import FeatureKind, Tracks
 
 PAPER, CORRECTED = range(2)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from infgen.config import TokenSettings
-from infgen.metrics.binned import bin_traffic, edges_of
+from infgen.metrics.binned import bin_traffic
 from infgen.metrics.protocols import CORRECTED, PROTOCOLS
 from infgen.metrics.radius import live_within
 from infgen.metrics.reference import count_log, count_simulated, log_probabilities
@@ -12,6 +12,7 @@ from infgen.metrics.table import Against, make_row
 from infgen.metrics.traffic import from_log, from_rollout
 from infgen.metrics.tune_radius import RadiusError, best_radius_m, placement_by_radius
 from infgen.metrics.windows import cut_windows
+from infgen.road_edges import edges_of
 from tests.pipeline.test_score import as_rollout
 
 

@@ -6,11 +6,12 @@ import polars as pl
 import pytest
 
 from infgen.config import ReferenceSettings, TokenSettings
-from infgen.metrics.binned import bin_traffic, edges_of
+from infgen.metrics.binned import bin_traffic
 from infgen.metrics.counts import mean_counts
 from infgen.metrics.reference import add_up, count_log
 from infgen.metrics.traffic import from_log
 from infgen.metrics.windows import cut_windows
+from infgen.road_edges import edges_of
 from pipeline import reference
 from pipeline.reference_files import read_against, read_binned, read_counts, read_logged
 from tests.pipeline.test_score import REFERENCE, Inputs, ingested

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from infgen.rollout.clearance import find_hits
+from infgen.rollout.kerbs import Kerbs, find_departures
 from infgen.rollout.session import Session
 from infgen.rollout.simulate import simulate
 from infgen.rollout.trace import collect
@@ -173,8 +174,44 @@ def test_where_nobody_would_run_into_anybody_nothing_changes(drive, start, playe
     np.testing.assert_array_equal(careless.path, careful.path)
 
 
+def off_the_road(playing, begin, tokens=8):
+    """How often a vehicle leaves the road, all rollouts together."""
+    kerbs, session, count = [Kerbs(begin[0].scene)], Session(playing, begin), 0
+    for _ in range(tokens):
+        before = session.population
+        way = session.step().path[:, :, [2, 4]]
+        there = before.presence != Presence.ABSENT
+        one_map = np.zeros(len(begin), dtype=np.int64)
+        count += int(find_departures(before, there, way, kerbs, one_map).sum())
+    return count
+
+
+def test_who_would_leave_the_road_draws_again_if_asked(drive, start, player):
+    begin = [start(drive(), at) for at in range(24)]
+    still = {"insert": False, "remove": False, "top_moves": 0, "move_tries": 20}
+
+    careless = off_the_road(player(**still), begin)
+    careful = off_the_road(player(**still, stay_on_road=True), begin)
+
+    assert careless > 20
+    assert careful < careless / 5
+
+
+def test_who_can_stay_on_the_road_only_by_running_into_others_leaves_it(
+    parked, start, player
+):
+    begin = [start(parked(5), at) for at in range(12)]
+    still = {"insert": False, "remove": False, "top_moves": 0}
+
+    careless = new_hits(player(**still), begin)
+    careful = new_hits(player(**still, move_tries=20, stay_on_road=True), begin)
+
+    assert careful < careless / 5
+
+
 def test_who_is_driven_is_never_drawn_for(parked, start, player):
-    driven = Session(player(move_tries=5, insert=False, remove=False), start(parked(1)))
+    careful = {"move_tries": 5, "stay_on_road": True}
+    driven = Session(player(**careful, insert=False, remove=False), start(parked(1)))
 
     frame = driven.step(pose(8.0, -2.0))
 
@@ -182,7 +219,9 @@ def test_who_is_driven_is_never_drawn_for(parked, start, player):
 
 
 def test_drawing_again_does_not_depend_on_other_rollouts(parked, start, player):
-    playing = player(move_tries=5, insert=False, remove=False, top_moves=0)
+    playing = player(
+        move_tries=5, stay_on_road=True, insert=False, remove=False, top_moves=0
+    )
     begin = [start(parked(5), at) for at in range(4)]
 
     together = Session(playing, begin)

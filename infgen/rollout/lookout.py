@@ -1,0 +1,73 @@
+"""Whose move leads where it should not: into somebody, or off the road."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from infgen.rollout.clearance import LOOKED_AT, find_hits, repeat
+from infgen.rollout.kerbs import Kerbs, find_departures
+from infgen.rollout.population import Population
+from infgen.rollout.trace import Start
+from infgen.tokens.codebook import MotionCodebook
+from infgen.tokens.scene_tokens import Presence
+
+CLEAR_AHEAD = 3
+"""Half seconds that everybody is taken to go on alike where it is asked who meets whom."""
+ROAD_AHEAD = 2
+"""The same where it is asked who leaves the road: three would keep cars from turning."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lookout:
+    """Looks ahead for a batch of rollouts.
+
+    Attributes:
+        codebook: Moves.
+        kerbs: Of each map; none if nobody is kept on the road.
+        scene: Map of each rollout.
+    """
+
+    codebook: MotionCodebook
+    kerbs: Sequence[Kerbs]
+    scene: Int64[np.ndarray, " rollout"]
+
+    def go_wrong(
+        self,
+        before: Population,
+        move: Int64[np.ndarray, "rollout row"],
+        drawn: Bool[np.ndarray, "rollout row"],
+        *,
+        road: bool,
+    ) -> Bool[np.ndarray, "rollout row"]:
+        """Tell whose move leads into somebody or, if asked, off the road. Who stands may.
+
+        Args:
+            before: Everyone at the beginning of the half second.
+            move: Everyone's move.
+            drawn: Whose was drawn since it was last asked: nobody else leaves the road.
+            road: Whether to ask who leaves the road.
+        """
+        there = (before.presence != Presence.ABSENT) & (before.presence != Presence.LEAVING)
+        there_moving = there & ~self.codebook.standing[before.kind, move]
+        ways = repeat(before, move, self.codebook, CLEAR_AHEAD)
+        wrong = find_hits(before, there, ways)
+        if road and self.kerbs:
+            soon = ways[:, :, : ROAD_AHEAD * len(LOOKED_AT)]
+            which = there_moving & drawn
+            wrong |= find_departures(before, which, soon, self.kerbs, self.scene)
+        return wrong & there_moving
+
+
+def look_out(
+    starts: Sequence[Start], codebook: MotionCodebook, *, stay_on_road: bool
+) -> Lookout:
+    """Look out for rollouts; those of one scene share its map."""
+    maps = {start.scene.scenario_id: start.scene for start in starts}
+    number = {name: at for at, name in enumerate(maps)}
+    return Lookout(
+        codebook=codebook,
+        kerbs=[Kerbs(scene) for scene in maps.values()] if stay_on_road else [],
+        scene=np.array([number[s.scene.scenario_id] for s in starts], dtype=np.int64),
+    )
