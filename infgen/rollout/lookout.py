@@ -40,8 +40,8 @@ class Lookout:
         drawn: Bool[np.ndarray, "rollout row"],
         *,
         road: bool,
-    ) -> Bool[np.ndarray, "rollout row"]:
-        """Tell whose move leads into somebody or, if asked, off the road. Who stands may.
+    ) -> tuple[Bool[np.ndarray, "rollout row"], Bool[np.ndarray, "rollout row"]]:
+        """Tell whose move leads into somebody, and whose off the road. Who stands may.
 
         Args:
             before: Everyone at the beginning of the half second.
@@ -50,14 +50,13 @@ class Lookout:
             road: Whether to ask who leaves the road.
         """
         there = (before.presence != Presence.ABSENT) & (before.presence != Presence.LEAVING)
-        there_moving = there & ~self.codebook.standing[before.kind, move]
+        moving = there & ~self.codebook.standing[before.kind, move]
         ways = repeat(before, move, self.codebook, CLEAR_AHEAD)
-        wrong = find_hits(before, there, ways)
-        if road and self.kerbs:
-            soon = ways[:, :, : ROAD_AHEAD * len(LOOKED_AT)]
-            which = there_moving & drawn
-            wrong |= find_departures(before, which, soon, self.kerbs, self.scene)
-        return wrong & there_moving
+        hits = find_hits(before, there, ways) & moving
+        if not road or not self.kerbs:
+            return hits, np.zeros_like(hits)
+        soon = ways[:, :, : ROAD_AHEAD * len(LOOKED_AT)]
+        return hits, find_departures(before, moving & drawn, soon, self.kerbs, self.scene)
 
 
 def look_out(

@@ -164,12 +164,14 @@ class Session:
         for attempt in range(1, settings.move_tries):
             # Whom the road and the others leave no way out is to spare the others.
             road = attempt <= settings.move_tries // 2
-            again = self._lookout.go_wrong(before, move, again, road=road)
+            hits, departs = self._lookout.go_wrong(before, move, again, road=road)
+            again = hits | departs
             if ego_path is not None:
                 again[:, EGO_ROW] = False
             if not again.any():
                 break
-            move = self._moves_again(before, said, token, attempt, move, again)
+            steers = departs & ~hits
+            move = self._moves_again(before, said, token, attempt, move, again, steers)
         moved, path = move_on(before, move, leave, player.codebook)
         if settings.removes and settings.leave_radius_m:
             moved = leave_beyond(before, moved, settings.leave_radius_m)
@@ -196,14 +198,17 @@ class Session:
         attempt: int,
         move: Int64[np.ndarray, "rollout row"],
         again: Bool[np.ndarray, "rollout row"],
+        steers: Bool[np.ndarray, "rollout row"],
     ) -> Int64[np.ndarray, "rollout row"]:
-        """Sample the moves of some rows anew."""
+        """Sample the moves of some rows anew; who only has to steer does not stop."""
         player, rows = self._player, said.packed.rows
         which = rows.pack(player.tensor(again))
         luck = self._luck(rows, token, Purpose.MOVE, attempt)[which]
         kind = rows.pack(player.tensor(before.kind).long())[which]
         drawn = rows.pack(player.tensor(move))
-        drawn[which] = self._draw(said.packed.move_logits[which], kind, luck)
+        stops = rows.pack(player.tensor(steers))[which, None] & self._standing[kind]
+        logits = said.packed.move_logits[which].masked_fill(stops, -torch.inf)
+        drawn[which] = self._draw(logits, kind, luck)
         return rows.spread(drawn).cpu().numpy()
 
     def _draw(self, logits: Tensor, kind: Tensor, luck: Tensor) -> Tensor:

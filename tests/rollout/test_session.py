@@ -197,6 +197,22 @@ def test_who_would_leave_the_road_draws_again_if_asked(drive, start, player):
     assert careful < careless / 5
 
 
+def test_who_has_to_steer_does_not_stop_for_it(drive, start, player):
+    """Nobody else stands than would have anyway, though many draw again."""
+    begin = [start(drive(), at) for at in range(200)]
+    still = {"insert": False, "remove": False, "top_moves": 0, "move_tries": 20}
+
+    plain, kept = (
+        Session(player(**still, stay_on_road=stays), begin).step().path
+        for stays in (False, True)
+    )
+
+    stood, stands = ((path == path[:, :, :1]).all(axis=(1, 2, 3)) for path in (plain, kept))
+    np.testing.assert_array_equal(stands, stood)
+    assert 0 < stood.sum() < 20
+    assert (plain != kept).any(axis=(1, 2, 3)).sum() > 30
+
+
 def test_who_can_stay_on_the_road_only_by_running_into_others_leaves_it(
     parked, start, player
 ):
@@ -204,7 +220,7 @@ def test_who_can_stay_on_the_road_only_by_running_into_others_leaves_it(
     still = {"insert": False, "remove": False, "top_moves": 0}
 
     careless = new_hits(player(**still), begin)
-    careful = new_hits(player(**still, move_tries=20, stay_on_road=True), begin)
+    careful = new_hits(player(**still, move_tries=40, stay_on_road=True), begin)
 
     assert careful < careless / 5
 
