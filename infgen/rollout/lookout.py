@@ -9,14 +9,14 @@ from jaxtyping import Bool, Int64
 from infgen.rollout.clearance import LOOKED_AT, find_hits, repeat
 from infgen.rollout.kerbs import Kerbs, find_departures
 from infgen.rollout.population import Population
-from infgen.rollout.trace import Start
+from infgen.rollout.trace import Start, number_maps
 from infgen.tokens.codebook import MotionCodebook
 from infgen.tokens.scene_tokens import Presence
 
 CLEAR_AHEAD = 3
 """Half seconds that everybody is taken to go on alike where it is asked who meets whom."""
 ROAD_AHEAD = 2
-"""The same where it is asked who leaves the road: three would keep cars from turning."""
+"""The same where it is asked who leaves the road: cars that turn do not turn for long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +63,6 @@ def look_out(
     starts: Sequence[Start], codebook: MotionCodebook, *, stay_on_road: bool
 ) -> Lookout:
     """Look out for rollouts; those of one scene share its map."""
-    maps = {start.scene.scenario_id: start.scene for start in starts}
-    number = {name: at for at, name in enumerate(maps)}
-    return Lookout(
-        codebook=codebook,
-        kerbs=[Kerbs(scene) for scene in maps.values()] if stay_on_road else [],
-        scene=np.array([number[s.scene.scenario_id] for s in starts], dtype=np.int64),
-    )
+    maps, scene = number_maps(starts)
+    kerbs = [Kerbs(start.scene) for start in maps] if stay_on_road else []
+    return Lookout(codebook, kerbs, scene)

@@ -37,7 +37,7 @@ from infgen.rollout.population import (
 from infgen.rollout.room import make_room
 from infgen.rollout.sampling import choose, happens
 from infgen.rollout.streams import Purpose, Stream
-from infgen.rollout.trace import NOBODY, Frame, Start
+from infgen.rollout.trace import NOBODY, Frame, Start, number_maps
 from infgen.tokens.moves import follow, make_move_table
 from infgen.tokens.scene_tokens import Presence
 
@@ -263,14 +263,12 @@ def _begin(
     player: Player, starts: Sequence[Start], streams: Sequence[Stream], first: Population
 ) -> tuple[Memory, Asking]:
     """Encode every map once, however many rollouts of it there are."""
-    maps = {start.scene.scenario_id: start for start in starts}
-    number = {name: at for at, name in enumerate(maps)}
-    scene = np.array([number[start.scene.scenario_id] for start in starts], dtype=np.int64)
-    histories = [start.history for start in maps.values()]
+    maps, scene = number_maps(starts)
+    histories = [start.history for start in maps]
     roads = collate_roads(
         histories,
         max(history.num_roads for history in histories),
-        [start.lights for start in maps.values()],
+        [start.lights for start in maps],
     )
     memory = player.stepper.begin(roads, player.tensor(scene), first.life.shape[1])
     settings, room = player.settings, None

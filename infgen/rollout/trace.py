@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int8, Int16, Int32
+from jaxtyping import Bool, Float32, Int8, Int16, Int32, Int64
 
 from infgen.clock import CLOCK
 from infgen.rollout.heights import ground_z_m
@@ -73,6 +73,16 @@ class Start:
         order = np.argsort(self.scene.tracks.id, kind="stable")
         found = np.searchsorted(self.scene.tracks.id[order], self.history.track_id)
         return order[found].astype(np.int32)
+
+
+def number_maps(
+    starts: Sequence[Start],
+) -> tuple[list[Start], Int64[np.ndarray, " rollout"]]:
+    """One start on each map, however many rollouts it has, and the map of each rollout."""
+    maps = {start.scene.scenario_id: start for start in starts}
+    number = {name: at for at, name in enumerate(maps)}
+    scene = [number[start.scene.scenario_id] for start in starts]
+    return list(maps.values()), np.array(scene, dtype=np.int64)
 
 
 def collect(
