@@ -6,8 +6,10 @@ built-in one where it is absent::
     python benchmarks/training.py [--size paper] [--threads 2] [--device cpu]
         [--precision auto]
 
-One row has products of half the bits, which pay on processors that multiply bfloat16. Every
-row is a process of its own, so its memory is too. The last line is one JSON object:
+One row has products of half the bits, which pay on processors that multiply bfloat16. One
+has as many processes as there are threads, of one thread and one scene each, which add up
+their gradients as under ``torchrun``. Every row is a process of its own, so its memory is
+too. The last line is one JSON object:
 ``cpu_s_per_scene`` and ``peak_rss_mib`` of the first row, one scene a step, and
 ``flops_over_peak``: multiply-adds of matrix products a second over those of a plain product
 of large matrices in the same process. On a GPU seconds are the clock's.
@@ -15,12 +17,17 @@ of large matrices in the same process. On a GPU seconds are the clock's.
 
 import argparse
 import json
+import tempfile
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
+import torch.distributed as dist
 from made_codebooks import made_codebooks
 from measuring import (
     SIZES,
@@ -58,6 +65,9 @@ class Case:
         device: Where.
         threads: Of the processor.
         precision: As in ``TrainSettings``.
+        team: Processes that do a step together ...
+        rank: ... the number of this one ...
+        meeting: ... and the file by which they find each other.
     """
 
     size: str
@@ -66,6 +76,9 @@ class Case:
     device: str
     threads: int
     precision: str
+    team: int = 1
+    rank: int = 0
+    meeting: str = ""
 
 
 def prepare(case: Case) -> tuple[Descent, Batch, Training]:
@@ -78,24 +91,34 @@ def prepare(case: Case) -> tuple[Descent, Batch, Training]:
     tokens = tokenize_scene(read_scene(), motion, roads, grid)
     batch = collate([tokens] * case.scenes, Limits.of(model, how, grid), 0)
     torch.manual_seed(0)
-    device = torch.device(case.device)
+    team = _join(case)
+    device = team.device
     network = Network(model, motion, roads, grid).to(device)
     optimiser = torch.optim.AdamW(network.parameters(), fused=True)
     average = {name: p.detach().clone() for name, p in network.named_parameters()}
     training = Training(network, average, optimiser)
-    descent = Descent(training, how, Team(device=device), 1)
+    descent = Descent(training, how, team, case.team)
     return descent, to_device(batch, device), training
+
+
+def _join(case: Case) -> Team:
+    device = torch.device(case.device)
+    if case.team > 1:
+        where = f"file://{case.meeting}"
+        dist.init_process_group("gloo", where, rank=case.rank, world_size=case.team)
+    return Team(case.rank, case.team, device)
 
 
 def measure(case: Case) -> dict[str, float]:
     """Measure one row, in this process."""
     torch.set_num_threads(case.threads)
     descent, batch, training = prepare(case)
+    own = range(case.rank, case.rank + 1)
     with repeatable():
         with FlopCounterMode(display=False) as counter:
-            descent.step([batch], range(1), 0)
+            descent.step([batch], own, 0)
         start = time.perf_counter()
-        used = seconds(lambda: descent.step([batch], range(1), 1), STEPS, case.device)
+        used = seconds(lambda: descent.step([batch], own, 1), STEPS, case.device)
         passed_s = (time.perf_counter() - start) / STEPS
     flops = float(counter.get_total_flops())
     peak = peak_flops(case.device, bf16=descent.forward.bf16)
@@ -104,11 +127,22 @@ def measure(case: Case) -> dict[str, float]:
         "roads": float(batch.roads.real.sum()) / case.scenes,
         "parameters": float(sum(p.numel() for p in training.network.parameters())),
         "used_s_per_scene": used / case.scenes,
-        "clock_s_per_scene": passed_s / case.scenes,
+        "clock_s_per_scene": passed_s / case.scenes / case.team,
         "peak_rss_mib": peak_mib(case.device),
         "gflop_per_scene": flops / case.scenes / 1e9,
         "flops_over_peak": flops / passed_s / peak,
     }
+
+
+def measure_apart(case: Case) -> dict[str, float]:
+    """Measure one row in processes of their own: means, but the most memory of any."""
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(case.team) as pool:
+        meeting = str(Path(folder) / "meeting")
+        ranks = range(case.team)
+        each = [asdict(replace(case, rank=rank, meeting=meeting)) for rank in ranks]
+        rows = list(pool.map(partial(in_own_process, Path(__file__)), each))
+    found = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    return found | {"peak_rss_mib": max(row["peak_rss_mib"] for row in rows)}
 
 
 def report(first: Case) -> None:
@@ -122,9 +156,10 @@ def report(first: Case) -> None:
         ),
         "one scene, bf16": replace(first, precision="bf16"),
     }
-    found = {
-        name: in_own_process(Path(__file__), asdict(case)) for name, case in cases.items()
-    }
+    if device == "cpu" and threads > 1:
+        name = f"one scene in each of {threads} processes of one thread"
+        cases[name] = replace(first, team=threads, threads=1)
+    found = {name: measure_apart(case) for name, case in cases.items()}
     one = found["one scene"]
     used = "CPU-s" if device == "cpu" else "s"
     show_table(
