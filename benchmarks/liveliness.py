@@ -6,9 +6,10 @@ Reads the logs and the rollouts of a root, however long they are::
 
 The first table has the rollouts, span by span, beside the logs as far as they go: agents
 around the ego, its speed and that of vehicles, the share of vehicles that are off the road
-(most are parked there), that of those that drive, entries and exits per half second. The
-second has who comes after now, from when it is near: speed in the first second, and whether
-vehicles begin off the road. The last line is one JSON object.
+(most are parked there), that of those that drive, entries and exits per half second, and in
+how many half seconds the ego, and other vehicles, set off after standing for two seconds.
+The second has who comes after now, from when it is near: speed in the first second, and
+whether vehicles begin off the road. The last line is one JSON object.
 """
 
 import argparse
@@ -21,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
+from numpy.lib.stride_tricks import sliding_window_view
 
 from infgen.clock import CLOCK
 from infgen.config import TokenSettings, build
@@ -42,6 +44,10 @@ SPEED_EDGES_MPS = np.arange(0.0, 26.0)
 """Bins of first speeds; what is faster is in the last one."""
 DRIVING_MPS = 1.0
 """Vehicles that are faster drive."""
+STILL_M = 0.1
+"""Who moves less in half a second stands ..."""
+STOOD_TOKENS = 4
+"""... and has stood after so many of them."""
 COLUMNS = {
     "agents": ("agents", ".1f"),
     "ego_mps": ("ego, m/s", ".2f"),
@@ -50,6 +56,8 @@ COLUMNS = {
     "driving_off_road": ("driving off-road", ".1%"),
     "entries": ("entries / 0.5 s", ".3f"),
     "exits": ("exits / 0.5 s", ".3f"),
+    "ego_sets_off": ("ego sets off", ".1%"),
+    "sets_off": ("others set off", ".1%"),
 }
 
 
@@ -115,8 +123,32 @@ def take(side: Side, traffic: Traffic, edges: RoadEdges | None, look: Look) -> N
         for name, those in (("off_road", near), ("driving_off_road", drives)):
             row, step = np.nonzero(those[rows, some])
             side.add(name, at_s[::STEPS_PER_S][step], off[row, step], look.span_s)
+    _take_starts(side, traffic, near & vehicle, look)
     _take_events(side, traffic, len(steps), look)
     _take_newcomers(side, traffic, edges, speed_mps, known, near)
+
+
+def _take_starts(side: Side, traffic: Traffic, others: np.ndarray, look: Look) -> None:
+    """Look at who has stood for a while: does it set off in the next half second?"""
+    motion, stride = traffic.motion, CLOCK.steps_per_token
+    knots = np.arange(traffic.now % stride, motion.valid.shape[2], stride)
+    x_m, y_m, valid = (
+        motion.x_m[0, :, knots],
+        motion.y_m[0, :, knots],
+        motion.valid[0, :, knots],
+    )
+    seen = valid[1:] & valid[:-1]  # [half second, agent]
+    still = seen & (np.hypot(np.diff(x_m, axis=0), np.diff(y_m, axis=0)) < STILL_M)
+    if len(still) <= STOOD_TOKENS:
+        return
+    stood = sliding_window_view(still, STOOD_TOKENS, axis=0).all(axis=-1)[:-1]
+    later, begins = np.arange(STOOD_TOKENS, len(still)), knots[STOOD_TOKENS:-1]
+    ego = np.arange(stood.shape[1]) == traffic.ego
+    for name, who in (("ego_sets_off", ego), ("sets_off", others[:, begins].T & ~ego)):
+        asked = stood & seen[later] & who & (begins >= traffic.now)[:, None]
+        half, row = np.nonzero(asked)
+        at_s = (begins[half] - traffic.now) * CLOCK.step_s
+        side.add(name, at_s, ~still[later[half], row], look.span_s)
 
 
 def _take_events(side: Side, traffic: Traffic, num_steps: int, look: Look) -> None:
