@@ -138,13 +138,15 @@ def _take_starts(side: Side, traffic: Traffic, others: np.ndarray, look: Look) -
         motion.valid[0, :, knots],
     )
     seen = valid[1:] & valid[:-1]  # [half second, agent]
-    still = seen & (np.hypot(np.diff(x_m, axis=0), np.diff(y_m, axis=0)) < STILL_M)
+    still: np.ndarray = seen & (
+        np.hypot(np.diff(x_m, axis=0), np.diff(y_m, axis=0)) < STILL_M
+    )
     if len(still) <= STOOD_TOKENS:
         return
     stood = sliding_window_view(still, STOOD_TOKENS, axis=0).all(axis=-1)[:-1]
     later, begins = np.arange(STOOD_TOKENS, len(still)), knots[STOOD_TOKENS:-1]
     ego = np.arange(stood.shape[1]) == traffic.ego
-    for name, who in (("ego_sets_off", ego), ("sets_off", others[:, begins].T & ~ego)):
+    for name, who in (("ego_sets_off", ego), ("sets_off", others[:, begins].T)):
         asked = stood & seen[later] & who & (begins >= traffic.now)[:, None]
         half, row = np.nonzero(asked)
         at_s = (begins[half] - traffic.now) * CLOCK.step_s
