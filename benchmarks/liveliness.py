@@ -138,12 +138,12 @@ def _take_starts(side: Side, traffic: Traffic, others: np.ndarray, look: Look) -
         motion.valid[0, :, knots],
     )
     seen = valid[1:] & valid[:-1]  # [half second, agent]
-    still: np.ndarray = seen & (
-        np.hypot(np.diff(x_m, axis=0), np.diff(y_m, axis=0)) < STILL_M
-    )
+    way_m = np.hypot(np.diff(x_m, axis=0), np.diff(y_m, axis=0))
+    still = seen & (way_m < STILL_M)
     if len(still) <= STOOD_TOKENS:
         return
-    stood = sliding_window_view(still, STOOD_TOKENS, axis=0).all(axis=-1)[:-1]
+    before = sliding_window_view(still[:-1], STOOD_TOKENS, axis=0)
+    stood: np.ndarray = np.asarray(before.all(axis=-1))
     later, begins = np.arange(STOOD_TOKENS, len(still)), knots[STOOD_TOKENS:-1]
     ego = np.arange(stood.shape[1]) == traffic.ego
     for name, who in (("ego_sets_off", ego), ("sets_off", others[:, begins].T)):
