@@ -121,6 +121,8 @@ class ModelSettings:
             as they were at the end of the history; in rollouts, ``rollout.lights`` says
             what they show. In half of the scenes of a training nobody looks at them after
             the history, so that rollouts may go on without.
+        light_ahead_m: So far ahead every agent is told by itself what the traffic light of
+            its lane shows, and for how long it has; 0 for only among all other road tokens.
     """
 
     width: int = 128
@@ -154,6 +156,20 @@ class ModelSettings:
     move_width: int = 0
     tell_ego: bool = False
     step_lights: bool = False
+    light_ahead_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse to tell of lights that are not seen to change.
+
+        Raises:
+            ConfigError: naming the setting.
+        """
+        check_bounds(self, "model", (("light_ahead_m", 0, math.inf),))
+        if self.light_ahead_m and not self.step_lights:
+            raise ConfigError(
+                f"model.light_ahead_m is {self.light_ahead_m:g}, which needs "
+                "model.step_lights=true; set that as well, or model.light_ahead_m=0"
+            )
 
 
 @dataclass(frozen=True, slots=True)

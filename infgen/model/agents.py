@@ -23,7 +23,8 @@ from infgen.model.moves import MoveHead
 from infgen.model.outputs import MotionOutputs
 from infgen.model.pairs import Shared
 from infgen.model.relations import Rows, direction, relation_embedding
-from infgen.model.sight import Around, Reach
+from infgen.model.sight import Around, Reach, RoadFeatures
+from infgen.model.stop_lines import LightAhead
 from infgen.scene import AgentKind
 from infgen.tokens.codebook import MotionCodebook
 from infgen.tokens.grid import Grid
@@ -161,12 +162,14 @@ class Sight:
         past_present: ... and which of it there is [N, K].
         roads: Road tokens around them.
         agents: Rows of the agents around them.
+        light: What they are told of the traffic lights ahead [N, D], if they are.
     """
 
     past_relation: Shared
     past_present: Tensor
     roads: Seen
     agents: Around
+    light: Tensor | None
 
 
 class MotionBlock(nn.Module):
@@ -218,6 +221,8 @@ class MotionStack(nn.Module):
         self.leave = mlp(width, width, 1) if leaves else None
         patterns = settings.pattern_tokens
         self.pattern = mlp(width, width, NUM_PATTERNS) if patterns else None
+        ahead_m = settings.light_ahead_m
+        self.light = LightAhead(width, ahead_m) if ahead_m else None
 
     def roads_reach(self) -> Reach:
         """How agents see roads."""
@@ -237,8 +242,18 @@ class MotionStack(nn.Module):
             s.agent_agent_radius_m, s.agent_agent_neighbours, self.agents_relation
         )
 
+    def lights_ahead(
+        self, roads: RoadFeatures, pose: Tensor, scene: Tensor, token: Tensor
+    ) -> Tensor | None:
+        """Tell agents on maps [N] at half seconds [N] what the lights ahead show [N, D]."""
+        if self.light is None or roads.lines is None:
+            return None
+        told: Tensor = self.light(roads.lines, pose, scene, token)
+        return told
+
     def forward(self, x_ND: Tensor, past_index: Tensor, sight: Sight) -> Tensor:
         """Update the agents of all tokens; ``past_index`` are rows of their own past."""
+        x_ND = x_ND if sight.light is None else x_ND + sight.light
         for block in self.blocks:
             past = Seen(normed(x_ND), past_index, sight.past_relation, sight.past_present)
             x_ND = block(x_ND, past, sight)

@@ -129,6 +129,9 @@ class Network(nn.Module):
                 by_token.number,
                 visible[:, None] & visible[:, :, None] & others,
             ),
+            self.motion.lights_ahead(
+                roads, rows.pack(agents.pose), rows.at // agents.visible[0].numel(), token
+            ),
         )
         x = self.motion(x, past_index, sight)
         kind = rows.pack(agents.kind[:, None].expand(agents.visible.shape))

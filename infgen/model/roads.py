@@ -11,6 +11,7 @@ from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.relations import Rows, relation_embedding
 from infgen.model.road_grid import RoadGrid
 from infgen.model.sight import Around, Lamps, Reach, RoadFeatures
+from infgen.model.stop_lines import StopLines
 from infgen.tokens.codebook import RoadCodebook
 from infgen.tokens.roads import LineKind, PointKind
 from infgen.tokens.scene_tokens import SignalClass
@@ -42,6 +43,7 @@ class RoadEncoder(nn.Module):
         width = settings.width
         self.radius_m = settings.map_map_radius_m
         self.step_lights = settings.step_lights
+        self.stop_lines = settings.light_ahead_m > 0
         self.neighbours = settings.map_map_neighbours
         curve_m = torch.from_numpy(codebook.curve_m.copy())
         self.register_buffer("curve_m", curve_m, persistent=False)
@@ -85,7 +87,10 @@ class RoadEncoder(nn.Module):
         if self.step_lights:
             looks, lamps = self._lamps(roads, rows, x)
             features = torch.cat([features, looks])
-        return RoadFeatures(rows, features, roads.pose, roads.real, sight.grid, lamps)
+        lines = StopLines.of(roads) if self.stop_lines else None
+        return RoadFeatures(
+            rows, features, roads.pose, roads.real, sight.grid, lamps, lines
+        )
 
     def predict_hidden(self, roads: Roads, covered: RoadFeatures) -> tuple[Tensor, Tensor]:
         """Predict hidden road tokens from their predecessors, which did not see them.

@@ -15,6 +15,7 @@ from infgen.model.layers import Seen
 from infgen.model.pairs import Shared
 from infgen.model.relations import Rows, across, nearest, relations
 from infgen.model.road_grid import RoadGrid
+from infgen.model.stop_lines import StopLines
 from infgen.model.tables import RelationEmbedding
 
 
@@ -103,6 +104,7 @@ class RoadFeatures:
         real: Which places of the padded maps hold a road token [scene, road].
         grid: The same tokens by where they are.
         lamps: What those with a traffic light look like, if that is seen as it changes.
+        lines: Where lights stop traffic, if agents are told of those ahead.
     """
 
     rows: Rows
@@ -111,6 +113,7 @@ class RoadFeatures:
     real: Tensor
     grid: RoadGrid
     lamps: "Lamps | None"
+    lines: StopLines | None
 
     def at(self, scene: Tensor, place: Tensor, token: Tensor | None) -> Tensor:
         """Rows [N, K] of the features of places [N, K] of maps [N], at half seconds [N]."""

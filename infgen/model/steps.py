@@ -204,6 +204,7 @@ class Stepper:
         memory.visible &= (column.presence != Presence.ENTERING)[..., None]
         x = self._embed(*memory.last(), column, rows)
         sight = self._sight(memory, column, rows)
+        x = x if sight.light is None else x + sight.light
         place = memory.columns % memory.window
         for block, past in zip(motion.blocks, memory.features, strict=True):
             before = normed(x)
@@ -381,15 +382,18 @@ class Stepper:
             rows.number,
             visible[:, None] & visible[:, :, None] & others,
         )
-        token = torch.full_like(rows.at, memory.columns)
+        pose, token = rows.pack(column.pose), torch.full_like(rows.at, memory.columns)
+        scene = memory.scene[rows.at // visible.shape[1]]
+        light = self.network.motion.lights_ahead(memory.roads, pose, scene, token)
         roads = see_roads(
             self._roads_reach, rows, column.pose, memory.roads, memory.scene, token
         )
         place = torch.arange(memory.window, device=visible.device)
         ago = (place - memory.columns) % memory.window - memory.window  # -window ... -1
-        described = relations(rows.pack(column.pose), rows.pack(memory.pose))
+        described = relations(pose, rows.pack(memory.pose))
         ago = ago.to(described.dtype).expand(len(rows.at), -1)[..., None]
         related = self.network.motion.past_relation.look_up(
             torch.cat([described, ago], dim=-1), self._past_table
         )
-        return Sight(Shared.of(related), rows.pack(memory.visible), roads, around)
+        past = rows.pack(memory.visible)
+        return Sight(Shared.of(related), past, roads, around, light)

@@ -45,6 +45,7 @@ TINY = ModelSettings(
     move_width=10,
     tell_ego=True,
     step_lights=True,
+    light_ahead_m=15.0,
 )
 
 VARIANTS = {
@@ -60,6 +61,7 @@ VARIANTS = {
         "move_width": 0,
         "tell_ego": False,
         "step_lights": False,
+        "light_ahead_m": 0.0,
         "map_agent_ahead_m": 0.0,
         "map_agent_across": False,
     },
@@ -144,6 +146,9 @@ def _record(name, kind, pose, move, presence, roads, random):
     offset_m = np.where(cell[row, token, None] >= 0, in_grid_m[row, token] - centre_m, 0)
     none = np.empty(0)
     line = np.arange(roads) // 6
+    lit = np.unique(line)[1::3]
+    road_pose = random.uniform(-1, 1, (roads, 3)) * [50, 50, np.pi]
+    road_pose[np.searchsorted(line, lit)] = _somewhere_ahead(pose, observed, len(lit))
     return SceneTokens(
         scenario_id=name,
         origin_xyz_m=np.zeros(3),
@@ -166,16 +171,15 @@ def _record(name, kind, pose, move, presence, roads, random):
         entry_offset_m=offset_m.astype(np.float32),
         entry_heading=encode_heading(pose[row, token, 2] - pose[0, token, 2], grid),
         entry_residual_rad=np.zeros(len(row), dtype=np.float32),
-        road_pose=random.uniform(-1, 1, (roads, 3)).astype(np.float32)
-        * np.float32([50, 50, np.pi]),
+        road_pose=road_pose.astype(np.float32),
         road_z_m=np.zeros(roads, dtype=np.float32),
         road_token=random.integers(NUM_ROADS, size=roads).astype(np.int16),
         road_point_kind=random.integers(10, size=roads).astype(np.int8),
         road_line_kind=random.integers(4, size=roads).astype(np.int8),
         road_line=line.astype(np.int32),
         road_signal=random.integers(len(SignalClass), size=roads).astype(np.int8),
-        signal_line=np.unique(line)[1::3].astype(np.int32),
-        signal_state=_any_signal((len(np.unique(line)[1::3]), tokens)),
+        signal_line=lit.astype(np.int32),
+        signal_state=_any_signal((len(lit), tokens)),
         word=none.astype(np.uint8),
         word_value=none.astype(np.int16),
         word_agent=none.astype(np.int16),
@@ -184,6 +188,16 @@ def _record(name, kind, pose, move, presence, roads, random):
         anchor_token=none.astype(np.int16),
         anchor_pose=np.empty((0, 3), dtype=np.float32),
     )
+
+
+def _somewhere_ahead(pose, observed, count):
+    """Stop lines that some agent has six metres ahead at some time."""
+    agent, token = np.nonzero(observed)
+    if not len(agent):
+        return np.zeros((count, 3), dtype=np.float32)
+    some = np.linspace(0, len(agent) - 1, count).round().astype(int)
+    six = np.float32([[6.0, 0.3, 0.1]])
+    return to_world(np.repeat(six, count, axis=0), pose[agent[some], token[some]])
 
 
 def _any_signal(shape):

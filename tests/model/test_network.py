@@ -207,7 +207,7 @@ def test_hidden_road_tokens_are_not_seen(network, record, limits):
 
 
 def test_signals_as_they_were_last_are_seen(new_network, tiny, record, limits):
-    network = new_network(replace(tiny, step_lights=False)).eval()
+    network = new_network(replace(tiny, step_lights=False, light_ahead_m=0.0)).eval()
     batch, before = run(network, [record(1)], limits)
     signal = (batch.roads.signal + 1) % 5
 
@@ -229,6 +229,17 @@ def test_a_light_that_changes_is_seen_from_then_on_and_not_before(network, recor
     gap = before.motion.rows.spread(after.motion.move_logits - before.motion.move_logits)
     assert gap[0, :4].abs().max() == 0
     assert gap[0, 4].abs().max() > 1e-3
+
+
+def test_agents_are_told_of_the_lines_ahead(network, record, limits):
+    batch, told = run(network, [record(1)], limits)
+    nowhere = torch.ones_like(batch.roads.follows)  # No lane begins: there are no lines.
+
+    with torch.no_grad():
+        untold = network(replace(batch, roads=replace(batch.roads, follows=nowhere)))
+
+    gap = told.motion.move_logits - untold.motion.move_logits
+    assert gap.abs().max() > 1e-3
 
 
 def test_the_ego_alone_is_told_that_it_is(new_network, record, limits):
