@@ -1,6 +1,6 @@
 """Does who stands first at a light set off when it turns green, and wait while it is red?
 
-Logs as they were, half second by half second, and what some weights expect of them::
+Logs, half second by half second as they are learned from, and what some weights expect::
 
     python benchmarks/at_the_lights.py ROOT [--weights ROOT/latest/train]
         [--split validation] [--scenes 80]
@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32
+from liveliness import STILL_M
 from loader import shards
 from torch import Tensor
 
@@ -34,8 +35,6 @@ from pipeline.screen import show_table
 from pipeline.splits import in_split
 from pipeline.weights import load_network
 
-STILL_M = 0.1
-"""Who moves less in half a second stands."""
 CLOSE_M = 12.0
 """A stop line so far ahead of a vehicle's centre is its next one."""
 NEAR_M = 15.0
@@ -178,6 +177,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         [unit for unit in units if in_split(read_manifest(unit)["name"], asked.split)]
     )
     count = min(asked.scenes, len(scenes))
+    if not count:
+        parser.error(f"{asked.root} has no tokens of split {asked.split}; see --split")
     found = [look(network, scenes[row]) for row in range(count)]
     print(json.dumps({"scenes": count, "rows": report(found)}))
 
