@@ -20,6 +20,8 @@ OPTIONS = {"preset": "veryfast", "crf": "20", "bf": "0", "x264-params": "sliced-
 GIF_COLOURS = 255
 GIF_TICK_S = 0.01
 """A GIF counts time in hundredths of a second."""
+_BOX_LEVELS = 8
+"""Colours so near to each other may stand for each other."""
 
 
 def encode_piece(
@@ -82,9 +84,15 @@ def gif_palette(
     """
     image = wanted("PIL.Image")
     chosen = image.fromarray(np.concatenate(samples)).quantize(GIF_COLOURS - len(kept))
-    colours = [*np.concatenate([rgb(colour) for colour in kept]).tolist()]
+    own = np.array([rgb(colour) for colour in kept])
+    others = np.array(chosen.getpalette()).reshape(-1, 3)
+    # Pillow looks colours up by boxes of a few levels: one next to a kept one may be taken
+    # in its place.
+    apart = np.abs(others[:, None] - own).max(axis=-1)
+    beside = (apart < _BOX_LEVELS).any(axis=1)
+    others[beside] = own[apart[beside].argmin(axis=1)]
     palette = image.new("P", (1, 1))
-    palette.putpalette([*colours, *chosen.getpalette()])
+    palette.putpalette(np.concatenate([own, others]).ravel().tolist())
     return palette
 
 

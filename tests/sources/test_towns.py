@@ -69,13 +69,15 @@ def test_a_scene_is_the_same_whoever_draws_it_and_with_which_others():
 @needs_sumo
 @pytest.mark.slow
 def test_scenes_may_be_longer_than_womds():
-    (scene,) = draw_scenes(2, "validation", 311, 0, 1)
+    # In a town that is wider than those of shorter scenes are.
+    (scene,) = draw_scenes(2, "validation", 600, 0, 1)
 
-    assert scene.tracks.num_steps == len(scene.timestamps_s) == 311
+    assert scene.tracks.num_steps == len(scene.timestamps_s) == 600
     assert scene.tracks.valid[scene.ego].all()
     # The truth goes on: agents come and go to the end.
     last = scene.tracks.valid[:, 200:]
     assert (~last[:, 0] & last.any(axis=1)).sum() > 3
+    assert _crossings(scene) > 3
 
 
 # Scenes
@@ -235,14 +237,14 @@ def test_nobody_runs_a_red_light(scenes):
 
 def _crossings(scene):
     """Count who crosses a stop line, and see that one of its lights let them."""
-    signals, tracks = scene.signals, scene.tracks
+    signals, tracks, steps = scene.signals, scene.tracks, scene.tracks.num_steps
     stops_m, of_stop = np.unique(signals.stop_xyz_m[:, :2], axis=0, return_inverse=True)
     crossed = 0
     for at, stop_m in enumerate(stops_m):
         rows = np.flatnonzero(of_stop == at)
         waits = np.isin(signals.state[rows], (SignalState.STOP, SignalState.ARROW_STOP))
-        lit = np.bincount(signals.step[rows], minlength=91)
-        red = (np.bincount(signals.step[rows], waits, minlength=91) == lit) & (lit > 0)
+        lit = np.bincount(signals.step[rows], minlength=steps)
+        red = (np.bincount(signals.step[rows], waits, minlength=steps) == lit) & (lit > 0)
         over = _crosses(scene, int(signals.lane_id[rows[0]]), stop_m)
         over &= (tracks.kind != AgentKind.PEDESTRIAN)[:, None]
         assert not over[:, red[1:]].any()

@@ -65,6 +65,7 @@ class Person:
         accel_mps2: How hard they speed up.
         brake_mps2: How hard they like to brake.
         aside_m: How far left of the middle of their lane they like to be.
+        hesitation_s: How long after they could they set off, if they have stood.
     """
 
     body: Body
@@ -74,6 +75,7 @@ class Person:
     accel_mps2: float
     brake_mps2: float
     aside_m: float
+    hesitation_s: float
 
 
 def draw_motorist(rng: np.random.Generator) -> Person:
@@ -89,6 +91,7 @@ def draw_motorist(rng: np.random.Generator) -> Person:
         accel_mps2=float(rng.uniform(0.9, 1.4) if heavy else rng.uniform(1.3, 2.9)),
         brake_mps2=float(rng.uniform(1.8, 2.6) if heavy else rng.uniform(1.9, 3.4)),
         aside_m=float(np.clip(rng.normal(0.0, 0.16), -0.35, 0.35)),
+        hesitation_s=draw_hesitation(rng),
     )
 
 
@@ -102,6 +105,7 @@ def draw_cyclist(rng: np.random.Generator) -> Person:
         accel_mps2=float(rng.uniform(0.7, 1.3)),
         brake_mps2=float(rng.uniform(1.5, 2.5)),
         aside_m=0.0,
+        hesitation_s=draw_hesitation(rng),
     )
 
 
@@ -115,7 +119,13 @@ def draw_walker(rng: np.random.Generator) -> Person:
         accel_mps2=1.0,
         brake_mps2=1.5,
         aside_m=0.0,
+        hesitation_s=0.0,
     )
+
+
+def draw_hesitation(rng: np.random.Generator) -> float:
+    """Draw how long somebody who may go takes to do so."""
+    return float(min(rng.lognormal(np.log(0.7), 0.5), 2.5))
 
 
 def draw_size(body: Body, rng: np.random.Generator) -> tuple[float, float, float]:

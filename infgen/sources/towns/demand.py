@@ -59,6 +59,11 @@ class Trip:
     route: list[str]
     anywhere: bool
 
+    @property
+    def drives(self) -> bool:
+        """Whether they go by vehicle or bicycle."""
+        return self.person.body is not Body.WALKER
+
 
 def draw_level(rng: np.random.Generator) -> Level:
     """Draw how much is going on, from next to nothing to dense."""
@@ -188,4 +193,5 @@ def _driving(person: Person) -> dict[str, str]:
         "latAlignment": "right" if cycling else f"{person.aside_m:.3f}",
         "maxSpeedLat": "0.8",
         "minGapLat": "0.5",
+        "startupDelay": f"{person.hesitation_s:.2f}",
     }

@@ -6,7 +6,7 @@ from jaxtyping import Float64
 from infgen.clock import CLOCK
 from infgen.scene import RoadMap, Signals, SignalState
 from infgen.sources.towns.network import Connector, SignalPlan
-from infgen.sources.towns.town import WARM_UP_S, Town
+from infgen.sources.towns.town import Town
 
 SEEN_M = 65.0
 """Lights are seen from within this distance."""
@@ -46,7 +46,7 @@ def draw_signals(
     stops_m = np.array([each.xy_m[0] for each in lit]).reshape(-1, 2)
     rows = []
     for step, at_m in enumerate(eye_m):
-        time_s = WARM_UP_S + (first_step + step) * CLOCK.step_s
+        time_s = town.begins_s + (first_step + step) * CLOCK.step_s
         near = np.linalg.norm(stops_m - at_m, axis=1) < SEEN_M
         for at in np.flatnonzero(near).tolist():
             letter = plans[at].shown(time_s)[lit[at].index]

@@ -37,9 +37,24 @@ class Played:
 
 
 def play(
-    net: Path, routes: Path, num_trips: int, start_s: float, num_steps: int, seed: int
+    net: Path,
+    routes: Path,
+    num_trips: int,
+    most_vehicles: int,
+    start_s: float,
+    num_steps: int,
+    seed: int,
 ) -> Played:
     """Play a town's traffic and record it from some time on.
+
+    Args:
+        net: SUMO's net.
+        routes: Its route file.
+        num_trips: How many the route file has.
+        most_vehicles: While there are so many nobody drives into town.
+        start_s: When the recording begins.
+        num_steps: How long it is.
+        seed: Of SUMO's draws.
 
     Raises:
         SumoError: if SUMO fails.
@@ -61,6 +76,7 @@ def play(
         "time-to-teleport.remove": True,
         "collision.action": "none",
         "max-depart-delay": 10,
+        "max-num-vehicles": most_vehicles,
         "precision": 3,
         "device.fcd.begin": f"{start_s:.1f}",
         "fcd-output.attributes": "id,x,y,angle,speed",

@@ -32,7 +32,8 @@ from infgen.sources.towns.streets import Street
 from infgen.sources.towns.surroundings import Surroundings, surround
 
 WARM_UP_S = 35.0
-"""Traffic runs so long before anyone records it."""
+"""Traffic runs so long before anyone records it; in wide towns as many times longer as they
+are wide."""
 _MOST_SEED = 1 << 31
 
 
@@ -49,6 +50,7 @@ class Town:
         size_lwh_m: Their boxes.
         car: Who drives a car.
         bodies: Where they are at each recorded step.
+        begins_s: Time of the first recorded step, as the plans of the lights count it.
     """
 
     network: Network
@@ -59,6 +61,7 @@ class Town:
     size_lwh_m: Float64[np.ndarray, "trip 3"]
     car: Bool[np.ndarray, " trip"]
     bodies: Bodies
+    begins_s: float
 
     @property
     def num_steps(self) -> int:
@@ -93,12 +96,17 @@ def make_town(rng: np.random.Generator, num_steps: int, spread: float = 1.0) -> 
             for link, street in enumerate(layout.street)
             for way in "fb"
         }
-        seconds = WARM_UP_S + num_steps * CLOCK.step_s
+        warm_up_s = WARM_UP_S * spread
+        seconds = warm_up_s + num_steps * CLOCK.step_s
         trips = draw_trips(network, draw_level(rng), seconds, rng)
         write_routes(trips, folder / "town.rou.xml")
         seed = int(rng.integers(_MOST_SEED))
-        played = play(net, folder / "town.rou.xml", len(trips), WARM_UP_S, num_steps, seed)
-    return _with_traffic(network, streets, trips, follow(played, *_bodies(trips)), rng)
+        first = sum(trip.drives and trip.depart_s == 0 for trip in trips)
+        played = play(
+            net, folder / "town.rou.xml", len(trips), first, warm_up_s, num_steps, seed
+        )
+    bodies = follow(played, *_bodies(trips))
+    return _with_traffic(network, streets, trips, bodies, warm_up_s, rng)
 
 
 def _bodies(trips: list[Trip]) -> tuple[np.ndarray, np.ndarray]:
@@ -112,6 +120,7 @@ def _with_traffic(
     streets: dict[str, Street],
     trips: list[Trip],
     bodies: Bodies,
+    begins_s: float,
     rng: np.random.Generator,
 ) -> Town:
     size_lwh_m = np.array([trip.person.size_lwh_m for trip in trips])
@@ -137,4 +146,5 @@ def _with_traffic(
         size_lwh_m=size_lwh_m,
         car=np.array([trip.person.body is Body.CAR for trip in trips]),
         bodies=bodies,
+        begins_s=begins_s,
     )

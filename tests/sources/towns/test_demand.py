@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from infgen.scene import AgentKind
-from infgen.sources.towns.bodies import Body, draw_motorist, draw_size
+from infgen.sources.towns.bodies import Body, draw_hesitation, draw_motorist, draw_size
 from infgen.sources.towns.demand import (
     NUM_WANDERERS,
     Level,
@@ -139,3 +139,11 @@ def test_most_motorists_drive_cars():
     bodies = [draw_motorist(np.random.default_rng(seed)).body for seed in range(300)]
 
     assert 0.8 < bodies.count(Body.CAR) / 300 < 0.95
+
+
+def test_half_of_drivers_take_more_than_a_moment_to_set_off():
+    hesitation_s = [draw_hesitation(np.random.default_rng(seed)) for seed in range(400)]
+
+    assert np.median(hesitation_s) == pytest.approx(0.7, abs=0.1)
+    assert min(hesitation_s) > 0
+    assert max(hesitation_s) <= 2.5

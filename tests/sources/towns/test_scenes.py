@@ -46,6 +46,7 @@ def town(crossing):
         size_lwh_m=np.array([[4.8, 2.0, 1.6]] * 2),
         car=np.array([True, True]),
         bodies=Bodies(pose, velocity_mps, np.ones((2, STEPS), bool)),
+        begins_s=35.0,
     )
 
 
@@ -183,6 +184,18 @@ def test_lights_are_recorded_while_they_are_near(town):
     shown = {SignalState(state) for state in signals.state}
     assert shown & {SignalState.GO, SignalState.ARROW_GO}
     assert shown & {SignalState.STOP, SignalState.ARROW_STOP}
+
+
+def test_lights_are_those_of_the_time_at_which_the_town_is_recorded(town):
+    here = np.zeros((20, 2))
+    later = replace(town, begins_s=town.begins_s + 4.0)
+
+    one = draw_signals(town, town.road_map, 40, here)
+    same = draw_signals(later, town.road_map, 0, here)
+    other = draw_signals(town, town.road_map, 0, here)
+
+    np.testing.assert_array_equal(one.state, same.state)
+    assert (one.state != other.state).any()
 
 
 def test_random_streams_depend_on_their_words_alone():
