@@ -21,7 +21,7 @@ class CalibrateSettings:
             is ``odds``.
             ``none`` adds nothing.
         split: Split whose scenes are played for it (start of the file name): never that of
-            the rollouts that are scored.
+            the rollouts that are scored, but as long as those, and with as much of a map.
         scenes: Scenes to play, of all files alike, each once with every pair of biases; 0
             for all of the split.
         scenes_per_task: Scenes of one unit of work.

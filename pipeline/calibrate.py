@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 from infgen.clock import CLOCK
 from infgen.config import CalibrateSettings, RolloutSettings, TokenSettings
 from pipeline.calibration import Biases, read_biases, write_found
+from pipeline.plan import PlanError
 from pipeline.playing import begin, load_player, play_all, read_some
-from pipeline.splits import in_split, shares
+from pipeline.splits import in_split, shares, split_of
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
 if TYPE_CHECKING:
@@ -84,8 +85,19 @@ def _reach(weights: Path, how: CalibrateSettings) -> Any:
 
 
 def _parts(inputs: Inputs, how: CalibrateSettings) -> list[list[tuple[Done, int, int]]]:
-    """Cut the scenes into parts for one unit each: file, first scene, how many."""
-    files = [done for done in inputs.units("ingest") if in_split(done.name, how.split)]
+    """Cut the scenes into parts for one unit each: file, first scene, how many.
+
+    Raises:
+        PlanError: if there is no file of the split.
+    """
+    every = inputs.units("ingest")
+    files = [done for done in every if in_split(done.name, how.split)]
+    if not files:
+        found = ", ".join(sorted({split_of(done.name) for done in every})) or "none"
+        raise PlanError(
+            f"no file of split {how.split!r} to play and calibrate by (there is: {found}); "
+            "set calibrate.split, or calibrate.by"
+        )
     parts: list[list[tuple[Done, int, int]]] = [[]]
     room = how.scenes_per_task
     for done, count in zip(files, shares(files, how.scenes), strict=True):

@@ -11,6 +11,7 @@ from infgen.scene import Scene
 from pipeline import calibrate as stage
 from pipeline import ingest
 from pipeline.calibration import Biases, read_found
+from pipeline.plan import PlanError
 from pipeline.response import DESIGN
 from pipeline.stage import Done
 from pipeline.store import write_records
@@ -89,6 +90,13 @@ def test_every_pair_of_biases_is_played_on_the_same_scenes(inputs):
     adds = [unit.task["biases"]["add"] for unit in units[::2]]
     assert min(adds) == pytest.approx(math.log(3), abs=1e-4)
     assert max(adds) - min(adds) == pytest.approx(0.8, abs=1e-4)
+
+
+def test_a_split_of_which_there_is_no_file_is_named_with_those_that_there_are(inputs):
+    asked = stage.narrow(with_settings("calibrate", split="tuning"))
+
+    with pytest.raises(PlanError, match=r"'tuning'.*there is: training, validation.*split"):
+        stage.plan(inputs, asked)
 
 
 @pytest.mark.parametrize(
