@@ -146,7 +146,7 @@ def write_routes(trips: list[Trip], path: Path) -> None:
     for at, trip in enumerate(trips):
         _write_type(root, f"t{at}", trip.person)
         about = {"id": str(at), "type": f"t{at}", "depart": f"{trip.depart_s:.1f}"}
-        if trip.person.body is Body.WALKER:
+        if not trip.drives:
             person = SubElement(root, "person", about | {"departPos": "random"})
             SubElement(person, "walk", {"edges": " ".join(trip.route)})
             continue

@@ -112,7 +112,7 @@ def make_town(rng: np.random.Generator, num_steps: int, spread: float = 1.0) -> 
 def _bodies(trips: list[Trip]) -> tuple[np.ndarray, np.ndarray]:
     """Length of everyone, and who walks."""
     length_m = np.array([trip.person.size_lwh_m[0] for trip in trips])
-    return length_m, np.array([trip.person.body is Body.WALKER for trip in trips])
+    return length_m, np.array([not trip.drives for trip in trips])
 
 
 def _with_traffic(
