@@ -22,8 +22,8 @@ class CalibrateSettings:
             ``none`` adds nothing.
         split: Split whose scenes are played for it (start of the file name): never that of
             the rollouts that are scored, but as long as those, and with as much of a map.
-        scenes: Scenes to play, of all files alike, each once with every pair of biases; 0
-            for all of the split.
+        scenes: Scenes to play, evenly spread over those of the split, each once with every
+            pair of biases; 0 for all.
         scenes_per_task: Scenes of one unit of work.
         add_reach: Plays are up to this far above the odds' own bias of entering; what is
             taken may lie half as far again to either side.

@@ -48,7 +48,7 @@ class RolloutSettings:
         mode: ``long``, ``motion-only`` or ``wosac``: see ``MODES``.
         seconds: Length of a rollout after the history; the mode's if None.
         count: Rollouts per scene.
-        scenes: Scenes to play, the first ones of all files alike; 0 for all of the split.
+        scenes: Scenes to play, evenly spread over those of the split; 0 for all.
         scenes_per_task: Scenes of one unit of work.
         batch: Rollouts that are played at once.
         everyone: Whether to play every agent of the log that is there at now, however far

@@ -8,7 +8,8 @@ alike. Where the last validation of the training is to decide, there are no unit
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
-from itertools import chain
+from itertools import chain, groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ from infgen.config import CalibrateSettings, RolloutSettings, TokenSettings
 from pipeline.calibration import Biases, read_biases, write_found
 from pipeline.plan import PlanError
 from pipeline.playing import begin, load_player, play_all, read_some
-from pipeline.splits import in_split, shares, split_of
+from pipeline.splits import in_split, split_of, spread
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
 if TYPE_CHECKING:
@@ -69,8 +70,8 @@ def plan(inputs: Inputs, settings: Settings) -> list[Unit]:
                         "biases": biases,
                         "point": point,
                         "pieces": [
-                            {"scenes": str(done.path), "first": first, "count": count}
-                            for done, first, count in pieces
+                            {"scenes": str(done.path), "rows": rows}
+                            for done, rows in pieces
                         ],
                     },
                 )
@@ -84,8 +85,8 @@ def _reach(weights: Path, how: CalibrateSettings) -> Any:
     return Reach(read_biases(weights), how.add_reach, how.leave_reach)
 
 
-def _parts(inputs: Inputs, how: CalibrateSettings) -> list[list[tuple[Done, int, int]]]:
-    """Cut the scenes into parts for one unit each: file, first scene, how many.
+def _parts(inputs: Inputs, how: CalibrateSettings) -> list[list[tuple[Done, list[int]]]]:
+    """Cut the scenes into parts for one unit each: file, rows of its scenes.
 
     Raises:
         PlanError: if there is no file of the split.
@@ -98,18 +99,14 @@ def _parts(inputs: Inputs, how: CalibrateSettings) -> list[list[tuple[Done, int,
             f"no file of split {how.split!r} to play and calibrate by (there is: {found}); "
             "set calibrate.split, or calibrate.by"
         )
-    parts: list[list[tuple[Done, int, int]]] = [[]]
-    room = how.scenes_per_task
-    for done, count in zip(files, shares(files, how.scenes), strict=True):
-        first = 0
-        while first < count:
-            if room == 0:
-                parts.append([])
-                room = how.scenes_per_task
-            some = min(room, count - first)
-            parts[-1].append((done, first, some))
-            first, room = first + some, room - some
-    return [part for part in parts if part]
+    chosen = zip(files, spread(files, how.scenes), strict=True)
+    scenes = [(done, row) for done, rows in chosen for row in rows]
+    most = how.scenes_per_task
+    parts = [scenes[at : at + most] for at in range(0, len(scenes), most)]
+    return [
+        [(done, [row for _, row in some]) for done, some in groupby(part, itemgetter(0))]
+        for part in parts
+    ]
 
 
 def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Report:
@@ -154,7 +151,7 @@ def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Re
 
 def _scenes(unit: Unit) -> Iterator[Any]:
     for piece in unit.task["pieces"]:
-        yield from read_some(Path(piece["scenes"]), piece["first"], piece["count"])
+        yield from read_some(Path(piece["scenes"]), piece["rows"])
 
 
 def finish(
@@ -230,7 +227,7 @@ def _rates(counts: "Turnover") -> dict[str, float | None]:
 
 STAGE = Stage(
     name="calibrate",
-    version=2,
+    version=3,
     settings={
         "tokenize": TokenSettings,
         "rollout": RolloutSettings,

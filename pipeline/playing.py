@@ -49,11 +49,13 @@ def load_player(
     return player, str(read_about(weights)["weights"])
 
 
-def read_some(folder: Path, first: int, count: int) -> "Iterator[Scene]":
-    """Read some scenes of an ingested file."""
+def read_some(folder: Path, rows: Sequence[int]) -> "Iterator[Scene]":
+    """Read some scenes of an ingested file; rows are ascending."""
     from pipeline.ingest import read_scenes  # noqa: PLC0415
 
-    return islice(read_scenes(folder), first, first + count)
+    wanted = set(rows)
+    scenes = islice(read_scenes(folder), max(rows, default=-1) + 1)
+    return (scene for row, scene in enumerate(scenes) if row in wanted)
 
 
 def begin(player: "Player", scene: "Scene") -> "list[Start]":

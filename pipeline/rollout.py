@@ -6,8 +6,8 @@ overhead. What a rollout does depends on its scene, its index and the seed alone
 
 import math
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from infgen.config import RolloutSettings
 from pipeline.calibration import Biases, read_found
 from pipeline.parquet import Fields, joined, table
 from pipeline.playing import begin, load_player, play_all, read_some
-from pipeline.splits import in_split, shares
+from pipeline.splits import in_split, spread
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
 if TYPE_CHECKING:
@@ -38,27 +38,52 @@ INDEX: Fields = {
 }
 
 
+OF_ENTRIES = (
+    "add_bias",
+    "entry_mask",
+    "entry_lane_m",
+    "entry_tries",
+    "max_entries",
+    "top_cells",
+    "cell_nucleus",
+    "cell_temperature",
+    "heading_temperature",
+)
+OF_EXITS = ("leave_bias", "leave_radius_m")
+
+
+def narrow(sections: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Set what is about who enters, or leaves, to its default where nobody does."""
+    settings: RolloutSettings = sections["rollout"]
+    idle = (() if settings.inserts else OF_ENTRIES) + (() if settings.removes else OF_EXITS)
+    usual = RolloutSettings()
+    return {"rollout": replace(settings, **{name: getattr(usual, name) for name in idle})}
+
+
 def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
     """Cut each shard, or a part of it, into units of about equally many scenes."""
     weights = inputs.folder("train")
     identity = inputs.content("train", "model.safetensors", "model.json")
-    biases = asdict(read_found(inputs.folder("calibrate")))
+    found = read_found(inputs.folder("calibrate"))
+    biases = Biases(
+        add=found.add if settings.inserts else 0.0,
+        leave=found.leave if settings.removes else 0.0,
+    )
     shards = [
         done for done in inputs.units("ingest") if in_split(done.name, settings.split)
     ]
     units = []
-    for done, scenes in zip(shards, shares(shards, settings.scenes), strict=True):
-        for first, after in pairwise(_edges(scenes, settings.scenes_per_task)):
+    for done, rows in zip(shards, spread(shards, settings.scenes), strict=True):
+        for first, after in pairwise(_edges(len(rows), settings.scenes_per_task)):
             units.append(
                 Unit(
-                    name=f"{done.name}-{first:05d}",
+                    name=f"{done.name}-{rows[first]:05d}",
                     inputs={"scenes": done.key, "weights": identity},
                     task={
                         "scenes": str(done.path),
                         "weights": str(weights),
-                        "biases": biases,
-                        "first": first,
-                        "count": after - first,
+                        "biases": asdict(biases),
+                        "rows": rows[first:after],
                     },
                 )
             )
@@ -145,7 +170,7 @@ def _starts(unit: Unit, player: "Player") -> "tuple[list[Start], list[str]]":
     """Begin all rollouts; scenes that cannot be played are named with the reason."""
     task = unit.task
     starts, refused = [], []
-    for scene in read_some(Path(task["scenes"]), task["first"], task["count"]):
+    for scene in read_some(Path(task["scenes"]), task["rows"]):
         try:
             starts += begin(player, scene)
         except ValueError as error:
@@ -176,11 +201,12 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=4,
+    version=5,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=play,
     finish=finish,
+    narrow=narrow,
     modules=(
         "infgen.nearest",
         "infgen.road_edges",

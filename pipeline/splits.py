@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
 
+import numpy as np
+
 from pipeline.stage import Done
 
 
@@ -27,11 +29,25 @@ def in_split(name: str, split: str) -> bool:
     return split_of(name) == split
 
 
-def shares(files: Sequence[Done], most: int) -> list[int]:
-    """Scenes to take of each ingested file, of all alike; all of them if ``most`` is 0."""
+def spread(files: Sequence[Done], most: int) -> list[list[int]]:
+    """Choose scenes of ingested files, evenly spread over all of them.
+
+    Neighbours in a file may be alike: views of one town, cuts of one drive.
+
+    Args:
+        files: Of one split, in order.
+        most: How many scenes to choose; 0 for all.
+
+    Returns:
+        For each file the rows of its scenes, ascending.
+    """
     counts = [int(done.report["scenes"]) for done in files]
     total = sum(counts)
-    if most == 0 or most >= total:
-        return counts
-    ends = [end * most // total for end in accumulate(counts, initial=0)]
-    return [end - begin for begin, end in pairwise(ends)]
+    chosen = np.arange(total)
+    if 0 < most < total:
+        chosen = np.arange(most) * total // most
+    ends = accumulate(counts, initial=0)
+    return [
+        (chosen[(chosen >= begin) & (chosen < end)] - begin).tolist()
+        for begin, end in pairwise(ends)
+    ]

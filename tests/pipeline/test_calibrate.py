@@ -80,13 +80,10 @@ def test_every_pair_of_biases_is_played_on_the_same_scenes(inputs):
     scenes = {json.dumps(unit.task["pieces"]) for unit in units}
     assert len(scenes) == 2
     first, second = units[:2]
-    assert [piece["count"] for piece in first.task["pieces"]] == [1, 1]
-    assert [piece["count"] for piece in second.task["pieces"]] == [1]
-    assert set(first.inputs) == {
-        "weights",
-        "scenes/training.tfrecord-0",
-        "scenes/training.tfrecord-1",
-    }
+    assert [piece["rows"] for piece in first.task["pieces"]] == [[0, 1]]
+    assert [piece["rows"] for piece in second.task["pieces"]] == [[0]]
+    assert set(first.inputs) == {"weights", "scenes/training.tfrecord-0"}
+    assert set(second.inputs) == {"weights", "scenes/training.tfrecord-1"}
     adds = [unit.task["biases"]["add"] for unit in units[::2]]
     assert min(adds) == pytest.approx(math.log(3), abs=1e-4)
     assert max(adds) - min(adds) == pytest.approx(0.8, abs=1e-4)

@@ -1,4 +1,5 @@
 import dataclasses
+from itertools import chain
 
 import numpy as np
 import polars as pl
@@ -54,7 +55,7 @@ def test_the_split_is_cut_into_units_of_a_few_scenes(inputs):
     assert [unit.name for unit in units] == [
         f"validation.tfrecord-0-0000{first}" for first in (0, 2, 4)
     ]
-    assert [unit.task["count"] for unit in units] == [2, 2, 1]
+    assert [unit.task["rows"] for unit in units] == [[0, 1], [2, 3], [4]]
     assert units[0].inputs == {
         "scenes": "key of validation.tfrecord-0",
         "weights": "content of train",
@@ -71,8 +72,9 @@ def test_units_are_of_about_equal_work(inputs, scenes, most, parts):
 
     units = stage.STAGE.plan(Finished([shard], inputs.weights), settings)
 
-    assert [unit.task["count"] for unit in units] == parts
-    assert [unit.task["first"] for unit in units] == list(np.cumsum([0, *parts])[:-1])
+    found = [unit.task["rows"] for unit in units]
+    assert [len(rows) for rows in found] == parts
+    assert list(chain.from_iterable(found)) == list(range(scenes))
 
 
 def test_the_pace_is_told_and_kept_apart_from_what_is_reproducible(inputs, tmp_path):
@@ -99,27 +101,41 @@ def test_the_calibrated_biases_are_added_to_those_of_the_settings(inputs, tmp_pa
     assert (report["add_bias"], report["leave_bias"]) == (1.75, -0.5)
 
 
-def test_scenes_may_be_limited(inputs):
+def test_of_limited_scenes_those_far_apart_are_played(inputs, tmp_path):
     units = stage.STAGE.plan(inputs, dataclasses.replace(SETTINGS, scenes=3))
 
-    assert [unit.task["count"] for unit in units] == [2, 1]
+    assert [unit.name[-5:] for unit in units] == ["00000", "00003"]
+    assert [unit.task["rows"] for unit in units] == [[0, 1], [3]]
+    _, rollouts = play(units[1], tmp_path / "last")
+    assert {rollout.scenario_id for rollout in rollouts} == {"scene 3"}
 
 
 @pytest.mark.parametrize(
-    ("most", "parts"), [(0, [9, 1, 4]), (14, [9, 1, 4]), (7, [4, 1, 2]), (1, [0, 0, 1])]
+    ("nobody", "idle"),
+    [
+        ({"mode": "motion-only"}, {"add_bias": 1.0, "leave_bias": 1.0, "entry_tries": 9}),
+        ({"insert": False}, {"add_bias": 1.0, "max_entries": 3, "top_cells": 5}),
+        ({"remove": False}, {"leave_bias": 1.0, "leave_radius_m": 70.0}),
+    ],
 )
-def test_of_all_files_alike_some_scenes_are_played(inputs, most, parts):
-    path = inputs.scenes[1].path
-    shards = [
-        Done(f"validation.tfrecord-{at}", "key", path, {"scenes": count})
-        for at, count in enumerate((9, 1, 4))
-    ]
-    settings = dataclasses.replace(SETTINGS, scenes=most, scenes_per_task=99)
+def test_what_is_about_who_enters_or_leaves_decides_nothing_where_nobody_does(
+    inputs, nobody, idle
+):
+    narrow = stage.STAGE.narrow
+    plain, other = (
+        dataclasses.replace(SETTINGS, scenes=1, **nobody, **more) for more in ({}, idle)
+    )
+    write_found(inputs.calibrated, Biases(add=0.75, leave=-0.5))
 
-    units = stage.STAGE.plan(Finished(shards, inputs.weights), settings)
+    (unit,) = stage.STAGE.plan(inputs, plain)
 
-    found = {unit.name.rsplit("-", 1)[0]: unit.task["count"] for unit in units}
-    assert [found.get(shard.name, 0) for shard in shards] == parts
+    assert narrow({"rollout": other}) == narrow({"rollout": plain}) == {"rollout": plain}
+    assert unit.task["biases"] == {
+        "add": 0.75 if plain.inserts else 0.0,
+        "leave": -0.5 if plain.removes else 0.0,
+    }
+    everyone = {"rollout": dataclasses.replace(SETTINGS, **idle)}
+    assert narrow(everyone) == everyone
 
 
 def test_every_scene_of_a_unit_is_played_as_often_as_asked(inputs, tmp_path):

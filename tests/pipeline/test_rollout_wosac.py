@@ -44,9 +44,7 @@ def played(record, metre_moves, bent_roads, tmp_path_factory, quiet):
         folder.mkdir()
     save_network(weights, network, state_of(network), step=0)
     paths = {"scenes": str(scenes), "weights": str(weights)}
-    unit = Unit(
-        "v-00000", {"weights": "random"}, {**paths, "biases": {}, "first": 0, "count": 1}
-    )
+    unit = Unit("v-00000", {"weights": "random"}, {**paths, "biases": {}, "rows": [0]})
     report = STAGE.work(unit, target, RolloutSettings(mode="wosac", batch=16), quiet)
     assert (report["rollouts"], report["inserted"], report["left"]) == (32, 0, 0)
     return target

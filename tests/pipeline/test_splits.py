@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.splits import in_split, shares, split_of
+from pipeline.splits import in_split, split_of, spread
 from pipeline.stage import Done
 
 
@@ -32,10 +32,28 @@ def test_a_file_is_of_its_own_split_only():
     assert not in_split(name, "training")
 
 
-@pytest.mark.parametrize(
-    ("most", "taken"), [(0, [9, 1, 4]), (14, [9, 1, 4]), (7, [4, 1, 2]), (1, [0, 0, 1])]
-)
-def test_of_all_files_alike_some_scenes_are_taken(most, taken):
-    files = [Done(str(at), "key", Path(), {"scenes": n}) for at, n in enumerate((9, 1, 4))]
+ALL = [list(range(9)), [0], [0, 1, 2, 3]]
 
-    assert shares(files, most) == taken
+
+def files_of(*counts):
+    return [Done(str(at), "key", Path(), {"scenes": n}) for at, n in enumerate(counts)]
+
+
+@pytest.mark.parametrize(
+    ("most", "taken"),
+    [
+        (0, ALL),
+        (14, ALL),
+        (99, ALL),
+        (7, [[0, 2, 4, 6, 8], [], [0, 2]]),
+        (4, [[0, 3, 7], [], [0]]),
+        (1, [[0], [], []]),
+    ],
+)
+def test_scenes_are_taken_evenly_from_all_files_and_within_each(most, taken):
+    assert spread(files_of(9, 1, 4), most) == taken
+
+
+def test_of_towns_of_ten_views_each_one_view_is_taken_of_every_town():
+    assert spread(files_of(20, 20, 20), 6) == [[0, 10]] * 3
+    assert spread([], 6) == []
