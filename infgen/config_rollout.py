@@ -73,6 +73,10 @@ class RolloutSettings:
             first, as in the paper.
         stay_on_road: Whether half of these draws are also for vehicles that would leave the
             road within a second, or go farther off it. Who is more than a metre off may.
+        patience_s: Vehicles that have stood in a lane for so long set off, unless a light
+            that is not green is ahead or they would run into somebody; 0 for who stands as
+            long as it likes, as in the paper. A network that looks back for a few seconds
+            takes whoever has stood all of them for parked.
         move_temperature: Logits of moves are divided by it: below 1 the likely become
             likelier.
         cell_temperature: The same for cells.
@@ -110,6 +114,7 @@ class RolloutSettings:
     cell_nucleus: float = 1.0
     move_tries: int = 1
     stay_on_road: bool = False
+    patience_s: float = 0.0
     move_temperature: float = 1.0
     cell_temperature: float = 1.0
     heading_temperature: float = 1.0
@@ -151,6 +156,12 @@ class RolloutSettings:
                 "rollout.stay_on_road draws moves again, but rollout.move_tries is "
                 f"{self.move_tries}; say rollout.move_tries=32 too"
             )
+        if self.patience_s and self.move_tries < 2:
+            raise ConfigError(
+                f"rollout.patience_s is {self.patience_s}, but rollout.move_tries is "
+                f"{self.move_tries}: who sets off may run into somebody; say "
+                "rollout.move_tries=32 too"
+            )
         self._check_numbers()
 
     def _check_numbers(self) -> None:
@@ -174,6 +185,7 @@ class RolloutSettings:
             ("top_moves", 0, math.inf),
             ("top_cells", 0, math.inf),
             ("move_tries", 1, math.inf),
+            ("patience_s", 0, math.inf),
             ("entry_lane_m", 0, math.inf),
             ("entry_tries", 1, math.inf),
             ("max_entries", 0, math.inf),

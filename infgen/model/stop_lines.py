@@ -97,6 +97,18 @@ class StopLines:
         told = torch.cat([there[..., None], near[..., None], lasting], dim=-1)
         return told.to(pose.dtype).flatten(1)
 
+    def shown_ahead(
+        self,
+        pose: Float32[Tensor, "row 3"],
+        scene: Int64[Tensor, " row"],
+        token: Int64[Tensor, " row"],
+        reach_m: float,
+    ) -> Bool[Tensor, "row shown"]:
+        """Tell every row whether a line ahead shows each class, or did when last seen."""
+        told = self.ahead(pose, scene, token, reach_m)
+        there = told.view(len(pose), CLASSES, 2 + LONG_SINCE)[..., 0] > 0
+        return there[:, :REMEMBERED] | there[:, REMEMBERED:]
+
 
 def features() -> int:
     """Width of what ``StopLines.ahead`` tells."""

@@ -29,7 +29,7 @@ class Kerbs:
     def __init__(self, scene: Scene) -> None:
         """Look at nothing yet."""
         self._edges = edges_of(scene, flat=True)
-        self._lanes = _lanes(scene)
+        self._lanes = lane_pieces(scene)
         self._row: dict[int, int] = {}
         self._off_m = np.zeros((0, TILE + 1, TILE + 1), dtype=np.float32)
 
@@ -78,12 +78,12 @@ class Kerbs:
         points_m[:, :2] = at.reshape(-1, 2) * np.float32(POINT_M)
         off_m = signed_distance_m(points_m, edges)
         off = np.flatnonzero(off_m > 0)
-        lane_m = _distance_m(points_m[off], *self._lanes) - np.float32(LANE_M)
+        lane_m = lanes_distance_m(points_m[off], *self._lanes) - np.float32(LANE_M)
         off_m[off] = np.minimum(off_m[off], lane_m)
         return off_m.reshape(at.shape[:-1])
 
 
-def _lanes(
+def lane_pieces(
     scene: Scene,
 ) -> tuple[Float32[np.ndarray, "piece 3"], Float32[np.ndarray, "piece 3"]]:
     """All pieces of lanes, flat: first points, and the ways to their last points."""
@@ -95,7 +95,7 @@ def _lanes(
     return flat_m[row], flat_m[row + 1] - flat_m[row]
 
 
-def _distance_m(
+def lanes_distance_m(
     points_m: Float32[np.ndarray, "point 3"],
     start_m: Float32[np.ndarray, "piece 3"],
     along_m: Float32[np.ndarray, "piece 3"],
@@ -113,6 +113,7 @@ def find_departures(
     before: Population,
     which: Bool[np.ndarray, "rollout row"],
     ways: Float32[np.ndarray, "rollout row looked 3"],
+    moments: Int64[np.ndarray, "rollout row"],
     kerbs: Sequence[Kerbs],
     scene: Int64[np.ndarray, " rollout"],
 ) -> Bool[np.ndarray, "rollout row"]:
@@ -122,6 +123,7 @@ def find_departures(
         before: Everyone at the beginning of the half second.
         which: Who is asked about.
         ways: Where everyone is to be, one moment after the other.
+        moments: How many of these count for each.
         kerbs: Of each map.
         scene: Map of each rollout.
     """
@@ -130,9 +132,12 @@ def find_departures(
     poses = np.concatenate([before.pose[:, :, None], ways], axis=2)
     for at, edge in enumerate(kerbs):
         rollout, row = np.nonzero(vehicle & (scene == at)[:, None])
-        size_lw_m = before.size_lwh_m[rollout, row, None, :2]
-        corners_m = box_corners(poses[rollout, row], size_lw_m)  # [vehicle, moment, 4, 2]
-        off_m = edge.off_m(corners_m.reshape(-1, 2)).reshape(corners_m.shape[:-1])
+        counts = np.arange(poses.shape[2]) <= moments[rollout, row, None]  # now, and then
+        who, moment = np.nonzero(counts)
+        size_lw_m = before.size_lwh_m[rollout[who], row[who], :2]
+        corners_m = box_corners(poses[rollout[who], row[who], moment], size_lw_m)
+        off_m = np.full((*counts.shape, 4), -np.inf, dtype=np.float32)
+        off_m[counts] = edge.off_m(corners_m.reshape(-1, 2)).reshape(-1, 4)
         now_m, then_m = off_m[:, 0].max(axis=1), off_m[:, 1:].max(axis=(1, 2))
         farther = then_m > np.maximum(now_m, 0) + np.float32(SLACK_M)
         departs[rollout, row] = farther & (now_m < OFF_M)

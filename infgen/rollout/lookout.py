@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float32, Int64
 
+from infgen.clock import CLOCK
 from infgen.rollout.clearance import LOOKED_AT, find_hits, repeat
 from infgen.rollout.kerbs import Kerbs, find_departures
 from infgen.rollout.population import Population
@@ -15,8 +16,11 @@ from infgen.tokens.scene_tokens import Presence
 
 CLEAR_AHEAD = 3
 """Half seconds that everybody is taken to go on alike where it is asked who meets whom."""
-ROAD_AHEAD = 2
-"""The same where it is asked who leaves the road: cars that turn do not turn for long."""
+ROAD_AHEAD = (2, 5)
+"""The same where it is asked who leaves the road: at least, as cars that turn do not turn
+for long, and at most. Between these it is as far as a car needs to stop ..."""
+BRAKES_MPS2 = 4.0
+"""... if it brakes so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +55,43 @@ class Lookout:
         """
         there = (before.presence != Presence.ABSENT) & (before.presence != Presence.LEAVING)
         moving = there & ~self.codebook.standing[before.kind, move]
-        ways = repeat(before, move, self.codebook, CLEAR_AHEAD)
-        hits = find_hits(before, there, ways) & moving
+        ways = repeat(before, move, self.codebook, max(CLEAR_AHEAD, *ROAD_AHEAD))
+        soon = ways[:, :, : CLEAR_AHEAD * len(LOOKED_AT)]
+        hits = find_hits(before, there, soon) & moving
         if not road or not self.kerbs:
             return hits, np.zeros_like(hits)
-        soon = ways[:, :, : ROAD_AHEAD * len(LOOKED_AT)]
-        return hits, find_departures(before, moving & drawn, soon, self.kerbs, self.scene)
+        moments = len(LOOKED_AT) * self._road_ahead(before, move)
+        asked = moving & drawn
+        departs = find_departures(before, asked, ways, moments, self.kerbs, self.scene)
+        return hits, departs
+
+    def is_slower(
+        self,
+        before: Population,
+        move: Int64[np.ndarray, "rollout row"],
+        other: Int64[np.ndarray, "rollout row"],
+    ) -> Bool[np.ndarray, "rollout row"]:
+        """Tell whose move is shorter than another."""
+        return self._way_m(before, move) < self._way_m(before, other)
+
+    def is_fast(
+        self, before: Population, move: Int64[np.ndarray, "rollout row"]
+    ) -> Bool[np.ndarray, "rollout row"]:
+        """Tell who cannot stop in the time that everybody looks ahead for the road."""
+        return self._road_ahead(before, move) > ROAD_AHEAD[0]
+
+    def _way_m(
+        self, before: Population, move: Int64[np.ndarray, "rollout row"]
+    ) -> Float32[np.ndarray, "rollout row"]:
+        way_m: np.ndarray = self.codebook.end_pose[before.kind, move, :2]
+        return np.linalg.norm(way_m, axis=-1)
+
+    def _road_ahead(
+        self, before: Population, move: Int64[np.ndarray, "rollout row"]
+    ) -> Int64[np.ndarray, "rollout row"]:
+        """Half seconds of each one's move that it takes as far as it needs to stop."""
+        stops_s = self._way_m(before, move) / CLOCK.token_s / (2 * BRAKES_MPS2)
+        return np.ceil(stops_s / CLOCK.token_s).clip(*ROAD_AHEAD).astype(np.int64)
 
 
 def look_out(

@@ -10,6 +10,7 @@ The order within a half second is SPEC 12.2's: everyone moves, whoever leaves is
 then newcomers enter one by one until the network says that motion begins.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -20,12 +21,14 @@ from torch import Tensor
 
 from infgen.clock import CLOCK
 from infgen.geometry import wrap_angle
-from infgen.model.batch import collate_roads
+from infgen.model.batch import Roads, collate_roads
 from infgen.model.columns import MotionStep
 from infgen.model.relations import Rows
 from infgen.model.steps import Memory
+from infgen.model.stop_lines import StopLines
 from infgen.rollout.lookout import look_out
 from infgen.rollout.newcomers import Asking, add_newcomers
+from infgen.rollout.patience import Patience
 from infgen.rollout.player import Player
 from infgen.rollout.population import (
     EGO_ROW,
@@ -65,7 +68,11 @@ class Session:
         self._player = player
         self._streams = [Stream.of(s.seed, s.scene.scenario_id, s.index) for s in starts]
         history = settle(starts, player.settings.max_agents)
-        self._memory, self._asking = _begin(player, starts, self._streams, history[0])
+        roads = _lay_out(starts)
+        self._memory, self._asking = _begin(
+            player, roads, starts, self._streams, history[0]
+        )
+        self._patience = _be_patient(player, roads, starts)
         for population in history[:-1]:
             player.stepper.motion_step(self._memory, player.column(population))
         self.population = history[-1]
@@ -155,23 +162,15 @@ class Session:
         """Sample everyone's move, and who leaves; drive the egos that are driven."""
         player, settings = self._player, self._player.settings
         move = self._moves(before, said, token)
+        move = self._hurry(before, said, token, move)
         if ego_path is not None:
             target, pose = ego_path[:, -1], before.pose[:, EGO_ROW]
             kind = before.kind[:, EGO_ROW]
             move[:, EGO_ROW], _ = follow(target, pose, kind, self._table)
         leave = self._leaves(said, token)
-        again = np.ones(move.shape, dtype=bool)
-        for attempt in range(1, settings.move_tries):
-            # Whom the road and the others leave no way out is to spare the others.
-            road = attempt <= settings.move_tries // 2
-            hits, departs = self._lookout.go_wrong(before, move, again, road=road)
-            again = hits | departs
-            if ego_path is not None:
-                again[:, EGO_ROW] = False
-            if not again.any():
-                break
-            steers = departs & ~hits
-            move = self._moves_again(before, said, token, attempt, move, again, steers)
+        driven = np.zeros(move.shape, dtype=bool)
+        driven[:, EGO_ROW] = ego_path is not None
+        move = self._take_care(before, said, token, move, driven)
         moved, path = move_on(before, move, leave, player.codebook)
         if settings.removes and settings.leave_radius_m:
             moved = leave_beyond(before, moved, settings.leave_radius_m)
@@ -179,6 +178,33 @@ class Session:
             path = path.copy()  # The population goes on from where the moves led.
             path[:, EGO_ROW] = ego_path
         return moved, path
+
+    def _take_care(
+        self,
+        before: Population,
+        said: MotionStep,
+        token: int,
+        move: Int64[np.ndarray, "rollout row"],
+        driven: Bool[np.ndarray, "rollout row"],
+    ) -> Int64[np.ndarray, "rollout row"]:
+        """Draw moves again that lead into somebody or off the road."""
+        tries, again = self._player.settings.move_tries, ~driven
+        slowest = move.copy()
+        for attempt in range(1, tries):
+            # Whom the road and the others leave no way out is to spare the others.
+            road = attempt <= tries // 2
+            hits, departs = self._lookout.go_wrong(before, move, again, road=road)
+            again, steers = (hits | departs) & ~driven, departs & ~hits
+            slower = self._lookout.is_slower(before, move, slowest)
+            slowest = np.where(slower & steers, move, slowest)
+            if attempt == tries // 2:
+                # Who is too fast for every way that it drew takes the slowest of them.
+                brakes = steers & again & self._lookout.is_fast(before, move)
+                move, again = np.where(brakes, slowest, move), again & ~brakes
+            if not again.any():
+                break
+            move = self._moves_again(before, said, token, attempt, move, again, steers)
+        return move
 
     def _moves(
         self, before: Population, said: MotionStep, token: int
@@ -210,6 +236,23 @@ class Session:
         logits = said.packed.move_logits[which].masked_fill(stops, -torch.inf)
         drawn[which] = self._draw(logits, kind, luck)
         return rows.spread(drawn).cpu().numpy()
+
+    def _hurry(
+        self,
+        before: Population,
+        said: MotionStep,
+        token: int,
+        move: Int64[np.ndarray, "rollout row"],
+    ) -> Int64[np.ndarray, "rollout row"]:
+        """Let those set off who have stood in a lane for too long."""
+        if self._patience is None:
+            return move
+        stalled = self._patience.stalled(before, token - 1)
+        stalled &= self._player.codebook.standing[before.kind, move]
+        if not stalled.any():
+            return move
+        attempt = self._player.settings.move_tries  # A number that no other draw has.
+        return self._moves_again(before, said, token, attempt, move, stalled, stalled)
 
     def _draw(self, logits: Tensor, kind: Tensor, luck: Tensor) -> Tensor:
         """Sample a move. Who seldom sets off still does: standing has its own nucleus."""
@@ -259,17 +302,36 @@ class Session:
         return shown
 
 
-def _begin(
-    player: Player, starts: Sequence[Start], streams: Sequence[Stream], first: Population
-) -> tuple[Memory, Asking]:
-    """Encode every map once, however many rollouts of it there are."""
-    maps, scene = number_maps(starts)
+def _lay_out(starts: Sequence[Start]) -> Roads:
+    """Put the maps of rollouts side by side, each once."""
+    maps, _ = number_maps(starts)
     histories = [start.history for start in maps]
-    roads = collate_roads(
+    return collate_roads(
         histories,
         max(history.num_roads for history in histories),
         [start.lights for start in maps],
     )
+
+
+def _be_patient(player: Player, roads: Roads, starts: Sequence[Start]) -> Patience | None:
+    """Remember who stands, if nobody is to stand for ever."""
+    tokens = math.ceil(player.settings.patience_s / CLOCK.token_s)
+    if not tokens:
+        return None
+    maps, scene = number_maps(starts)
+    return Patience([one.scene for one in maps], scene, StopLines.of(roads), tokens)
+
+
+def _begin(
+    player: Player,
+    roads: Roads,
+    starts: Sequence[Start],
+    streams: Sequence[Stream],
+    first: Population,
+) -> tuple[Memory, Asking]:
+    """Encode every map once, however many rollouts of it there are."""
+    maps, scene = number_maps(starts)
+    histories = [start.history for start in maps]
     memory = player.stepper.begin(roads, player.tensor(scene), first.life.shape[1])
     settings, room = player.settings, None
     if settings.entry_mask:

@@ -88,13 +88,14 @@ def test_without_lanes_edges_decide():
     assert off_m(Kerbs(scene_of([edge])), (0, -2), (0, 2)) == [2, -2]
 
 
-def departs(y_m, heading_rad, metres, kind=CAR):
+def departs(y_m, heading_rad, metres, kind=CAR, moments=2):
     """A car 4 m long and 2 m wide at (0, y) goes straight on."""
     population = everyone((0, y_m, heading_rad), kind=kind)
     found = find_departures(
         population,
         np.ones((1, 1), dtype=bool),
         ways(population, metres),
+        np.array([[moments]]),
         [Kerbs(street())],
         np.zeros(1, dtype=np.int64),
     )
@@ -118,6 +119,12 @@ def test_who_is_on_the_road_leaves_it(y_m, heading_rad, metres, found):
     assert departs(y_m, heading_rad, metres) is found
 
 
+def test_nobody_is_looked_at_for_longer_than_asked():
+    """Over the edge at the end of the way, but not at its middle, 0.6 of it."""
+    assert departs(0.0, -np.pi / 2, 1.2, moments=2)
+    assert not departs(0.0, -np.pi / 2, 1.2, moments=1)
+
+
 @pytest.mark.parametrize("kind", [WALKER, RIDER])
 def test_only_vehicles_are_kept(kind):
     assert not departs(0.0, -np.pi / 2, 5.0, kind)
@@ -130,10 +137,11 @@ def test_everyone_is_held_against_the_map_of_its_own_rollout_if_asked_about():
     )
     way = np.concatenate([ways(one, 5.0, 5.0)] * 2)
     kerbs = [Kerbs(street()), Kerbs(scene_of([]))]
-    which = np.ones((2, 2), dtype=bool)
+    which, moments = np.ones((2, 2), dtype=bool), np.full((2, 2), 2)
 
     def ask(which, scene):
-        return find_departures(both, which, way, kerbs, np.array(scene)).tolist()
+        one_map = np.array(scene)
+        return find_departures(both, which, way, moments, kerbs, one_map).tolist()
 
     assert ask(which, [0, 0]) == [[True, False], [True, False]]
     assert ask(which, [1, 0]) == [[False, False], [True, False]]

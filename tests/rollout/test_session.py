@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from infgen.rollout.clearance import find_hits
 from infgen.rollout.kerbs import Kerbs, find_departures
@@ -182,7 +183,9 @@ def off_the_road(playing, begin, tokens=8):
         way = session.step().path[:, :, [2, 4]]
         there = before.presence != Presence.ABSENT
         one_map = np.zeros(len(begin), dtype=np.int64)
-        count += int(find_departures(before, there, way, kerbs, one_map).sum())
+        moments = np.full(there.shape, way.shape[2])
+        found = find_departures(before, there, way, moments, kerbs, one_map)
+        count += int(found.sum())
     return count
 
 
@@ -246,3 +249,29 @@ def test_drawing_again_does_not_depend_on_other_rollouts(parked, start, player):
         many, one = together.step(), alone.step()
 
     np.testing.assert_allclose(many.path[2], one.path[0], atol=1e-4)
+
+
+def test_who_is_too_fast_for_every_way_takes_the_slowest(drive, start, player):
+    """The network knows 10 to 19 m to the right only, and all lead off the road soon."""
+    begin = [start(drive(), at) for at in range(24)]
+    still = {"insert": False, "remove": False, "top_moves": 0, "move_tries": 40}
+
+    def ways_m(playing):
+        step, move = playing.stepper.motion_step, torch.arange(61)
+        fast = (move > 40) & (move % 20 >= 10)
+
+        def heard(memory, column):
+            said = step(memory, column)
+            said.packed.move_logits.masked_fill_(~fast, -torch.inf)
+            return said
+
+        playing.stepper.motion_step = heard
+        session = Session(playing, begin)
+        before = session.population.pose[:, 0, :2]
+        return np.linalg.norm(session.step().path[:, 0, -1, :2] - before, axis=-1)
+
+    careless = ways_m(player(**still))
+    careful = ways_m(player(**still, stay_on_road=True))
+
+    assert careless.mean() > 13
+    assert np.median(careful) < 12
