@@ -9,19 +9,20 @@ around the ego, its speed and that of vehicles, the share of vehicles that are o
 (most are parked there), that of those that drive, entries and exits per half second, and in
 how many half seconds the ego, and other vehicles, set off after standing for two seconds.
 The second has who comes after now, from when it is near: speed in the first second, and
-whether vehicles begin off the road. The last line is one JSON object.
+whether vehicles begin off the road. A rollout whose ego leaves the map, where a street out
+of town ends, counts until then; how many do is said. The last line is one JSON object.
 """
 
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy.lib.stride_tricks import sliding_window_view
 
 from infgen.clock import CLOCK
@@ -32,6 +33,7 @@ from infgen.metrics.reference import divergence_bits
 from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic, from_log, from_rollout
 from infgen.road_edges import RoadEdges, edges_of
+from infgen.rollout.kerbs import lane_pieces, lanes_distance_m
 from infgen.scene import AgentKind
 from infgen.tokens.tracks import TokensError
 from pipeline.logs import open_logs, unit_folders
@@ -40,6 +42,8 @@ from pipeline.rollout import read_rollouts
 from pipeline.screen import show_table
 
 STEPS_PER_S = round(1 / CLOCK.step_s)
+OF_STEPS = ("x_m", "y_m", "z_m", "heading_rad", "valid")
+"""What of the motion is by step."""
 SPEED_EDGES_MPS = np.arange(0.0, 26.0)
 """Bins of first speeds; what is faster is in the last one."""
 DRIVING_MPS = 1.0
@@ -48,6 +52,8 @@ STILL_M = 0.1
 """Who moves less in half a second stands ..."""
 STOOD_TOKENS = 4
 """... and has stood after so many of them."""
+OFF_MAP_M = 30.0
+"""An ego so far from every lane has left the map."""
 COLUMNS = {
     "agents": ("agents", ".1f"),
     "ego_mps": ("ego, m/s", ".2f"),
@@ -68,6 +74,8 @@ class Side:
     sums: dict[str, Float64[np.ndarray, "2 span"]]
     first_mps: list[Float64[np.ndarray, " newcomer"]] = field(default_factory=list)
     off_road: list[Bool[np.ndarray, " newcomer"]] = field(default_factory=list)
+    count: int = 0
+    left_map_s: list[float] = field(default_factory=list)
 
     def means(self, name: str) -> Float64[np.ndarray, " span"]:
         """Means of one figure; NaN for spans that nothing reaches."""
@@ -96,8 +104,34 @@ class Look:
     radius_m: float
 
 
-def take(side: Side, traffic: Traffic, edges: RoadEdges | None, look: Look) -> None:
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Edges of a map's roads, and its lanes: where pieces begin, and their ways."""
+
+    edges: RoadEdges | None
+    lanes: tuple[Float32[np.ndarray, "piece 3"], Float32[np.ndarray, "piece 3"]]
+
+
+def on_map(traffic: Traffic, place: Place) -> Traffic:
+    """Cut a log or rollout where its ego leaves the map, if it does."""
+    motion, after = traffic.motion, traffic.now + 1
+    x_m, y_m = motion.x_m[0, traffic.ego], motion.y_m[0, traffic.ego]
+    steps = np.arange(after, len(x_m), STEPS_PER_S)
+    ego_m = np.column_stack([x_m[steps], y_m[steps], 0 * steps]).astype(np.float32)
+    (off,) = np.nonzero(lanes_distance_m(ego_m, *place.lanes) > OFF_MAP_M)
+    if not len(off):
+        return traffic
+    end = int(steps[off[0]])
+    cut = {name: getattr(motion, name)[..., :end] for name in OF_STEPS}
+    return replace(traffic, motion=replace(motion, **cut))
+
+
+def take(side: Side, whole: Traffic, place: Place, look: Look) -> None:
     """Measure one log or rollout."""
+    traffic, edges = on_map(whole, place), place.edges
+    side.count += 1
+    if traffic is not whole:
+        side.left_map_s.append(len(traffic.motion.x_m[0, 0]) * CLOCK.step_s)
     motion, now = traffic.motion, traffic.now
     x_m, y_m, valid = motion.x_m[0], motion.y_m[0], motion.valid[0]
     others = np.arange(len(valid)) != traffic.ego
@@ -216,17 +250,18 @@ def measure(root: Path, look: Look) -> tuple[Side, Side]:
     sides: list[Side] = []
     for scenario_id, some in groupby(rollouts, key=lambda one: one.scenario_id):
         scene = logs.find(scenario_id)
-        edges, played = edges_of(scene), [from_rollout(one) for one in some]
+        place = Place(edges_of(scene), lane_pieces(scene))
+        played = [from_rollout(one) for one in some]
         if not sides:
             steps = played[0].motion.valid.shape[2] - played[0].now - 1
             spans = max(1, round(steps * CLOCK.step_s / look.span_s))
             sides = [_empty(spans), _empty(spans)]
         try:
-            take(sides[0], from_log(scene, tokens), edges, look)
+            take(sides[0], from_log(scene, tokens), place, look)
         except TokensError as error:
             print(f"<!-- no log of {scenario_id}: {error} -->")
         for traffic in played:
-            take(sides[1], traffic, edges, look)
+            take(sides[1], traffic, place, look)
     if not sides:
         raise FileNotFoundError(f"{root} has no rollouts")
     return sides[0], sides[1]
@@ -267,6 +302,13 @@ def report(logs: Side, played: Side, look: Look) -> dict[str, Any]:
             for span in spans
         ],
     )
+    for who, side in (("logs", logs), ("rollouts", played)):
+        after_s = ", ".join(f"{at_s:.0f}" for at_s in sorted(side.left_map_s))
+        print(
+            f"{who}: the ego left the map in {len(side.left_map_s)} of {side.count} "
+            f"(after {after_s or 'no'} s)"
+        )
+        found[f"left_map_{who}_s"] = side.left_map_s
     newcomers = {who: _newcomers(side) for who, side in
                  (("logs", logs), ("rollouts", played))}  # fmt: skip
     found["newcomers"] = newcomers
