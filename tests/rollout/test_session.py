@@ -239,7 +239,8 @@ def test_who_is_driven_is_never_drawn_for(parked, start, player):
 
 def test_drawing_again_does_not_depend_on_other_rollouts(parked, start, player):
     playing = player(
-        move_tries=5, stay_on_road=True, insert=False, remove=False, top_moves=0
+        **{"move_tries": 5, "stay_on_road": True, "patience_s": 1.0},
+        **{"insert": False, "remove": False, "top_moves": 0},
     )
     begin = [start(parked(5), at) for at in range(4)]
 
