@@ -16,13 +16,13 @@ of town ends, counts until then; how many do is said. The last line is one JSON 
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from numpy.lib.stride_tricks import sliding_window_view
 
 from infgen.clock import CLOCK
@@ -31,9 +31,9 @@ from infgen.metrics.kinematics import speed, speed_valid
 from infgen.metrics.placement import count_per_token
 from infgen.metrics.reference import divergence_bits
 from infgen.metrics.road import road_edge_m
-from infgen.metrics.traffic import Traffic, from_log, from_rollout
+from infgen.metrics.traffic import Traffic, from_log, from_rollout, on_map
 from infgen.road_edges import RoadEdges, edges_of
-from infgen.rollout.kerbs import lane_pieces, lanes_distance_m
+from infgen.rollout.kerbs import Lanes, lane_pieces
 from infgen.scene import AgentKind
 from infgen.tokens.tracks import TokensError
 from pipeline.logs import open_logs, unit_folders
@@ -42,8 +42,6 @@ from pipeline.rollout import read_rollouts
 from pipeline.screen import show_table
 
 STEPS_PER_S = round(1 / CLOCK.step_s)
-OF_STEPS = ("x_m", "y_m", "z_m", "heading_rad", "valid")
-"""What of the motion is by step."""
 SPEED_EDGES_MPS = np.arange(0.0, 26.0)
 """Bins of first speeds; what is faster is in the last one."""
 DRIVING_MPS = 1.0
@@ -52,8 +50,6 @@ STILL_M = 0.1
 """Who moves less in half a second stands ..."""
 STOOD_TOKENS = 4
 """... and has stood after so many of them."""
-OFF_MAP_M = 30.0
-"""An ego so far from every lane has left the map."""
 COLUMNS = {
     "agents": ("agents", ".1f"),
     "ego_mps": ("ego, m/s", ".2f"),
@@ -109,26 +105,12 @@ class Place:
     """Edges of a map's roads, and its lanes: where pieces begin, and their ways."""
 
     edges: RoadEdges | None
-    lanes: tuple[Float32[np.ndarray, "piece 3"], Float32[np.ndarray, "piece 3"]]
-
-
-def on_map(traffic: Traffic, place: Place) -> Traffic:
-    """Cut a log or rollout where its ego leaves the map, if it does."""
-    motion, after = traffic.motion, traffic.now + 1
-    x_m, y_m = motion.x_m[0, traffic.ego], motion.y_m[0, traffic.ego]
-    steps = np.arange(after, len(x_m), STEPS_PER_S)
-    ego_m = np.column_stack([x_m[steps], y_m[steps], 0 * steps]).astype(np.float32)
-    (off,) = np.nonzero(lanes_distance_m(ego_m, *place.lanes) > OFF_MAP_M)
-    if not len(off):
-        return traffic
-    end = int(steps[off[0]])
-    cut = {name: getattr(motion, name)[..., :end] for name in OF_STEPS}
-    return replace(traffic, motion=replace(motion, **cut))
+    lanes: Lanes
 
 
 def take(side: Side, whole: Traffic, place: Place, look: Look) -> None:
     """Measure one log or rollout."""
-    traffic, edges = on_map(whole, place), place.edges
+    traffic, edges = on_map(whole, place.lanes), place.edges
     side.count += 1
     if traffic is not whole:
         side.left_map_s.append(len(traffic.motion.x_m[0, 0]) * CLOCK.step_s)

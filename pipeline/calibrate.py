@@ -111,15 +111,16 @@ def _parts(inputs: Inputs, how: CalibrateSettings) -> list[list[tuple[Done, list
 
 def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Report:
     """Play some scenes with one pair of biases; count them, and their logs."""
-    from infgen.metrics.traffic import from_log, from_rollout  # noqa: PLC0415
+    from infgen.metrics.traffic import from_log, from_rollout, on_map  # noqa: PLC0415
     from infgen.metrics.turnover import add_up, count_turnover  # noqa: PLC0415
+    from infgen.rollout.kerbs import lane_pieces  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
     how: CalibrateSettings = settings["calibrate"]
     played = Biases(**unit.task["biases"]).over(settings["rollout"])
     folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
     player, weights = load_player(folder, identity, played)
-    starts, lengths, logs, refused = [], [], [], []
+    starts, played_on, logs, refused = [], [], [], []
     longest = CLOCK.tokens_in(player.settings.length_s)
     for scene in _scenes(unit):
         try:
@@ -129,16 +130,17 @@ def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Re
             refused.append(f"{scene.scenario_id}: {error}")
             continue
         # The longer of a log and its rollouts is cut into windows as long as the shorter.
-        lengths.append(min(longest, logged.future_tokens))
+        played_on.append((min(longest, logged.future_tokens), lane_pieces(scene)))
         logs.append(count_turnover(logged, how.count_radius_m, longest))
 
     def tell(done: float) -> None:
         progress(done, len(starts), "rollouts")
 
     rollouts = chain.from_iterable(play_all(player, starts, weights, tell))
+    # Beyond the end of a map nobody enters: biases are not to make up for that.
     plays = [
-        count_turnover(from_rollout(rollout), how.count_radius_m, length)
-        for rollout, length in zip(rollouts, lengths, strict=True)
+        count_turnover(on_map(from_rollout(rollout), lanes), how.count_radius_m, length)
+        for rollout, (length, lanes) in zip(rollouts, played_on, strict=True)
     ]
     return {
         "point": unit.task["point"],
@@ -227,7 +229,7 @@ def _rates(counts: "Turnover") -> dict[str, float | None]:
 
 STAGE = Stage(
     name="calibrate",
-    version=3,
+    version=4,
     settings={
         "tokenize": TokenSettings,
         "rollout": RolloutSettings,

@@ -9,6 +9,7 @@ from infgen.clock import CLOCK
 from infgen.config import TokenSettings
 from infgen.metrics.motion import Motion
 from infgen.metrics.placement import Events, logged_events, simulated_events
+from infgen.rollout.kerbs import Lanes, lanes_distance_m
 from infgen.rollout.rollout import Rollout
 from infgen.scene import AgentKind, Scene
 
@@ -49,6 +50,10 @@ class Traffic:
         return self.motion.valid[0, :, self.now]
 
 
+OFF_MAP_M = 30.0
+"""An ego so far from every lane has left the map."""
+OF_STEPS = ("x_m", "y_m", "z_m", "heading_rad", "valid")
+"""What of a motion is by step."""
 LOGGED = -1
 """Index of the log among the rollouts of its scene."""
 
@@ -103,6 +108,27 @@ def from_rollout(rollout: Rollout) -> Traffic:
         ),
         events=simulated_events(rollout),
     )
+
+
+def on_map(traffic: Traffic, lanes: Lanes) -> Traffic:
+    """Cut a log or rollout where its ego leaves the map, if it does: none enters there.
+
+    Maps of WOMD end where its ego did not get in nine seconds; a rollout gets farther.
+
+    Args:
+        traffic: With its events, those of what is cut off too.
+        lanes: All of the map's; on a map without any nobody leaves it.
+    """
+    motion = traffic.motion
+    x_m, y_m = motion.x_m[0, traffic.ego], motion.y_m[0, traffic.ego]
+    steps = np.arange(traffic.now + 1, len(x_m), CLOCK.steps_per_token)
+    ego_m = np.column_stack([x_m[steps], y_m[steps], 0 * steps]).astype(np.float32)
+    (off,) = np.nonzero(lanes_distance_m(ego_m, *lanes) > OFF_MAP_M)
+    if not len(off) or not len(lanes[0]):
+        return traffic
+    end = int(steps[off[0]])
+    cut = {name: getattr(motion, name)[..., :end] for name in OF_STEPS}
+    return replace(traffic, motion=replace(motion, **cut))
 
 
 def with_boxes(traffic: Traffic, size_lwh_m: np.ndarray) -> Traffic:

@@ -23,6 +23,10 @@ SLACK_M = 0.05
 """Farther off the road by no more than this is as far as before."""
 
 
+Lanes = tuple[Float32[np.ndarray, "piece 3"], Float32[np.ndarray, "piece 3"]]
+"""Pieces of lanes, flat: first points, and the ways to their last points."""
+
+
 class Kerbs:
     """How far off the road the places of one map are, all of it flat."""
 
@@ -83,10 +87,8 @@ class Kerbs:
         return off_m.reshape(at.shape[:-1])
 
 
-def lane_pieces(
-    scene: Scene,
-) -> tuple[Float32[np.ndarray, "piece 3"], Float32[np.ndarray, "piece 3"]]:
-    """All pieces of lanes, flat: first points, and the ways to their last points."""
+def lane_pieces(scene: Scene) -> Lanes:
+    """Take all pieces of lanes of a map."""
     road_map = scene.road_map
     flat_m = road_map.xyz_m * np.array([1, 1, 0], dtype=np.float32)
     feature = np.repeat(np.arange(road_map.num_features), np.diff(road_map.point_offsets))
