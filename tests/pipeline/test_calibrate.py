@@ -15,6 +15,7 @@ from pipeline.plan import PlanError
 from pipeline.response import DESIGN
 from pipeline.stage import Done
 from pipeline.store import write_records
+from tests.conftest import straight_road
 from tests.pipeline.finished import Finished
 
 PLAYED = RolloutSettings(seconds=3.0, max_agents=16, count=7, seed=3)
@@ -137,6 +138,23 @@ def test_a_unit_counts_rollouts_and_logs_and_names_what_cannot_be_played(
     assert len(report["refused"]) == 1
     assert "the history ends at step 13" in report["refused"][0]
     assert stage.work(unit, tmp_path / "again", every, quiet) == report
+
+
+def test_a_rollout_counts_until_its_ego_leaves_the_map(inputs, drive, tmp_path, quiet):
+    """The road ends 5 m behind the ego, which goes on by some 10 m a half second."""
+    folder = tmp_path / "short"
+    folder.mkdir()
+    scene = drive(road_map=straight_road(10.0))
+    path = folder / "scenes-000.zarr"
+    write_records(path, [scene], Scene, ingest.SCHEMA, compress=True)
+    short = Done("training.tfrecord-9", "key", folder, {"scenes": 1})
+    every = stage.narrow(with_settings("calibrate", scenes=0, scenes_per_task=99))
+    unit = stage.plan(Finished([short], inputs.weights), every)[0]
+
+    report = stage.work(unit, tmp_path / "out", every, quiet)
+
+    assert report["played"]["tokens"] < 4
+    assert report["logged"]["tokens"] == 2 * 4
 
 
 def test_a_higher_bias_lets_more_in(inputs, tmp_path, quiet):
