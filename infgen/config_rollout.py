@@ -72,7 +72,8 @@ class RolloutSettings:
             everybody going on alike, until one does not lead there; 1 for whatever is drawn
             first, as in the paper.
         stay_on_road: Whether half of these draws are also for vehicles that would leave the
-            road within a second, or go farther off it. Who is more than a metre off may.
+            road before they could stop, or go farther off it. Who is more than a metre off
+            may; who is too fast for every draw takes the slowest.
         patience_s: Vehicles that have stood in a lane for so long set off, unless a light
             that is not green is ahead or they would run into somebody; 0 for who stands as
             long as it likes, as in the paper. A network that looks back for a few seconds

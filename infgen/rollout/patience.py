@@ -99,9 +99,10 @@ class Patience:
         found = np.zeros(len(pose), dtype=bool)
         for at, (start_m, along_m) in enumerate(self._lanes):
             way_rad = np.arctan2(along_m[:, 1], along_m[:, 0])
+            reach_m = np.linalg.norm(along_m, axis=1) + IN_LANE_M
             for row in np.flatnonzero(self._scene[rollout] == at):
                 turned_rad = np.abs(wrap_angle(way_rad - pose[row, 2]))
-                near = np.abs(start_m[:, :2] - pose[row, :2]).max(axis=1) < 10 * IN_LANE_M
+                near = np.abs(start_m[:, :2] - pose[row, :2]).max(axis=1) < reach_m
                 own = near & (turned_rad < ALONG_RAD)
                 xyz_m = np.append(pose[row, :2], np.float32(0))[None]
                 gap_m = lanes_distance_m(xyz_m, start_m[own], along_m[own])
