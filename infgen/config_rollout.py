@@ -85,6 +85,10 @@ class RolloutSettings:
         add_bias: Added to the log-odds that one more agent enters, on top of what stage
             ``calibrate`` finds.
         leave_bias: The same for an agent's leaving.
+        keep_count: How firmly the number of agents around the ego is held to what it was
+            at now: the odds that one more enters are multiplied by that number, over the
+            number there is, to this power; 0 for not at all, as in the paper. A network
+            that looks back for a few seconds forgets how full the street was.
         entry_mask: Whether newcomers are kept off other boxes, also off where these will be
             in half a second, and vehicles near lanes. The paper lets them in anywhere.
         entry_lane_m: Farthest from a lane's middle that a vehicle may enter. Most logged
@@ -121,6 +125,7 @@ class RolloutSettings:
     heading_temperature: float = 1.0
     add_bias: float = 0.0
     leave_bias: float = 0.0
+    keep_count: float = 0.0
     entry_mask: bool = True
     entry_lane_m: float = 15.0
     entry_tries: int = 4
@@ -187,6 +192,7 @@ class RolloutSettings:
             ("top_cells", 0, math.inf),
             ("move_tries", 1, math.inf),
             ("patience_s", 0, math.inf),
+            ("keep_count", 0, math.inf),
             ("entry_lane_m", 0, math.inf),
             ("entry_tries", 1, math.inf),
             ("max_entries", 0, math.inf),

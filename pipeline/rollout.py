@@ -40,6 +40,7 @@ INDEX: Fields = {
 
 OF_ENTRIES = (
     "add_bias",
+    "keep_count",
     "entry_mask",
     "entry_lane_m",
     "entry_tries",

@@ -22,7 +22,7 @@ from pipeline.events import Event
 from pipeline.folders import PARTIAL, write_file, write_json
 from pipeline.locks import locked
 
-VERSION = 5
+VERSION = 6
 """Raised when the same order would give other bytes."""
 SHORTEST_S, LONGEST_S = 2.1, 600.0
 STEPS_PER_S = 10

@@ -69,6 +69,7 @@ def test_saying_what_the_mode_says_is_no_contradiction():
         ({"stay_on_road": True}, "say rollout.move_tries=32"),
         ({"patience_s": 20.0}, "say rollout.move_tries=32"),
         ({"patience_s": -1.0, "move_tries": 2}, "0 or more"),
+        ({"keep_count": -0.5}, "0 or more"),
     ],
 )
 def test_nonsense_is_refused(given, said):

@@ -33,11 +33,13 @@ class Asking:
         player: The network.
         streams: Random numbers of the rollouts.
         room: Where newcomers may stand; None for anywhere.
+        at_now: How many others there were around each ego at now.
     """
 
     player: Player
     streams: Sequence[Stream]
     room: Room | None
+    at_now: Int64[np.ndarray, " rollout"]
 
     @property
     def tries(self) -> int:
@@ -54,7 +56,19 @@ class Asking:
     def take(self, places: Int64[np.ndarray, " kept"]) -> "Asking":
         """Go on with some rollouts only."""
         room = None if self.room is None else self.room.take(places)
-        return replace(self, streams=[self.streams[at] for at in places], room=room)
+        return replace(
+            self,
+            streams=[self.streams[at] for at in places],
+            room=room,
+            at_now=self.at_now[places],
+        )
+
+    def add_bias(self, population: Population) -> Tensor:
+        """What is added to the log-odds [rollout] that one more enters."""
+        settings, radius_m = self.player.settings, self.player.grid.radius_m
+        # Odds of one more after another: how many enter in a row is proportional to them.
+        fuller = (self.at_now + 1) / (population.count_others(radius_m) + 1)
+        return self.player.tensor(settings.add_bias + settings.keep_count * np.log(fuller))
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +135,8 @@ def _next_newcomers(
     """
     player, luck = party.asking.player, party.asking.luck(token, turn)
     query = player.stepper.entry_query(party.entries)
-    add = happens(query.add_logit, luck(Purpose.ADD), player.settings.add_bias)
+    bias = party.asking.add_bias(party.population)
+    add = happens(query.add_logit, luck(Purpose.ADD), bias)
     wanted = add.cpu().numpy() & (party.population.life == NOBODY).any(axis=1)
     party, query = party.take(wanted), query.take(player.tensor(np.flatnonzero(wanted)))
     found = _find_places(party, query, token, turn) if len(party) else None

@@ -51,6 +51,12 @@ class Population:
         cell = encode_cell(to_grid(self.pose[..., :2], ego_pose), grid)
         return np.where(self.presence == Presence.ABSENT, np.int16(NO_CELL), cell)
 
+    def count_others(self, radius_m: float) -> Int64[np.ndarray, " rollout"]:
+        """Count who is within a radius of each rollout's ego, the ego left out."""
+        near = (_ego_distance_m(self) < radius_m) & (self.presence != Presence.ABSENT)
+        near[:, EGO_ROW] = False
+        return near.sum(axis=1)
+
     def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "Population":
         """Take some rollouts."""
         return _take(self, rollouts)

@@ -69,9 +69,7 @@ class Session:
         self._streams = [Stream.of(s.seed, s.scene.scenario_id, s.index) for s in starts]
         history = settle(starts, player.settings.max_agents)
         roads = _lay_out(starts)
-        self._memory, self._asking = _begin(
-            player, roads, starts, self._streams, history[0]
-        )
+        self._memory, self._asking = _begin(player, roads, starts, self._streams, history)
         self._patience = _be_patient(player, roads, starts)
         for population in history[:-1]:
             player.stepper.motion_step(self._memory, player.column(population))
@@ -327,15 +325,17 @@ def _begin(
     roads: Roads,
     starts: Sequence[Start],
     streams: Sequence[Stream],
-    first: Population,
+    settled: Sequence[Population],
 ) -> tuple[Memory, Asking]:
     """Encode every map once, however many rollouts of it there are."""
     maps, scene = number_maps(starts)
     histories = [start.history for start in maps]
-    memory = player.stepper.begin(roads, player.tensor(scene), first.life.shape[1])
+    rows = settled[0].life.shape[1]
+    memory = player.stepper.begin(roads, player.tensor(scene), rows)
     settings, room = player.settings, None
     if settings.entry_mask:
         room = make_room(
             histories, (player.codebook, player.roads), scene, settings.entry_lane_m
         )
-    return memory, Asking(player, streams, room)
+    at_now = settled[-1].count_others(player.grid.radius_m)
+    return memory, Asking(player, streams, room, at_now)

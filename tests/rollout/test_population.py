@@ -49,6 +49,15 @@ def test_the_history_ends_at_the_logs_own_poses(drive, start):
     np.testing.assert_allclose(now.pose[0, 0], scene.tracks.pose(scene.now)[0])
 
 
+def test_others_are_counted_within_a_radius_of_the_ego(parked, start):
+    here, there = parked(3, ego=2), parked(5)  # others at -16, -8, 8; at 8, 16, 24, 32, 40
+
+    now = settle([start(here), start(there)], min_rows=9)[-1]
+
+    np.testing.assert_array_equal(now.count_others(9.0), [2, 1])
+    np.testing.assert_array_equal(now.count_others(17.0), [3, 2])
+
+
 def test_rows_grow_with_the_largest_history(parked, start):
     history = settle([start(parked(3)), start(parked(5))], min_rows=2)
 

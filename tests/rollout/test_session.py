@@ -141,6 +141,24 @@ def test_newcomers_enter_around_the_driven_ego(crossing, start, player, force):
     assert (np.linalg.norm(away_m[entering], axis=1) < 75.6).all()
 
 
+@pytest.mark.parametrize(("add", "leave"), [(0.0, -20.0), (-2.0, 1.0)])
+def test_the_number_of_agents_is_held_to_what_it_was_at_now(
+    parked, start, player, force, add, leave
+):
+    begin = [start(parked(6), at) for at in range(6)]
+    counts = {}
+    for firmly in (0.0, 40.0):
+        playing = player(entry_mask=False, keep_count=firmly, max_agents=40)
+        force(playing, add=add, leave=leave)
+        session = Session(playing, begin)
+        for _ in range(6):
+            session.step()
+        counts[firmly] = session.population.count_others(75.0)
+
+    assert (np.abs(counts[0.0] - 6) > 1).any()
+    assert (np.abs(counts[40.0] - 6) <= 1).all()
+
+
 def new_hits(playing, begin, tokens=8):
     """How often somebody runs into another in a row of cars, all rollouts together."""
     session, count = Session(playing, begin), 0

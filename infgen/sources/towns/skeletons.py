@@ -44,6 +44,8 @@ class Skeleton:
 def draw_skeleton(folder: Path, rng: np.random.Generator, spread: float = 1.0) -> Skeleton:
     """Draw where streets run; dead ends are cut off, and some streets lead out of town.
 
+    None do of a wide town: who plays a trip of minutes must not come to where streets end.
+
     Args:
         folder: Where to put netgenerate's files.
         rng: Of all that is drawn.
@@ -64,7 +66,8 @@ def draw_skeleton(folder: Path, rng: np.random.Generator, spread: float = 1.0) -
         },
     )
     drawn = _without_dead_ends(_read(prefix))
-    return _with_ways_out(_stirred(drawn, pattern, rng), rng)
+    inner = _stirred(drawn, pattern, rng)
+    return inner if spread > 1 else _with_ways_out(inner, rng)
 
 
 def _options(

@@ -36,3 +36,4 @@ def test_a_town_is_as_many_times_wider_as_asked(tmp_path, seed):
 
     assert 1.5 < width_m(wide) / width_m(common) < 3.5
     assert len(wide.link) > 3 * len(common.link)
+    assert (wide.degree > 1).all()
