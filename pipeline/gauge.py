@@ -12,6 +12,8 @@ LONGEST_WORD = 36
 RECENT_S = 120.0
 """Rates are those of about the last two minutes."""
 MARK_S = 1.0
+LEAST = 0.01
+"""Less of a unit says nothing of the rate: beginning takes longer than going on."""
 
 
 @dataclass
@@ -98,10 +100,10 @@ class Gauge:
 
     @property
     def per_s(self) -> float | None:
-        """Units, or steps, per second of late; None as long as nothing is done."""
+        """Units, or steps, per second of late; None as long as next to nothing is done."""
         since, before = self._marks[0]
         taken, made = self.clock() - since, self._made - before
-        return made / taken if made > 0 and taken > 0 else None
+        return made / taken if made >= LEAST and taken > 0 else None
 
     @property
     def left_s(self) -> float | None:

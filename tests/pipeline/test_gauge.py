@@ -108,6 +108,14 @@ def test_before_anything_is_done_nothing_is_promised(clock):
     assert gauge.words() == "2 of 10 units"
 
 
+def test_the_first_of_many_steps_of_a_unit_promises_nothing(clock):
+    gauge = Gauge("s", units=6, before=0, clock=clock)
+    clock.now += 57
+    progress(gauge, 1, 600)
+
+    assert gauge.words() == "0.001667 of 6 units"
+
+
 def test_progress_without_a_total_is_let_pass(clock):
     gauge = Gauge("s", units=1, before=0, clock=clock)
     progress(gauge, 0, 0)

@@ -9,14 +9,14 @@ from infgen.sources.towns.town import Town, make_town, stream
 from infgen.sources.towns.views import View, draw_views
 
 FROM_RIM_M = 125.0
-"""The recording car of a town of common width keeps so far from where streets end."""
+"""Recording cars keep so far from where streets end."""
 SCENES_PER_TOWN = 10
 """Recorded in each town: other cars, other times."""
 LEAST_STEPS = 500
 """A town is played for at least so long, after it has warmed up."""
 WIDE_STEPS = 311
-"""For longer records towns are wider: whoever plays them shall not come to where streets
-end. Who turns now and then gets as far as the root of time."""
+"""For longer records towns are wider: whoever plays them shall not see all of one. Who
+turns now and then gets as far as the root of time."""
 
 
 def draw_scenes(
@@ -57,7 +57,7 @@ def _find_town(name: str, num_steps: int) -> tuple[Town, list[View]]:
             stream(name, "town", attempt), max(LEAST_STEPS, 3 * num_steps // 2), spread
         )
         rng = stream(name, "views", attempt)
-        views = draw_views(town, SCENES_PER_TOWN, num_steps, spread * FROM_RIM_M, rng)
+        views = draw_views(town, SCENES_PER_TOWN, num_steps, FROM_RIM_M, rng)
         if len(views) == SCENES_PER_TOWN:
             return town, views
         attempt += 1

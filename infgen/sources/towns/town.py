@@ -81,7 +81,7 @@ def make_town(rng: np.random.Generator, num_steps: int, spread: float = 1.0) -> 
     Args:
         rng: Of all that is drawn.
         num_steps: How long its traffic is recorded.
-        spread: How many times as wide as most it is.
+        spread: How many times as wide as most it is. No street leads out of a wide one.
 
     Raises:
         SumoError: if SUMO is missing or fails.
