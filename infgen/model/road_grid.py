@@ -112,9 +112,9 @@ class RoadGrid:
         touched = (row >= 0) & (row < rows) & (row <= high[:, 1:])
         touched &= (left < right)[:, None]
         first = torch.where(touched, row * columns, 0)
-        start = self.start[scene]
-        begin = start.gather(1, first + torch.where(touched, left[:, None], 0))
-        end = start.gather(1, first + torch.where(touched, right[:, None], 0))
+        # One by one: a row of all of a map's squares for each target would be large.
+        begin = self.start[scene[:, None], first + torch.where(touched, left[:, None], 0)]
+        end = self.start[scene[:, None], first + torch.where(touched, right[:, None], 0)]
         length = (end - begin) * touched
         steps = torch.arange(
             max(1, int(length.max())) if len(row) else 1, device=row.device

@@ -50,20 +50,43 @@ class Lookout:
         Args:
             before: Everyone at the beginning of the half second.
             move: Everyone's move.
-            drawn: Whose was drawn since it was last asked: nobody else leaves the road.
+            drawn: Whose was drawn since it was last asked: nobody else leaves the road,
+                and nobody runs into anybody in rollouts that have none.
             road: Whether to ask who leaves the road.
         """
+        hits, departs = np.zeros_like(drawn), np.zeros_like(drawn)
+        some = np.flatnonzero(drawn.any(axis=1))
+        if not len(some):
+            return hits, departs
+        # A few rollouts draw for long, and most rows are free: pairs of rows are dear.
+        few = before.take(some).without_free_rows()
+        rows = few.life.shape[1]
+        hits[some, :rows], departs[some, :rows] = self._go_wrong(
+            few, move[some, :rows], drawn[some, :rows], self.scene[some], road=road
+        )
+        return hits, departs
+
+    def _go_wrong(
+        self,
+        before: Population,
+        move: Int64[np.ndarray, "rollout row"],
+        drawn: Bool[np.ndarray, "rollout row"],
+        scene: Int64[np.ndarray, " rollout"],
+        *,
+        road: bool,
+    ) -> tuple[Bool[np.ndarray, "rollout row"], Bool[np.ndarray, "rollout row"]]:
         there = (before.presence != Presence.ABSENT) & (before.presence != Presence.LEAVING)
         moving = there & ~self.codebook.standing[before.kind, move]
-        ways = repeat(before, move, self.codebook, max(CLEAR_AHEAD, *ROAD_AHEAD))
+        road = road and bool(self.kerbs)
+        times = max(CLEAR_AHEAD, *ROAD_AHEAD) if road else CLEAR_AHEAD
+        ways = repeat(before, move, self.codebook, times)
         soon = ways[:, :, : CLEAR_AHEAD * len(LOOKED_AT)]
         hits = find_hits(before, there, soon) & moving
-        if not road or not self.kerbs:
+        if not road:
             return hits, np.zeros_like(hits)
         moments = len(LOOKED_AT) * self._road_ahead(before, move)
         asked = moving & drawn
-        departs = find_departures(before, asked, ways, moments, self.kerbs, self.scene)
-        return hits, departs
+        return hits, find_departures(before, asked, ways, moments, self.kerbs, scene)
 
     def is_slower(
         self,

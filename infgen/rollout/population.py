@@ -57,6 +57,18 @@ class Population:
         near[:, EGO_ROW] = False
         return near.sum(axis=1)
 
+    def without_free_rows(self) -> "Population":
+        """Cut off the rows that are free in every rollout, but those between others."""
+        used = (self.life != NOBODY).any(axis=0)
+        rows = len(used) - int(used[::-1].argmax())
+        cut = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Population(
+            **{
+                name: every[:, :rows] if every.ndim > 1 else every
+                for name, every in cut.items()
+            }
+        )
+
     def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "Population":
         """Take some rollouts."""
         return _take(self, rollouts)

@@ -187,14 +187,15 @@ class Session:
     ) -> Int64[np.ndarray, "rollout row"]:
         """Draw moves again that lead into somebody or off the road."""
         tries, again = self._player.settings.move_tries, ~driven
-        slowest = move.copy()
+        slowest, changed = move.copy(), again
         for attempt in range(1, tries):
             # Whom the road and the others leave no way out is to spare the others.
             road = attempt <= tries // 2
-            hits, departs = self._lookout.go_wrong(before, move, again, road=road)
+            hits, departs = self._lookout.go_wrong(before, move, changed, road=road)
             again, steers = (hits | departs) & ~driven, departs & ~hits
             slower = self._lookout.is_slower(before, move, slowest)
             slowest = np.where(slower & steers, move, slowest)
+            changed = again  # Whose move will be another; those who brake among them.
             if attempt == tries // 2:
                 # Who is too fast for every way that it drew takes the slowest of them.
                 brakes = steers & again & self._lookout.is_fast(before, move)

@@ -44,3 +44,18 @@ def test_who_is_fast_and_whose_move_is_slower(metre_moves):
 
     assert lookout.is_fast(cars, moves).tolist() == [[False, True, False]]
     assert lookout.is_slower(cars, moves, others).tolist() == [[True, False, True]]
+
+
+def test_only_rollouts_in_which_somebody_drew_are_looked_at_again(metre_moves):
+    """In both the second car runs into the first one that stands."""
+    one = everyone((9, 0, 0), (0, 0, 0))
+    both = one.take(np.array([0, 0]))
+    lookout = Lookout(metre_moves, [], np.zeros(2, dtype=np.int64))
+    moves, drawn = np.array([[0, 4], [0, 4]]), np.array([[True, True], [False, False]])
+
+    hits, departs = lookout.go_wrong(both, moves, drawn, road=True)
+
+    assert hits.tolist() == [[False, True], [False, False]]
+    assert not departs.any()
+    nobody, _ = lookout.go_wrong(both, moves, np.zeros_like(drawn), road=True)
+    assert not nobody.any()

@@ -58,6 +58,18 @@ def test_others_are_counted_within_a_radius_of_the_ego(parked, start):
     np.testing.assert_array_equal(now.count_others(17.0), [3, 2])
 
 
+def test_rows_that_are_free_in_every_rollout_are_cut_off(parked, start):
+    wide = settle([start(parked(3)), start(parked(5))], min_rows=9)[-1]
+
+    narrow = wide.without_free_rows()
+
+    assert narrow.life.shape == (2, 6)
+    np.testing.assert_array_equal(narrow.pose, wide.pose[:, :6])
+    np.testing.assert_array_equal(narrow.born, wide.born)
+    assert narrow.without_free_rows().life.shape == (2, 6)
+    assert narrow.take(np.array([0])).without_free_rows().life.shape == (1, 4)
+
+
 def test_rows_grow_with_the_largest_history(parked, start):
     history = settle([start(parked(3)), start(parked(5))], min_rows=2)
 
