@@ -88,7 +88,8 @@ class RolloutSettings:
         keep_count: How firmly the number of agents around the ego is held to what it was
             at now: the odds that one more enters are multiplied by that number, over the
             number there is, to this power; 0 for not at all, as in the paper. A network
-            that looks back for a few seconds forgets how full the street was.
+            that looks back for a few seconds forgets how full the street was. Where a map
+            ends there are to be fewer.
         entry_mask: Whether newcomers are kept off other boxes, also off where these will be
             in half a second, and vehicles near lanes. The paper lets them in anywhere.
         entry_lane_m: Farthest from a lane's middle that a vehicle may enter. Most logged

@@ -229,7 +229,7 @@ def _rates(counts: "Turnover") -> dict[str, float | None]:
 
 STAGE = Stage(
     name="calibrate",
-    version=4,
+    version=5,
     settings={
         "tokenize": TokenSettings,
         "rollout": RolloutSettings,

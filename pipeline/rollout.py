@@ -202,7 +202,7 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=5,
+    version=6,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=play,

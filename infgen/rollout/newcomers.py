@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from infgen.model.columns import EntryDetails, EntryQuery
@@ -33,13 +33,13 @@ class Asking:
         player: The network.
         streams: Random numbers of the rollouts.
         room: Where newcomers may stand; None for anywhere.
-        at_now: How many others there were around each ego at now.
+        wanted: How many others are to be around each ego; None for as many as enter.
     """
 
     player: Player
     streams: Sequence[Stream]
     room: Room | None
-    at_now: Int64[np.ndarray, " rollout"]
+    wanted: Float64[np.ndarray, " rollout"] | None = None
 
     @property
     def tries(self) -> int:
@@ -60,15 +60,18 @@ class Asking:
             self,
             streams=[self.streams[at] for at in places],
             room=room,
-            at_now=self.at_now[places],
+            wanted=None if self.wanted is None else self.wanted[places],
         )
 
-    def add_bias(self, population: Population) -> Tensor:
-        """What is added to the log-odds [rollout] that one more enters."""
-        settings, radius_m = self.player.settings, self.player.grid.radius_m
-        # Odds of one more after another: how many enter in a row is proportional to them.
-        fuller = (self.at_now + 1) / (population.count_others(radius_m) + 1)
-        return self.player.tensor(settings.add_bias + settings.keep_count * np.log(fuller))
+    def add_bias(self, population: Population) -> Float64[np.ndarray, " rollout"]:
+        """What is added to the log-odds that one more enters."""
+        settings = self.player.settings
+        bias = np.full(len(self.streams), settings.add_bias)
+        if self.wanted is not None:
+            there = population.count_others(self.player.grid.radius_m)
+            # One is asked for after another: how many come is proportional to the odds.
+            bias += settings.keep_count * np.log((self.wanted + 1) / (there + 1))
+        return bias
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +138,7 @@ def _next_newcomers(
     """
     player, luck = party.asking.player, party.asking.luck(token, turn)
     query = player.stepper.entry_query(party.entries)
-    bias = party.asking.add_bias(party.population)
+    bias = player.tensor(party.asking.add_bias(party.population))
     add = happens(query.add_logit, luck(Purpose.ADD), bias)
     wanted = add.cpu().numpy() & (party.population.life == NOBODY).any(axis=1)
     party, query = party.take(wanted), query.take(player.tensor(np.flatnonzero(wanted)))

@@ -26,6 +26,7 @@ from infgen.model.columns import MotionStep
 from infgen.model.relations import Rows
 from infgen.model.steps import Memory
 from infgen.model.stop_lines import StopLines
+from infgen.rollout.fullness import Fullness
 from infgen.rollout.lookout import look_out
 from infgen.rollout.newcomers import Asking, add_newcomers
 from infgen.rollout.patience import Patience
@@ -69,7 +70,10 @@ class Session:
         self._streams = [Stream.of(s.seed, s.scene.scenario_id, s.index) for s in starts]
         history = settle(starts, player.settings.max_agents)
         roads = _lay_out(starts)
-        self._memory, self._asking = _begin(player, roads, starts, self._streams, history)
+        self._memory, self._asking = _begin(
+            player, roads, starts, self._streams, history[0]
+        )
+        self._fullness = _keep_full(player, starts, history[-1])
         self._patience = _be_patient(player, roads, starts)
         for population in history[:-1]:
             player.stepper.motion_step(self._memory, player.column(population))
@@ -107,7 +111,7 @@ class Session:
         moved, paths = self._move(before, said, path, token)
         after = moved
         if player.inserts:
-            after = add_newcomers(self._asking, self._memory, moved, token)
+            after = add_newcomers(self._ask(moved), self._memory, moved, token)
         self.population, self.token = after, token
         self._driven_to = None if path is None else path[:, -1]
         return Frame(
@@ -120,6 +124,13 @@ class Session:
             kind=after.kind,
             size_lwh_m=after.size_lwh_m,
         )
+
+    def _ask(self, moved: Population) -> Asking:
+        """Who asks for newcomers around the egos where they are now."""
+        if self._fullness is None:
+            return self._asking
+        wanted = self._fullness.wanted(moved.pose[:, EGO_ROW, :2])
+        return replace(self._asking, wanted=wanted)
 
     def _ego_path(self, ego_pose: np.ndarray) -> Float32[np.ndarray, "rollout step 3"]:
         """Poses of the egos at the five steps; on a straight way if only the end is given.
@@ -321,22 +332,27 @@ def _be_patient(player: Player, roads: Roads, starts: Sequence[Start]) -> Patien
     return Patience([one.scene for one in maps], scene, StopLines.of(roads), tokens)
 
 
+def _keep_full(player: Player, starts: Sequence[Start], now: Population) -> Fullness | None:
+    """Remember how full the street is at now, if it is to stay so."""
+    if not (player.inserts and player.settings.keep_count):
+        return None
+    return Fullness.of(starts, now, player.grid.radius_m)
+
+
 def _begin(
     player: Player,
     roads: Roads,
     starts: Sequence[Start],
     streams: Sequence[Stream],
-    settled: Sequence[Population],
+    first: Population,
 ) -> tuple[Memory, Asking]:
     """Encode every map once, however many rollouts of it there are."""
     maps, scene = number_maps(starts)
     histories = [start.history for start in maps]
-    rows = settled[0].life.shape[1]
-    memory = player.stepper.begin(roads, player.tensor(scene), rows)
+    memory = player.stepper.begin(roads, player.tensor(scene), first.life.shape[1])
     settings, room = player.settings, None
     if settings.entry_mask:
         room = make_room(
             histories, (player.codebook, player.roads), scene, settings.entry_lane_m
         )
-    at_now = settled[-1].count_others(player.grid.radius_m)
-    return memory, Asking(player, streams, room, at_now)
+    return memory, Asking(player, streams, room)
