@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from infgen.rollout.fullness import Fullness
-from infgen.rollout.kerbs import lane_pieces
+from infgen.rollout.fullness import Fullness, pieces_of
 from tests.rollout.test_clearance import everyone
 from tests.rollout.test_kerbs import scene_of, street
 
@@ -14,7 +13,7 @@ def wanted(ego_x_m, scene):
     fullness = Fullness(
         at_now=np.array([10]),
         lanes_m=np.array([149.0 if scene is not EMPTY else 0.0]),
-        lanes=[lane_pieces(scene)],
+        pieces=[pieces_of(scene)],
         scene=np.zeros(1, dtype=np.int64),
         radius_m=75.0,
     )
