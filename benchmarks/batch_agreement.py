@@ -128,7 +128,7 @@ def _scenes(count: int) -> list[Scene]:
 def _network(weights: Path | None, scene: Scene) -> Network:
     if weights is not None:
         return load_network(weights).eval()
-    case = Case("small", 1, "long", False, 0.0, 0, 0, "cpu", 1)
+    case = Case("small", 1, "long", "plain", 0.0, 0, 0, "cpu", 1)
     motion, roads = made_codebooks()
     tokens = tokenize_scene(scene, motion, roads, TokenSettings())
     return make_network(case, Pace.of(tokens))

@@ -22,6 +22,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -55,6 +56,18 @@ SWEEP_S = 10.0
 """Length of the rollouts that are compared for other reasons."""
 SLOW_M = 0.5
 """Moves so much longer are less likely by a factor of e."""
+PLAYED: dict[str, dict[str, Any]] = {
+    "plain": {"entry_mask": False},
+    "masked": {},
+    "careful": {
+        "move_tries": 32,
+        "stay_on_road": True,
+        "patience_s": 20.0,
+        "keep_count": 1.0,
+    },
+}
+"""Settings by word: the paper's; newcomers kept off other boxes and near lanes; and as
+profiles ``pretrained`` and ``benchmark`` play."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +78,7 @@ class Case:
         size: ``paper`` or ``small``.
         batch: Rollouts played at once.
         mode: Of rollouts: ``long`` or ``motion-only``.
-        masked: Whether newcomers are kept off other boxes and near lanes.
+        played: One of ``PLAYED``.
         seconds: Length.
         agents: Agents at first, the nearest to the ego; 0 for all.
         roads: Road tokens, the nearest to the ego; 0 for all.
@@ -76,7 +89,7 @@ class Case:
     size: str
     batch: int
     mode: str
-    masked: bool
+    played: str
     seconds: float
     agents: int
     roads: int
@@ -152,7 +165,7 @@ def make_session(case: Case) -> tuple[Session, SceneTokens]:
     history = tokenize_scene(scene, motion, roads, seen, until=scene.now)
     history = _cropped(history, case.roads)
     settings = RolloutSettings(
-        mode=case.mode, seconds=case.seconds, batch=case.batch, entry_mask=case.masked
+        mode=case.mode, seconds=case.seconds, batch=case.batch, **PLAYED[case.played]
     )
     player = Player(
         Stepper(network), motion, roads, tokens, settings, torch.device(case.device)
@@ -225,7 +238,8 @@ def goals(case: Case) -> dict[str, Case]:
     return {
         "motion only, 32 at once": replace(case, mode="motion-only"),
         "entries and exits, 32 at once": case,
-        "the same with the entry mask": replace(case, masked=True),
+        "the same with the entry mask": replace(case, played="masked"),
+        "and with moves drawn again": replace(case, played="careful"),
         "motion only, 1 at once": replace(case, mode="motion-only", batch=1),
         "entries and exits, 1 at once": replace(case, batch=1),
     }
@@ -287,7 +301,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(json.dumps(measure(Case(**asked.case))))
         return
     case = Case(
-        asked.size, asked.batch, "long", False, asked.seconds, 0, 0, asked.device,
+        asked.size, asked.batch, "long", "plain", asked.seconds, 0, 0, asked.device,
         asked.threads,
     )  # fmt: skip
     found = report(f"rollouts of {asked.seconds:g} s, {asked.size}", goals(case))
