@@ -15,7 +15,7 @@ from infgen.rollout.population import EGO_ROW, Population
 from infgen.rollout.trace import Start, number_maps
 from infgen.scene import Scene
 
-Pieces = tuple[Float32[np.ndarray, "piece 2"], Float64[np.ndarray, " piece"]]
+Pieces = tuple[Float32[np.ndarray, "_ 2"], Float64[np.ndarray, " _"]]
 
 ENOUGH = 0.5
 """With this share of the lanes that were around at now, a street is as full as then: real

@@ -1,9 +1,13 @@
 """How full a street is to be, by hand: a lane along +x from -100 to 100 m."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from infgen.rollout.fullness import Fullness, pieces_of
+from infgen.scene import FeatureKind
+from tests.conftest import LANE_ID
 from tests.rollout.test_clearance import everyone
 from tests.rollout.test_kerbs import scene_of, street
 
@@ -21,6 +25,7 @@ def wanted(ego_x_m, scene):
 
 
 EMPTY = scene_of([])
+METRES = np.arange(0.0, 11.0)
 
 
 @pytest.mark.parametrize(
@@ -34,6 +39,20 @@ EMPTY = scene_of([])
 )
 def test_where_a_map_ends_there_are_to_be_fewer(ego_x_m, expected):
     assert wanted(ego_x_m, street()) == pytest.approx(expected)
+
+
+def test_every_rollout_is_on_its_own_map(start):
+    """The lanes of the second are 10 m long, and there are three others around its ego."""
+    lane = np.column_stack([METRES, 0 * METRES])
+    short = scene_of([(LANE_ID, FeatureKind.LANE, 0, lane)])
+    short = replace(short, scenario_id="short")
+    now = everyone((0, 0, 0), (10, 0, 0), (12, 0, 0), (14, 0, 0)).take(np.array([0, 0]))
+
+    fullness = Fullness.of([start(street()), start(short)], now, 75.0)
+
+    assert fullness.lanes_m == pytest.approx([149.0, 10.0])
+    there = np.array([[137.5, 0.0], [77.5, 0.0]], dtype=np.float32)
+    assert fullness.wanted(there) == pytest.approx([3 * 37 / 74.5, 3.0])
 
 
 def test_a_map_without_lanes_is_everywhere_as_it_was():
