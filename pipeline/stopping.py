@@ -49,6 +49,8 @@ def listening() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        if not (_STATE.whole or _STATE.patient):
+            _STATE.pending = 0  # Who comes after is not asked to stop.
 
 
 @contextmanager

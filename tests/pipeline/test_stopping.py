@@ -116,6 +116,14 @@ def test_handlers_are_put_back():
     assert signal.getsignal(signal.SIGTERM) is inner
 
 
+def test_a_stop_that_was_heard_is_over_with_the_block():
+    with pytest.raises(Stopped), stopping.listening():
+        send()
+
+    with stopping.whole():
+        assert not stopping.asked()
+
+
 def test_without_a_signal_nothing_stops():
     with stopping.patient(), stopping.whole():
         stopping.check()

@@ -1,6 +1,7 @@
 """Training learns, stops, goes on, and ends with the same bytes however it got there."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from infgen.config import ConfigError
 from pipeline.checkpoint import POINTER
@@ -138,10 +140,13 @@ def start(train_unit, train_settings):
         plain = {name: asdict(value) for name, value in train_settings.items()}
         plain["train"]["checkpoint_every"] = 1
         words = [json.dumps(dict(train_unit.task)), str(folder), json.dumps(plain)]
+        # Sums of several threads have other bytes: as many as there are in this process.
+        threads = str(torch.get_num_threads())
         return subprocess.Popen(
             [sys.executable, "-c", SCRIPT, *words],
             stdout=subprocess.DEVNULL,
             cwd=Path(__file__).parents[2],
+            env={**os.environ, "OMP_NUM_THREADS": threads},
         )
 
     return start_in
