@@ -18,8 +18,8 @@ from infgen.scene import Scene
 Pieces = tuple[Float32[np.ndarray, "_ 2"], Float64[np.ndarray, " _"]]
 
 ENOUGH = 0.5
-"""With this share of the lanes that were around at now, a street is as full as then: real
-counts hardly depend on how much road there is, as long as there is some."""
+"""With this share of the lanes that were around at now, a street is as full as then: counts
+in towns' logs hardly depend on how much road there is, as long as there is some."""
 
 
 @dataclass(frozen=True, slots=True)
