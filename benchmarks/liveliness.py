@@ -8,9 +8,11 @@ The first table has the rollouts, span by span, beside the logs as far as they g
 around the ego, its speed and that of vehicles, the share of vehicles that are off the road
 (most are parked there), that of those that drive, entries and exits per half second, and in
 how many half seconds the ego, and other vehicles, set off after standing for two seconds.
-The second has who comes after now, from when it is near: speed in the first second, and
-whether vehicles begin off the road. A rollout whose ego leaves the map, where a street out
-of town ends, counts until then; how many do is said. The last line is one JSON object.
+The second has who comes after now, from when it is near: speed in the first second, who
+begins off the road or on top of somebody, pedestrians and cyclists; below it stands how far
+apart logs and rollouts are in speeds and in the side newcomers come from. A rollout whose ego
+leaves the map, where a street out of town ends, counts until then; how many do is said. The
+last line is one JSON object.
 """
 
 import argparse
@@ -22,14 +24,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64
+from newcomers import STEPS_PER_S, Newcomers, apart_bits
 from numpy.lib.stride_tricks import sliding_window_view
 
 from infgen.clock import CLOCK
 from infgen.config import TokenSettings, build
 from infgen.metrics.kinematics import speed, speed_valid
 from infgen.metrics.placement import count_per_token
-from infgen.metrics.reference import divergence_bits
 from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic, from_log, from_rollout, on_map
 from infgen.road_edges import RoadEdges, edges_of
@@ -41,9 +43,6 @@ from pipeline.manifest import read_manifest
 from pipeline.rollout import read_rollouts
 from pipeline.screen import show_table
 
-STEPS_PER_S = round(1 / CLOCK.step_s)
-SPEED_EDGES_MPS = np.arange(0.0, 26.0)
-"""Bins of first speeds; what is faster is in the last one."""
 DRIVING_MPS = 1.0
 """Vehicles that are faster drive."""
 STILL_M = 0.1
@@ -68,8 +67,7 @@ class Side:
     """Logs, or rollouts: sums and counts of each figure by span, and newcomers."""
 
     sums: dict[str, Float64[np.ndarray, "2 span"]]
-    first_mps: list[Float64[np.ndarray, " newcomer"]] = field(default_factory=list)
-    off_road: list[Bool[np.ndarray, " newcomer"]] = field(default_factory=list)
+    newcomers: Newcomers = field(default_factory=Newcomers)
     count: int = 0
     left_map_s: list[float] = field(default_factory=list)
 
@@ -84,12 +82,6 @@ class Side:
         inside = span < self.sums[name].shape[1]
         np.add.at(self.sums[name][0], span[inside], values[inside])
         np.add.at(self.sums[name][1], span[inside], 1)
-
-    def first_counts(self) -> Float64[np.ndarray, " bin"]:
-        """Count newcomers by their speed in the first second."""
-        mps = np.concatenate([np.empty(0), *self.first_mps])
-        counts, _ = np.histogram(np.minimum(mps, SPEED_EDGES_MPS[-1]), SPEED_EDGES_MPS)
-        return counts.astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +133,7 @@ def take(side: Side, whole: Traffic, place: Place, look: Look) -> None:
             side.add(name, at_s[::STEPS_PER_S][step], off[row, step], look.span_s)
     _take_starts(side, traffic, near & vehicle, look)
     _take_events(side, traffic, len(steps), look)
-    _take_newcomers(side, traffic, edges, speed_mps, known, near)
+    side.newcomers.take(traffic, edges, speed_mps, known, near)
 
 
 def _take_starts(side: Side, traffic: Traffic, others: np.ndarray, look: Look) -> None:
@@ -179,44 +171,6 @@ def _take_events(side: Side, traffic: Traffic, num_steps: int, look: Look) -> No
     ):
         found = count_per_token(token, distance_m, look.radius_m, tokens)
         side.add(name, at_s, found, look.span_s)
-
-
-def _take_newcomers(
-    side: Side,
-    traffic: Traffic,
-    edges: RoadEdges | None,
-    speed_mps: np.ndarray,
-    known: np.ndarray,
-    near: np.ndarray,
-) -> None:
-    """Measure who comes after now, from when it is near; whoever is seen for a second."""
-    late = traffic.motion.valid[0].argmax(axis=1) > traffic.now
-    first = near.argmax(axis=1)
-    rows = np.flatnonzero(near.any(axis=1) & late)
-    rows = rows[first[rows] + STEPS_PER_S < near.shape[1]]
-    second = first[rows, None] + np.arange(1, STEPS_PER_S)
-    there = (near & known)[rows[:, None], second]
-    mps = np.where(there, speed_mps[rows[:, None], second], 0.0).sum(axis=1)
-    seen = there.any(axis=1)
-    side.first_mps.append((mps / np.maximum(there.sum(axis=1), 1))[seen].astype(float))
-    vehicles = rows[traffic.motion.kind[rows] == AgentKind.VEHICLE]
-    if edges is not None and len(vehicles):
-        side.off_road.append(_off_at(traffic, vehicles, first[vehicles], edges))
-
-
-def _off_at(
-    traffic: Traffic,
-    rows: Int64[np.ndarray, " newcomer"],
-    steps: Int64[np.ndarray, " newcomer"],
-    edges: RoadEdges,
-) -> Bool[np.ndarray, " newcomer"]:
-    """Whether each of some vehicles is off the road at a step of its own."""
-    found = np.zeros(len(rows), bool)
-    for step in np.unique(steps):
-        here = steps == step
-        off_m = road_edge_m(traffic.motion, rows[here], slice(step, step + 1), edges)
-        found[here] = off_m[0, :, 0] > 0
-    return found
 
 
 def measure(root: Path, look: Look) -> tuple[Side, Side]:
@@ -291,11 +245,10 @@ def report(logs: Side, played: Side, look: Look) -> dict[str, Any]:
             f"(after {after_s or 'no'} s)"
         )
         found[f"left_map_{who}_s"] = side.left_map_s
-    newcomers = {who: _newcomers(side) for who, side in
-                 (("logs", logs), ("rollouts", played))}  # fmt: skip
+    newcomers = {"logs": logs.newcomers.numbers(), "rollouts": played.newcomers.numbers()}
     found["newcomers"] = newcomers
-    apart = divergence_bits(logs.first_counts(), played.first_counts())
-    (found["first_speed_js"],) = _numbers(np.atleast_1d(apart))
+    apart = apart_bits(logs.newcomers, played.newcomers)
+    found |= {name: _numbers(np.atleast_1d(bits))[0] for name, bits in apart.items()}
     show_table(
         "newcomers",
         ("", *newcomers["logs"]),
@@ -304,8 +257,9 @@ def report(logs: Side, played: Side, look: Look) -> dict[str, Any]:
             for who, one in newcomers.items()
         ],
     )
-    told = _cell(found["first_speed_js"], ".3f")
-    print(f"first speeds, Jensen-Shannon divergence in bits: {told}")
+    for name, what in (("first_speed_js", "first speeds"), ("bearing_js", "bearings")):
+        told = _cell(found[name], ".3f")
+        print(f"{what}, Jensen-Shannon divergence in bits: {told}")
     return found
 
 
@@ -315,20 +269,6 @@ def _cell(value: float | None, form: str) -> str:
 
 def _numbers(values: np.ndarray) -> list[float | None]:
     return [None if np.isnan(value) else round(float(value), 5) for value in values]
-
-
-def _newcomers(side: Side) -> dict[str, float | None]:
-    mps = np.concatenate([np.empty(0), *side.first_mps])
-    off = np.concatenate([np.empty(0, bool), *side.off_road])
-    if not len(mps):
-        return {"seen": 0.0}
-    return {
-        "seen": float(len(mps)),
-        "standing (< 0.5 m/s)": float((mps < 0.5).mean()),
-        "median m/s": float(np.median(mps)),
-        "90 % m/s": float(np.percentile(mps, 90)),
-        "vehicles off-road": float(off.mean()) if len(off) else None,
-    }
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -12,7 +12,7 @@ LONGEST_WORD = 36
 RECENT_S = 120.0
 """Rates are those of about the last two minutes."""
 MARK_S = 1.0
-LEAST = 0.01
+LEAST = 0.05
 """Less of a unit says nothing of the rate: beginning takes longer than going on."""
 
 

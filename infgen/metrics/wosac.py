@@ -152,7 +152,8 @@ def combine(
         rule.feature: float(np.float32(rule.weight)) * likelihoods[rule.feature]
         for rule in version.rules
     }
-    displacement_m = simulated.average_displacement_error
+    # A generated scene has no log it should be near (the official value is 0).
+    displacement_m = simulated.average_displacement_error * (not version.whole_log)
     return Scores(
         scenario_id=scenario_id,
         version=version.name,

@@ -123,11 +123,13 @@ def test_scenario_generation_scores_all_steps_of_all_agents(log):
     }
     given = Rollouts(log.scenario_id, log.id[rows].astype(np.int64), **whole)
     wide = np.repeat(log.size_lwh_m[None, rows] + np.float32(1.0), 2, axis=0)
+    moved = replace(given, x_m=given.x_m + np.float32(1.0))
 
     found = wosac.score(log, given, "wosac-2025-scenario-gen")
+    beside = wosac.score(log, moved, "wosac-2025-scenario-gen")
     wider = wosac.score(log, replace(given, size_lwh_m=wide), "wosac-2025-scenario-gen")
 
-    assert found.average_displacement_error == 0
+    assert beside.average_displacement_error == 0  # There is no log to be near.
     assert 0.5 < found.metametric <= 1.0
     assert wider.interactive_metrics < found.interactive_metrics
     with pytest.raises(RolloutsError, match="expected 91"):
