@@ -10,9 +10,9 @@ around the ego, its speed and that of vehicles, the share of vehicles that are o
 how many half seconds the ego, and other vehicles, set off after standing for two seconds.
 The second has who comes after now, from when it is near: speed in the first second, who
 begins off the road or on top of somebody, pedestrians and cyclists; below it stands how far
-apart logs and rollouts are in speeds and in the side newcomers come from. A rollout whose ego
-leaves the map, where a street out of town ends, counts until then; how many do is said. The
-last line is one JSON object.
+apart logs and rollouts are in speeds and in the side newcomers come from. A rollout whose
+ego leaves the map, where a street out of town ends, counts until then; how many do is said.
+The last line is one JSON object.
 """
 
 import argparse
