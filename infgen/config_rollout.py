@@ -97,7 +97,7 @@ class RolloutSettings:
             within 10 m, 78 % within 15 m; of those that drive, 96, 97 and 97 %.
         entry_tries: Cells that are tried for one newcomer before there is none.
         max_entries: Newcomers per half second.
-        max_agents: Agents at any one time.
+        max_agents: Agents at any one time; or as many as a scene has at now, if more.
         seed: Of all random streams.
     """
 

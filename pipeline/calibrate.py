@@ -229,7 +229,7 @@ def _rates(counts: "Turnover") -> dict[str, float | None]:
 
 STAGE = Stage(
     name="calibrate",
-    version=5,
+    version=6,
     settings={
         "tokenize": TokenSettings,
         "rollout": RolloutSettings,
@@ -240,14 +240,6 @@ STAGE = Stage(
     finish=finish,
     narrow=narrow,
     modules=(
-        "infgen.metrics.placement",
-        "infgen.metrics.traffic",
-        "infgen.metrics.turnover",
-        "infgen.model",
-        "infgen.nearest",
-        "infgen.road_edges",
-        "infgen.rollout",
-        "infgen.tokens",
         "pipeline.calibrate",
         "pipeline.calibration",
         "pipeline.playing",

@@ -3,7 +3,7 @@
 import json
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -32,10 +32,6 @@ class Listener(Protocol):
 
     def __call__(self, event: Event) -> None:
         """Take note of one event."""
-
-
-Emit = Callable[..., None]
-"""``emit(event, **figures)``."""
 
 
 class Events:

@@ -4,14 +4,12 @@
 the machine are in ``run.json`` beside it.
 """
 
-import hashlib
 import platform
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -127,39 +125,6 @@ def _damage(
     for path in _files(folder):
         if str(path.relative_to(folder)) not in files:
             yield f"{path} is not in the manifest"
-
-
-def code_hash(modules: Sequence[str]) -> str:
-    """Hash the source of modules (packages: all their files), without importing them.
-
-    Raises:
-        StoreError: if one of them has no source.
-    """
-    return _code_hash(tuple(modules))
-
-
-@cache
-def _code_hash(modules: tuple[str, ...]) -> str:
-    digest = hashlib.sha256()
-    for module in sorted(modules):
-        for name, source in _sources(module):
-            digest.update(f"{name}\0{len(source)}\0".encode() + source)
-    return digest.hexdigest()
-
-
-def _sources(module: str) -> Iterator[tuple[str, bytes]]:
-    top, *rest = module.split(".")
-    spec = find_spec(top)
-    if spec is None:
-        raise StoreError(f"module {module} has no source")
-    folders = list(spec.submodule_search_locations or ())
-    package = Path(folders[0]) if folders else Path(spec.origin or "").with_suffix("")
-    place = package.joinpath(*rest)
-    paths = sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
-    if not paths or not all(path.is_file() for path in paths):
-        raise StoreError(f"module {module} has no source at {place}")
-    for path in paths:
-        yield path.relative_to(package.parent).as_posix(), path.read_bytes()
 
 
 @cache

@@ -13,8 +13,9 @@ from typing import Any
 
 from infgen.views.page import figures, heading, page, paragraph
 from infgen.views.sheets import Sheet
+from pipeline.code_hash import code_hash
 from pipeline.folders import publish, write_file, write_json
-from pipeline.manifest import Run, code_hash, package_versions, seal
+from pipeline.manifest import Run, package_versions, seal
 from pipeline.plan import digest
 from pipeline.preset import Preset
 from pipeline.preset_compared import Compared, compare

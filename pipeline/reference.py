@@ -110,9 +110,6 @@ STAGE = Stage(
     work=work,
     finish=finish,
     modules=(
-        "infgen.metrics",
-        "infgen.nearest",
-        "infgen.road_edges",
         "pipeline.reference",
         "pipeline.reference_files",
         "pipeline.reference_tables",

@@ -202,18 +202,13 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=6,
+    version=7,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=play,
     finish=finish,
     narrow=narrow,
     modules=(
-        "infgen.nearest",
-        "infgen.road_edges",
-        "infgen.rollout",
-        "infgen.model",
-        "infgen.tokens",
         "pipeline.calibration",
         "pipeline.playing",
         "pipeline.rollout",

@@ -204,9 +204,6 @@ STAGE = Stage(
     work=work,
     finish=finish,
     modules=(
-        "infgen.metrics",
-        "infgen.nearest",
-        "infgen.road_edges",
         "pipeline.reference_files",
         "pipeline.score",
         "pipeline.score_summary",

@@ -121,7 +121,8 @@ class Stage:
             in the root folder of the experiment or elsewhere; it then counts as a source.
         narrow: Sets what decides nothing here to its default, section by section, before
             there is a key: what other settings make idle, or what is another stage's.
-        modules: Modules whose code decides the bytes; their hash is recorded.
+        modules: Modules whose code decides the bytes, but what they import of the library;
+            the hash of all is recorded.
         resumes: ``work`` finds what a killed try left below ``target`` and goes on from it.
         in_driver: Units run in the driver's process, whatever the workers (training).
     """

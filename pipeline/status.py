@@ -4,10 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from pipeline.code_hash import code_hash
 from pipeline.folders import StoreError
 from pipeline.inputs import FinishedInputs, are_made
 from pipeline.locks import holder, is_locked
-from pipeline.manifest import code_hash, read_manifest
+from pipeline.manifest import read_manifest
 from pipeline.plan import Plan, PlanError, Planned
 from pipeline.root import MANIFEST, read_json
 

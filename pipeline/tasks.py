@@ -4,7 +4,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.manifest import code_hash, package_versions, read_manifest
+from pipeline.code_hash import code_hash
+from pipeline.manifest import package_versions, read_manifest
 from pipeline.plan import PlanError, Planned, placeless
 from pipeline.root import Root
 from pipeline.stage import Unit

@@ -169,9 +169,6 @@ STAGE = Stage(
     finish=finish,
     reads=reads,
     modules=(
-        "infgen.model",
-        "infgen.tokens.moves",
-        "infgen.tokens.noise",
         "pipeline.checkpoint",
         "pipeline.course",
         "pipeline.descent",

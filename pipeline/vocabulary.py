@@ -4,9 +4,8 @@ A unit is one ingested file: a bounded sample of its moves and map pieces. Sampl
 chosen by hashes of what they are, so neither workers nor the order of files matter.
 """
 
-import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -97,17 +96,6 @@ def load_codebooks(folder: Path) -> tuple[MotionCodebook, RoadCodebook]:
     motion = _read(folder / "motion.zarr", MotionCodebook, MOTION_SCHEMA)
     roads = _read(folder / "roads.zarr", RoadCodebook, ROADS_SCHEMA)
     return motion[0], roads[0]
-
-
-def vocabulary_fingerprint(folder: Path) -> str:
-    """Return the sha256 of both codebooks' arrays: what weights were trained for."""
-    state = hashlib.sha256()
-    for codebook in load_codebooks(folder):
-        for field in fields(codebook):
-            values: np.ndarray = getattr(codebook, field.name)
-            state.update(f"{field.name} {values.dtype.str} {values.shape}".encode())
-            state.update(np.ascontiguousarray(values).tobytes())
-    return state.hexdigest()
 
 
 def reads(root: Path, settings: VocabSettings) -> list[Source]:
@@ -335,27 +323,6 @@ STAGE = Stage(
     finish=finish,
     reads=reads,
     modules=(
-        "infgen.clock",
-        "infgen.geometry",
-        "infgen.scene",
-        "infgen.tokens.agents",
-        "infgen.tokens.arcs",
-        "infgen.tokens.clusters",
-        "infgen.tokens.codebook",
-        "infgen.tokens.coverage",
-        "infgen.tokens.curves",
-        "infgen.tokens.entries",
-        "infgen.tokens.fan",
-        "infgen.tokens.grid",
-        "infgen.tokens.kdisks",
-        "infgen.tokens.limits",
-        "infgen.tokens.moves",
-        "infgen.tokens.presence",
-        "infgen.tokens.roads",
-        "infgen.tokens.sample_keys",
-        "infgen.tokens.segments",
-        "infgen.tokens.tracks",
-        "infgen.views.codebooks",
         "pipeline.vocabulary",
     ),
 )

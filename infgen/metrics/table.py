@@ -1,9 +1,10 @@
 """One rollout's numbers under the names that tables use, and its curves over the windows.
 
-Names: ``paper/linear_speed`` (protocol and feature, bucket or composite), ``ace/own_75m``
-and ``ace_slope/own_75m`` (agent count error against the scene's own log, ``split`` the mean
-of all logs, ``truth`` the same moment of a longer log; within the count radius or ``all``),
-``agents/75m`` (mean number), ``rate/entries`` (per second, at any distance),
+Names: ``paper/linear_speed`` (protocol and feature, bucket or composite), ``ace/own_near``
+and ``ace_slope/own_near`` (agent count error against the scene's own log, ``split`` the
+mean of all logs, ``truth`` the same moment of a longer log; within the count radius or
+``all``),
+``agents/near`` (mean number), ``rate/entries`` (per second, at any distance),
 ``corrected/entry_rate`` (per second, where the protocol counts entries),
 ``corrected/collision_rate`` (share of agents and windows with a collision),
 ``corrected/newcomer_offroad_rate`` (of those who are not there now).
@@ -24,8 +25,6 @@ from infgen.metrics.reference import events_per_token, happened
 from infgen.metrics.windows import Windows, cut_windows
 
 COMPOSITE, WITHOUT_PLACEMENT = "composite", "composite_without_placement"
-WHO = ("near", "all")
-REFERENCES = ("own", "split", "truth")
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,6 @@ from infgen.rollout.population import Newcomers, Population, enter
 from infgen.rollout.room import Room
 from infgen.rollout.sampling import choose, happens
 from infgen.rollout.streams import Purpose, Stream
-from infgen.rollout.trace import NOBODY
 from infgen.tokens.grid import Grid, decode_cell, decode_heading, encode_cell
 from infgen.tokens.scene_tokens import NO_CELL
 
@@ -33,12 +32,14 @@ class Asking:
         player: The network.
         streams: Random numbers of the rollouts.
         room: Where newcomers may stand; None for anywhere.
+        most: Agents that each rollout may have at any one time.
         wanted: How many others are to be around each ego; None for as many as enter.
     """
 
     player: Player
     streams: Sequence[Stream]
     room: Room | None
+    most: Int64[np.ndarray, " rollout"]
     wanted: Float64[np.ndarray, " rollout"] | None = None
 
     @property
@@ -60,6 +61,7 @@ class Asking:
             self,
             streams=[self.streams[at] for at in places],
             room=room,
+            most=self.most[places],
             wanted=None if self.wanted is None else self.wanted[places],
         )
 
@@ -140,7 +142,8 @@ def _next_newcomers(
     query = player.stepper.entry_query(party.entries)
     bias = player.tensor(party.asking.add_bias(party.population))
     add = happens(query.add_logit, luck(Purpose.ADD), bias)
-    wanted = add.cpu().numpy() & (party.population.life == NOBODY).any(axis=1)
+    # Free rows alone do not count: a batch has as many as its most crowded scene needs.
+    wanted = add.cpu().numpy() & (party.population.num_agents < party.asking.most)
     party, query = party.take(wanted), query.take(player.tensor(np.flatnonzero(wanted)))
     found = _find_places(party, query, token, turn) if len(party) else None
     if found is None or not found.who.any():

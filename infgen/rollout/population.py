@@ -45,6 +45,11 @@ class Population:
     presence: Int8[np.ndarray, "rollout row"]
     observed: Bool[np.ndarray, "rollout row"]
 
+    @property
+    def num_agents(self) -> Int64[np.ndarray, " rollout"]:
+        """Agents of each rollout."""
+        return (self.life != NOBODY).sum(axis=1)
+
     def cells(self, grid: Grid) -> Int16[np.ndarray, "rollout row"]:
         """Cell [rollout, row] of the ego's grid that holds each agent, or ``NO_CELL``."""
         ego_pose = self.pose[:, EGO_ROW, None]

@@ -355,4 +355,5 @@ def _begin(
         room = make_room(
             histories, (player.codebook, player.roads), scene, settings.entry_lane_m
         )
-    return memory, Asking(player, streams, room)
+    most = np.maximum(settings.max_agents, first.num_agents)
+    return memory, Asking(player, streams, room, most)

@@ -3,7 +3,7 @@ import shutil
 import pytest
 
 from pipeline.folders import StoreError
-from pipeline.manifest import code_hash, crc32c, list_files, read_manifest, verify
+from pipeline.manifest import crc32c, list_files, read_manifest, verify
 
 
 @pytest.fixture
@@ -96,20 +96,3 @@ def test_what_is_not_finished_is_no_damage(made):
     (stage.with_name("0123456789abcdef.partial")).mkdir()
 
     assert damage(root) == []
-
-
-def test_the_hash_of_code_sees_every_file_of_a_package():
-    whole = code_hash(("infgen.tokens",))
-
-    assert whole == code_hash(("infgen.tokens",))
-    assert whole != code_hash(("infgen.tokens.codebook",))
-    assert code_hash(("infgen.clock", "infgen.scene")) == code_hash(
-        ("infgen.scene", "infgen.clock")
-    )
-
-
-def test_code_without_a_source_is_refused():
-    with pytest.raises(StoreError, match=r"infgen\.nowhere has no source"):
-        code_hash(("infgen.nowhere",))
-    with pytest.raises(StoreError, match="module nowhere has no source"):
-        code_hash(("nowhere",))

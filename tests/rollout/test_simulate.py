@@ -130,6 +130,20 @@ def test_a_crowded_scene_keeps_to_its_rows(crossing, start, play, network):
     assert rollout.valid[:, -1].sum() == 10
 
 
+def test_a_crowded_scene_beside_it_gives_a_scene_no_more_room(
+    parked, drive, start, play, network
+):
+    force(network, add=20.0, leave=-20.0)
+    full, thin = start(parked(7)), start(drive())
+
+    (alone,) = play([thin], max_entries=16, max_agents=4)
+    beside, crowded = play([thin, full], max_entries=16, max_agents=4)
+
+    assert crowded.valid[:, -1].sum() == 8
+    assert beside.valid[:, -1].sum() == 4
+    assert_equal(beside, alone, tolerance=1e-4)
+
+
 def test_rows_are_used_again_and_lives_are_not(crossing, start, play, network):
     force(network, add=20.0, leave=20.0)  # everyone leaves at once, others come
 

@@ -13,9 +13,6 @@ from jaxtyping import Float64
 from infgen.sources.towns import curves
 from infgen.sources.towns.curves import Points
 
-RING_SUFFIX = "r"
-"""Ends the names of edges that are part of a roundabout."""
-
 
 class Use(Enum):
     """Who goes on a lane."""

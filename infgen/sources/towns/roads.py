@@ -20,7 +20,6 @@ from infgen.sources.towns.network import Connector, Lane, Network, Use
 from infgen.sources.towns.streets import MPS_PER_MPH
 
 SPACING_M = 1.0
-_SHORTEST_M = 0.2
 
 
 @dataclass(frozen=True, slots=True)
