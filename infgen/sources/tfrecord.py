@@ -17,7 +17,7 @@ import google_crc32c
 
 from infgen.sources.remote import file_system
 
-MAX_RECORD_BYTES = 64 << 20
+MAX_RECORD_BYTES = 128 << 20
 """Longer records are refused; the largest real scenario is about 5 MB."""
 
 _HEADER = struct.Struct("<QI")

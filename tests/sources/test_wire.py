@@ -165,7 +165,7 @@ def test_unknown_enum_values_do_not_count():
 
 
 def test_more_messages_than_any_record_holds_are_refused():
-    with pytest.raises(wire.WireError, match="more than 4000000 points or states"):
+    with pytest.raises(wire.WireError, match="more than 16000000 points or states"):
         wire.Spans().add(2, 0, wire.MAX_MESSAGES + 1)
 
 
