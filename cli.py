@@ -1,9 +1,4 @@
-"""The command line: words in, tables and exit codes out. The work is done in ``pipeline``.
-
-Exit codes: 0 done or up to date; 1 a stage failed, or damage was found; 2 wrong words or
-settings; 3 something is stale (``status --check``), or too many records were quarantined;
-75 another run is at it; 130 and 143 stopped by SIGINT and SIGTERM.
-"""
+"""The command line: words in, tables and exit codes out. ``pipeline`` does the work."""
 
 import os
 import shutil
@@ -15,63 +10,89 @@ from typing import Annotated
 
 import typer
 
+from infgen import __version__
 from infgen.config import ConfigError
-from pipeline import lookup, ranks, stopping, tables
+from pipeline import described, lookup, ranks, stopping, tables, tools
 from pipeline.doctor import examine
-from pipeline.folders import StoreError
-from pipeline.locks import LockedError
 from pipeline.manifest import verify as find_damage
 from pipeline.options import (
+    WORK,
     Asked,
-    Building,
     Comparing,
-    Exporting,
+    Json,
+    RootFolder,
     Running,
-    Scoring,
-    Viewing,
+    StrictCode,
     gathers,
 )
-from pipeline.plan import PlanError
-from pipeline.root import Root
-from pipeline.screen import Screen, show_table
-from pipeline.settings import DEFAULT_FILE
+from pipeline.request import OWN_FILE, find_file
+from pipeline.root import find_root
+from pipeline.screen import show_table
+from pipeline.settings import DEFAULT_FILE, load_stages
 from pipeline.sweep import find_garbage
 from pipeline.sweep import sweep as remove_garbage
 from pipeline.verbs import (
     FAILED,
-    LOCKED,
     STALE,
-    WRONG,
     compare_arms,
+    exit_code,
     find_standings,
     print_json,
     run_stages,
-    show_plan,
     tell_standings,
     watch_stages,
 )
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
+FIRST_STEP = """\
+To begin with: `infgen demo` runs every stage on built-in records, in minutes.
+
+\b
+Exit codes:
+  0         done, or up to date
+  1         a stage failed, or damage was found
+  2         wrong words or settings
+  3         something is stale (status --check), or too many records are quarantined
+  75        another run is at it
+  130, 143  stopped by SIGINT, by SIGTERM
+"""
+
 app = typer.Typer(
     name="infgen",
     help="Long-term traffic simulation: driving logs in, scored futures out.",
+    epilog=FIRST_STEP,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Key = Annotated[str, typer.Argument(help="Start of a key, or the name of a stage.")]
-RootFolder = Annotated[Path, typer.Option("--root", help="Folder of the experiment.")]
-WORK = Path("work")
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"infgen {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def infgen(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", is_eager=True, callback=_tell_version
+        ),
+    ] = False,
+) -> None:
+    """Long-term traffic simulation: driving logs in, scored futures out."""
 
 
 @app.command()
 @gathers(asked=Asked, comparing=Comparing, running=Running)
 def run(
-    stages: Annotated[list[str] | None, typer.Argument(metavar="[STAGE]...")] = None,
+    stages: Annotated[list[str] | None, typer.Argument(metavar="STAGE")] = None,
     json_: Json = False,
     *,
     asked: Asked,
@@ -95,7 +116,7 @@ def run(
 @app.command()
 @gathers(asked=Asked, running=Running)
 def ingest(
-    files: Annotated[list[str] | None, typer.Argument(metavar="[RECORDS]...")] = None,
+    files: Annotated[list[str] | None, typer.Argument(metavar="RECORDS")] = None,
     json_: Json = False,
     *,
     asked: Asked,
@@ -104,6 +125,8 @@ def ingest(
     """Turn raw records into scenes.
 
     Example: infgen ingest '../data/*.tfrecord*' --root R --dask local:2
+
+    Example: infgen ingest builtin --root R --profile small
     """
     run_stages(asked.request(files or ()), ["ingest"], running, as_json=json_)
 
@@ -113,8 +136,13 @@ def _stage_verb(stage: str, what: str, *examples: str) -> None:
     def verb(json_: Json = False, *, asked: Asked, running: Running) -> None:
         run_stages(asked.request(), [stage], running, as_json=json_)
 
-    lines = [f"Example: infgen {stage} --root R{more}" for more in ("", *examples)]
-    app.command(stage, help="\n\n".join([what, *lines]))(verb)
+    more = ("--profile small -n", "--profile small", *examples)
+    lines = [f"Example: infgen {stage} --root R {words}" for words in more]
+    before = (
+        "Makes first what is missing before it, with the settings of --profile (without "
+        "one: of the root's last run, or else the paper's, for GPUs); -n only says what."
+    )
+    app.command(stage, help="\n\n".join([what, *lines, before]))(verb)
 
 
 _stage_verb("build-vocab", "Cluster the vocabularies of moves and road pieces.")
@@ -123,12 +151,12 @@ _stage_verb("train", "Train the network; goes on where a killed run stopped.")
 _stage_verb(
     "calibrate",
     "Find what rollouts add to their odds, so that as many come and go as in logs.",
-    " -s calibrate.by=play --dask local:2",
+    "--profile small -s calibrate.by=play --dask local:2",
 )
 _stage_verb(
     "rollout",
     "Play futures of the held-out scenes; settings are those of rollout.* in stages.yaml.",
-    " --dask local:8 -s rollout.mode=wosac -s rollout.count=32",
+    "--profile small --dask local:8 -s rollout.mode=wosac -s rollout.count=32",
 )
 _stage_verb("reference", "Count what the logs of the scored split do.")
 _stage_verb("score", "Score the futures against the logs.")
@@ -136,13 +164,14 @@ _stage_verb("report", "Gather tables and figures in one page.")
 
 
 @app.command()
-@gathers(asked=Asked, running=Running)
-def plan(json_: Json = False, *, asked: Asked, running: Running) -> None:
-    """Say what a run would make, and why (run -n).
+@gathers(asked=Asked)
+def plan(json_: Json = False, strict_code: StrictCode = False, *, asked: Asked) -> None:
+    """Say what a run of all stages would make, and why (run -n).
 
     Example: infgen plan --root R -s tokenize.max_gap_s=2
     """
-    show_plan(asked.request(), [], running, as_json=json_)
+    found = find_standings(asked.request(), strict_code=strict_code)
+    tell_standings(found, as_json=json_)
 
 
 @app.command()
@@ -156,7 +185,7 @@ def status(
     every: Annotated[
         float, typer.Option(help="Seconds between two looks of --watch.", min=0.1)
     ] = 2.0,
-    strict_code: Annotated[bool, typer.Option(help="Other code makes stale.")] = False,
+    strict_code: StrictCode = False,
     *,
     asked: Asked,
 ) -> None:
@@ -169,7 +198,7 @@ def status(
     if watch:
         watch_stages(asked, every, as_json=json_, check=check)
         return
-    found = find_standings(asked.request(), [], strict_code=strict_code)
+    found = find_standings(asked.request(), strict_code=strict_code)
     tell_standings(found, as_json=json_)
     if check and any(standing.state != "cached" for standing in found):
         raise typer.Exit(STALE)
@@ -200,7 +229,7 @@ def gc(
 
     Example: infgen gc --root R --yes
     """
-    garbage = (remove_garbage if yes else find_garbage)(Root(root.absolute()))
+    garbage = (remove_garbage if yes else find_garbage)(find_root(root, made=True))
     if json_:
         print_json({"removed": yes, "garbage": [asdict(each) for each in garbage]})
         return
@@ -219,7 +248,7 @@ def verify(
 
     Example: infgen verify --root R --full
     """
-    damage = list(find_damage(Root(root.absolute()), full=full))
+    damage = list(find_damage(find_root(root, made=True), full=full))
     if json_:
         print_json({"damage": damage})
     else:
@@ -234,7 +263,8 @@ def show(key: Key, root: RootFolder = WORK) -> None:
 
     Example: infgen show tokenize --root R
     """
-    print_json(lookup.describe(lookup.find(Root(root.absolute()), key)))
+    found = lookup.find(find_root(root, made=True), key)
+    print_json(lookup.describe(found), spread=True)
 
 
 @app.command()
@@ -243,7 +273,8 @@ def diff(one: Key, other: Key, root: RootFolder = WORK, json_: Json = False) -> 
 
     Example: infgen diff 3f2a91 77c0de --root R
     """
-    folders = [lookup.find(Root(root.absolute()), key) for key in (one, other)]
+    place = find_root(root, made=True)
+    folders = [lookup.find(place, key) for key in (one, other)]
     found = list(lookup.differences(*folders))
     if json_:
         print_json({"differences": [list(each) for each in found]})
@@ -260,7 +291,32 @@ def init(target: Annotated[Path, typer.Argument()] = Path("stages.yaml")) -> Non
     if target.exists():
         raise ConfigError(f"{target} exists; move it away, or name another file")
     shutil.copyfile(DEFAULT_FILE, target)
-    typer.echo(f"wrote {target}; `infgen run` in this folder uses it")
+    found = target.absolute() == Path(OWN_FILE).absolute()
+    used = "`infgen run` in this folder uses it"
+    typer.echo(f"wrote {target}; {used if found else f'use it with --file {target}'}")
+
+
+@app.command()
+def settings(
+    section: Annotated[
+        str | None,
+        typer.Argument(help="E.g. train, or train.steps; default: all."),
+    ] = None,
+    file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Of the stages.")
+    ] = None,
+    json_: Json = False,
+) -> None:
+    """List the settings there are: what -s and stages.yaml may name, and the defaults.
+
+    Example: infgen settings train
+    """
+    stages = load_stages(find_file(file, {}), os.environ)
+    found = described.find_sections(stages, section)
+    if json_:
+        print_json({"settings": [asdict(one) for each in found for one in each.settings]})
+    else:
+        tables.show_settings(found)
 
 
 @app.command()
@@ -269,7 +325,7 @@ def doctor(root: RootFolder = WORK, json_: Json = False) -> None:
 
     Example: infgen doctor --root R
     """
-    checks = list(examine(Root(root.absolute())))
+    checks = list(examine(find_root(root)))
     if json_:
         print_json({"checks": [asdict(check) for check in checks]})
     else:
@@ -287,104 +343,21 @@ def demo(root: RootFolder = WORK / "demo", json_: Json = False) -> None:
     run_stages(Asked(root=root, profile="demo").request(), [], Running(), as_json=json_)
 
 
-@app.command()
-@gathers(building=Building)
-def towns(json_: Json = False, *, building: Building) -> None:
-    """Write synthetic driving logs as WOMD records (needs SUMO: the extra towns).
-
-    Example: infgen towns --out towns --scenes 200 --seconds 31.1 --split validation
-
-    A run that was killed goes on where it stopped, if the same is asked for again.
-    """
-    with stopping.listening(), Screen() as screen:
-        found = building.write(screen)
-    if json_:
-        print_json(found.to_json())
-    else:
-        tables.show_towns(found)
-
-
-@app.command()
-@gathers(scoring=Scoring)
-def wosac(json_: Json = False, *, scoring: Scoring) -> None:
-    """Score rollouts by the metric of the Waymo Open Sim Agents Challenge.
-
-    Example: infgen wosac 'validation.tfrecord-*' submission.tar.gz --per-scene
-    """
-    with stopping.listening(), Screen() as screen:
-        found = scoring.official(screen)
-    if json_:
-        print_json(found.to_json())
-    else:
-        tables.show_official(found, per_scene=scoring.per_scene)
-    if found.refused:
-        raise typer.Exit(FAILED)
-
-
-@app.command()
-@gathers(exporting=Exporting)
-def export(json_: Json = False, *, exporting: Exporting) -> None:
-    """Write rollouts in the format of others.
-
-    Example: infgen export --to wosac --about about.yaml --out submission.tar.gz --root R
-
-    Example: infgen export --to parquet --out table --root R
-
-    A submission (wosac) needs a file --about with account_name, unique_method_name, authors
-    and acknowledge_complies_with_closed_loop_requirement.
-    """
-    with stopping.listening(), Screen() as screen:
-        found = exporting.write(screen)
-    if json_:
-        print_json(found.to_json())
-    else:
-        tables.show_exported(found)
-
-
-@app.command()
-@gathers(viewing=Viewing)
-def view(json_: Json = False, *, viewing: Viewing) -> None:
-    """Write a page that plays a scene: its rollouts and its log, side by side.
-
-    Example: infgen view R --scene 637f20 --rollouts 0,1,2
-
-    Example: infgen view validation.tfrecord-00000-of-00150
-
-    Example: infgen view R --video scene.mp4 --strip scene.svg
-    """
-    with stopping.listening(), Screen() as screen:
-        found = viewing.write(screen)
-    if json_:
-        print_json(found.to_json())
-    else:
-        typer.echo("\n".join(path for path, _ in found.files))
-
-
-def _exit_code(error: BaseException) -> int:
-    """Exit code of a known error; an unknown one goes on as a traceback."""
-    if isinstance(error, stopping.Stopped):
-        return 128 + error.signal
-    if isinstance(error, LockedError):
-        return LOCKED
-    if isinstance(error, ConfigError | PlanError):
-        return WRONG
-    if isinstance(error, StoreError | OSError):
-        return FAILED
-    ours = type(error).__module__.split(".")[0] in ("infgen", "pipeline")
-    if isinstance(error, ValueError) and ours:
-        return FAILED
-    raise error
+app.add_typer(tools.app)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command; a known error is one line and an exit code."""
     for name in THREADS:  # One thread each: results then do not depend on who does a unit.
         os.environ.setdefault(name, "1")
+    words = sys.argv[1:] if arguments is None else arguments
     try:
         ranks.run(lambda: app(args=arguments), os.environ)
     except (ValueError, OSError, stopping.Stopped) as error:
-        code = _exit_code(error)
+        code = exit_code(error)
         typer.echo(f"infgen: {error}", err=True)
+        if "--json" in words:  # Whoever gathers lines finds this one, too.
+            print_json({"error": str(error), "exit_code": code})
         sys.exit(code)
 
 

@@ -3,6 +3,7 @@
 import math
 import types
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import field, fields
 from difflib import get_close_matches
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -64,7 +65,8 @@ def settle(kind: type, key: str, value: Any, where: str) -> Any:
 def coerce(value: Any, kind: Any, where: str) -> Any:
     """Give a plain value the type of its field.
 
-    A YAML ``5e-4`` arrives as a string and becomes a float; a float is never cut to an int.
+    A YAML ``5e-4`` arrives as a string and becomes a float; a float is never cut to an int,
+    and an int keeps all its digits. No setting is infinite or not a number.
 
     Raises:
         ConfigError: naming the place, the value and the type expected.
@@ -85,12 +87,28 @@ def coerce(value: Any, kind: Any, where: str) -> Any:
     if kind is str:
         return str(value)
     try:
-        number = float(value)
-        if kind is int and number != int(number):
-            raise wrong
-        return kind(number)
+        return _whole(value) if kind is int else _finite(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise wrong from error
+
+
+def _whole(value: Any) -> int:
+    """Make an int: of ``1e3`` too, but not of ``1.5``."""
+    if isinstance(value, int):
+        return int(value)
+    with suppress(ValueError):  # Through a float, long ones would lose digits.
+        return int(str(value))
+    number = float(value)
+    if number != int(number):
+        raise ValueError("not whole")
+    return int(number)
+
+
+def _finite(value: Any) -> float:
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError("not finite")
+    return number
 
 
 def check_bounds(
@@ -109,5 +127,27 @@ def check_bounds(
     for name, least, most in bounds:
         value = getattr(settings, name)
         if not least <= value <= most:
-            wanted = f"{least:g} or more" if most == math.inf else f"{least:g} to {most:g}"
-            raise ConfigError(f"{stage}.{name} is {value}; expected {wanted}")
+            rest = "or more" if most == math.inf else f"to {_told(most)}"
+            raise ConfigError(f"{stage}.{name} is {value}; expected {_told(least)} {rest}")
+
+
+def check_numbers(
+    settings: Any, stage: str, bounds: Mapping[str, tuple[int | float, int | float]]
+) -> None:
+    """Refuse numbers that are out of bounds, and negative ones of all other fields.
+
+    Args:
+        settings: A settings' dataclass.
+        stage: What the settings are of, for the message.
+        bounds: Least and greatest value by field, infinity for none.
+
+    Raises:
+        ConfigError: naming the setting, its value and what was expected.
+    """
+    numbers = [f.name for f in fields(settings) if f.type in (int, float)]
+    every = {**dict.fromkeys(numbers, (0, math.inf)), **bounds}
+    check_bounds(settings, stage, ((name, *each) for name, each in every.items()))
+
+
+def _told(bound: int | float) -> str:
+    return str(bound) if isinstance(bound, int) else f"{bound:g}"

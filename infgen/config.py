@@ -5,15 +5,18 @@ runs. A value that follows from others is a property, not a setting.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from infgen.coerce import ConfigError as ConfigError
 from infgen.coerce import build as build
-from infgen.coerce import check_bounds, free
+from infgen.coerce import check_numbers, free
 from infgen.coerce import decisive as decisive
 from infgen.coerce import settle as settle
 from infgen.config_calibrate import CalibrateSettings as CalibrateSettings
 from infgen.config_rollout import RolloutSettings as RolloutSettings
+from infgen.config_score import ReferenceSettings as ReferenceSettings
+from infgen.config_score import ReportSettings as ReportSettings
+from infgen.config_score import ScoreSettings as ScoreSettings
 from infgen.config_vocab import VocabSettings as VocabSettings
 
 
@@ -28,6 +31,14 @@ class IngestSettings:
 
     max_scenes_per_shard: int = 500
     limit: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be.
+
+        Raises:
+            ConfigError: naming the setting, its value and what is expected.
+        """
+        check_numbers(self, "ingest", {"max_scenes_per_shard": (1, math.inf)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +79,13 @@ class TokenSettings:
                 f"tokenize.entry_order is {self.entry_order!r}; "
                 "expected 'distance' or 'bearing'"
             )
+        bounds = {
+            **dict.fromkeys(("max_distance_m", "near_distance_m"), (1, math.inf)),
+            "grid_radius_m": (1, math.inf),
+            "grid_step_m": (0.1, math.inf),
+            "heading_step_deg": (0.1, 360),
+        }
+        check_numbers(self, "tokenize", bounds)
         if 360 % self.heading_step_deg:
             raise ConfigError(
                 f"tokenize.heading_step_deg {self.heading_step_deg} does not divide 360"
@@ -159,12 +177,23 @@ class ModelSettings:
     light_ahead_m: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse to tell of lights that are not seen to change.
+        """Refuse what no network can be made of.
 
         Raises:
-            ConfigError: naming the setting.
+            ConfigError: naming the setting, its value and what is expected.
         """
-        check_bounds(self, "model", (("light_ahead_m", 0, math.inf),))
+        one_or_more = ("width", "heads", "motion_blocks", "fourier_bands", "window_tokens")
+        bounds = {
+            **dict.fromkeys(one_or_more, (1, math.inf)),
+            **{f.name: (1, math.inf) for f in fields(self) if "_neighbours" in f.name},
+            "dropout": (0, 1),
+        }
+        check_numbers(self, "model", bounds)
+        if self.width % self.heads:
+            raise ConfigError(
+                f"model.width is {self.width}; expected a multiple of model.heads "
+                f"({self.heads})"
+            )
         if self.light_ahead_m and not self.step_lights:
             raise ConfigError(
                 f"model.light_ahead_m is {self.light_ahead_m:g}, which needs "
@@ -286,19 +315,17 @@ class TrainSettings:
             if value not in words:
                 expected = " or ".join(words)
                 raise ConfigError(f"train.{name} is {value!r}; expected {expected}")
-        bounds = (
-            ("steps", 0, math.inf),
-            ("batch_scenes", 1, math.inf),
-            ("noise_moves", 0, math.inf),
-            ("noise_roads", 0, math.inf),
-            ("noise_share", 0, 1),
-            ("noise_drift", 0, 1),
-            ("accumulate", 1, math.inf),
-            ("bucket_batches", 1, math.inf),
-            ("loader_workers", 0, math.inf),
-            ("closed_loop_top", 0, math.inf),
-        )
-        check_bounds(self, "train", bounds)
+        one_or_more = ("batch_scenes", "max_agents", "accumulate", "bucket_batches")
+        shares = ("ema_decay", "label_smoothing", "noise_share", "noise_drift")
+        bounds = {
+            **dict.fromkeys(one_or_more, (1, math.inf)),
+            **dict.fromkeys(shares, (0, 1)),
+            "clip_norm": (1e-6, math.inf),
+            "max_tokens": (2, math.inf),  # After one alone nothing comes.
+            "peer_timeout_s": (1, math.inf),
+            "seed": (0, 2**63 - 1),
+        }
+        check_numbers(self, "train", bounds)
         for noise in ("noise_moves", "noise_drift"):
             if self.closed_loop_top and getattr(self, noise):
                 raise ConfigError(
@@ -310,61 +337,3 @@ class TrainSettings:
                 f"train.accumulate is {self.accumulate}, more than the "
                 f"{self.batch_scenes} scenes of a batch"
             )
-
-
-@dataclass(frozen=True, slots=True)
-class ReferenceSettings:
-    """How logs are measured, and with them the rollouts that are scored against them.
-
-    Attributes:
-        split: Whose logs; that of the rollouts.
-        window_s: Length of a window.
-        stride_s: From one window to the next.
-        count_radius_m: Agents within it of the ego are counted; ACE is given for it and for
-            no limit.
-    """
-
-    split: str = "validation"
-    window_s: float = 8.0
-    stride_s: float = 0.5
-    count_radius_m: float = 75.0
-
-
-@dataclass(frozen=True, slots=True)
-class ScoreSettings:
-    """How rollouts are scored (METRICS.md).
-
-    Attributes:
-        enter_radius_m: For models that neither insert nor remove: who crosses this distance
-            to the ego enters or leaves, and who is beyond it is not there; 0 for never.
-        wosac: Version of the Waymo metric, for the first eight seconds.
-        resamples: Bootstrap resamples of the scenes behind the 95 % intervals.
-        seed: Of the bootstrap.
-    """
-
-    enter_radius_m: float = 0.0
-    wosac: str = "wosac-2025"
-    resamples: int = 1000
-    seed: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class ReportSettings:
-    """What the report shows.
-
-    Attributes:
-        title: Heading of the report.
-        players: Of so many of the rollouts with the lowest scores there is a page that
-            plays them.
-    """
-
-    title: str = "InfGen"
-    players: int = 3
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be written.
-
-        Raises:
-            ConfigError: naming the setting.
-        """
-        check_bounds(self, "report", (("players", 0, math.inf),))

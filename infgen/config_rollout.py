@@ -3,7 +3,8 @@
 import math
 from dataclasses import dataclass
 
-from infgen.coerce import ConfigError, check_bounds
+from infgen.clock import CLOCK
+from infgen.coerce import ConfigError, check_numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,23 +184,19 @@ class RolloutSettings:
                 raise ConfigError(
                     f"rollout.{name} is {getattr(self, name)}; expected up to 1, above 0"
                 )
-        bounds = (
-            ("count", 1, math.inf),
-            ("scenes", 0, math.inf),
-            ("scenes_per_task", 1, math.inf),
-            ("batch", 1, math.inf),
-            ("leave_radius_m", 0, math.inf),
-            ("top_moves", 0, math.inf),
-            ("top_cells", 0, math.inf),
-            ("move_tries", 1, math.inf),
-            ("patience_s", 0, math.inf),
-            ("keep_count", 0, math.inf),
-            ("entry_lane_m", 0, math.inf),
-            ("entry_tries", 1, math.inf),
-            ("max_entries", 0, math.inf),
-            ("max_agents", 1, math.inf),
-        )
-        check_bounds(self, "rollout", bounds)
+        one_or_more = (
+            "count", "scenes_per_task", "batch", "move_tries", "entry_tries", "max_agents"
+        )  # fmt: skip
+        bounds = {
+            **dict.fromkeys(one_or_more, (1, math.inf)),
+            **dict.fromkeys(("add_bias", "leave_bias"), (-math.inf, math.inf)),
+            "seed": (0, 2**63 - 1),
+        }
+        check_numbers(self, "rollout", bounds)
+        try:
+            CLOCK.tokens_in(self.length_s)
+        except ValueError as error:
+            raise ConfigError(f"rollout.seconds: {error}") from error
 
     @property
     def length_s(self) -> float:

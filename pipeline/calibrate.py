@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 from infgen.clock import CLOCK
 from infgen.config import CalibrateSettings, RolloutSettings, TokenSettings
 from pipeline.calibration import Biases, read_biases, write_found
-from pipeline.plan import PlanError
 from pipeline.playing import begin, load_player, play_all, read_some
-from pipeline.splits import in_split, split_of, spread
+from pipeline.splits import files_of, spread
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
 if TYPE_CHECKING:
@@ -89,16 +88,12 @@ def _parts(inputs: Inputs, how: CalibrateSettings) -> list[list[tuple[Done, list
     """Cut the scenes into parts for one unit each: file, rows of its scenes.
 
     Raises:
-        PlanError: if there is no file of the split.
+        PlanError: if there is no scene of the split.
     """
-    every = inputs.units("ingest")
-    files = [done for done in every if in_split(done.name, how.split)]
-    if not files:
-        found = ", ".join(sorted({split_of(done.name) for done in every})) or "none"
-        raise PlanError(
-            f"no file of split {how.split!r} to play and calibrate by (there is: {found}); "
-            "set calibrate.split, or calibrate.by"
-        )
+    files = files_of(
+        inputs.units("ingest"), how.split,
+        to="play and calibrate by", setting="calibrate.split or calibrate.by",
+    )  # fmt: skip
     chosen = zip(files, spread(files, how.scenes), strict=True)
     scenes = [(done, row) for done, rows in chosen for row in rows]
     most = how.scenes_per_task

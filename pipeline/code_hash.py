@@ -15,7 +15,8 @@ from pathlib import Path
 from pipeline.folders import StoreError
 
 LIBRARY = "infgen"
-SETTINGS = ("infgen.config", "infgen.config_rollout")
+SETTINGS = "infgen.config"
+"""All settings, and how the files begin that they are in."""
 
 
 def code_hash(modules: Sequence[str]) -> str:
@@ -71,7 +72,7 @@ def _imports(path: Path) -> frozenset[str]:
             named |= {node.module, *(f"{node.module}.{one.name}" for one in node.names)}
     parts = [name.split(".") for name in named if name.split(".")[0] == LIBRARY]
     every = {".".join(some[:upto]) for some in parts for upto in range(1, len(some) + 1)}
-    return frozenset(every.difference(SETTINGS))
+    return frozenset(name for name in every if not name.startswith(SETTINGS))
 
 
 def _files(module: str) -> Iterator[tuple[str, Path]]:

@@ -3,7 +3,8 @@
 A list of records of one type (a frozen dataclass, its arrays annotated by jaxtyping, other
 such dataclasses nested in it) becomes a dictionary of one-dimensional arrays: every array
 field laid end to end (``tracks.xyz_m``), and the sizes of every named dimension per record
-(``dim.agent``). Nothing else is needed to cut the records out again, also from memory maps.
+(``dim.agent``). Nothing else is needed to cut the records out again, also from columns that
+stay on disk.
 """
 
 import math
@@ -11,12 +12,31 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
 from functools import cache
-from typing import Any, Generic, NamedTuple, TypeVar, get_type_hints
+from typing import (
+    Any,
+    Generic,
+    NamedTuple,
+    Protocol,
+    TypeVar,
+    get_type_hints,
+    runtime_checkable,
+)
 
 import numpy as np
 
 T = TypeVar("T")
-Columns = Mapping[str, np.ndarray]
+
+
+@runtime_checkable
+class Values(Protocol):
+    """One column: an array, or what gives parts of one."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, part: slice, /) -> np.ndarray: ...
+
+
+Columns = Mapping[str, Values]
 
 
 class Column(NamedTuple):
@@ -108,7 +128,7 @@ class _Cut(NamedTuple):
         kind: Python type of a scalar; None for an array.
     """
 
-    values: np.ndarray
+    values: Values
     extent: int
     factor: int
     shape: tuple[int, ...]
@@ -125,7 +145,7 @@ class _Maker(NamedTuple):
 class Unpacked(Generic[T], Sequence[T]):
     """Records cut out of columns on demand: ``records[3]`` touches only that record.
 
-    Arrays are views of the columns; with memory maps nothing is read until it is used. All
+    Arrays are parts of the columns: views, or read there and then from columns on disk. All
     that depends on the type is settled when opened: training reads one record at a time.
     """
 
@@ -160,14 +180,14 @@ class Unpacked(Generic[T], Sequence[T]):
 
     def column(self, name: str) -> np.ndarray:
         """Return one whole column, all records end to end."""
-        return self._columns[name]
+        return self._columns[name][:]
 
     def sizes(self, dim: str) -> np.ndarray:
         """Return the size of one named dimension in every record."""
-        return self._columns[f"dim.{dim}"]
+        return self._columns[f"dim.{dim}"][:]
 
     def _cut(self, leaf: Column, found: dict[tuple[str, ...], int]) -> _Cut:
-        values = np.asarray(self._columns[leaf.name])
+        values = self._columns[leaf.name]
         dims = _dims(leaf)
         named = tuple(dim for dim in dims if not dim.isdigit())
         factor = math.prod(int(dim) for dim in dims if dim.isdigit())
@@ -188,7 +208,7 @@ class Unpacked(Generic[T], Sequence[T]):
 
     def _size(self, dim: str) -> np.ndarray:
         name, more = _split(dim)
-        return np.asarray(self._columns[f"dim.{name}"]) + more
+        return self._columns[f"dim.{name}"][:] + more
 
 
 def names(kind: Any) -> frozenset[str]:

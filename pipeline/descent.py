@@ -5,6 +5,7 @@ loss term is its sum over all parts divided by the sum of its weights over all p
 latter are known beforehand (``supervised``), so gradients simply add up.
 """
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from pipeline.distributed import Team
 from pipeline.precision import Pass
 
 LEAST_WEIGHT = 1e-6
+SEED_BITS = 16
 FIGURES = ("loss", "weight", "count", "right", "event")
 """Sums of a term, as ``Term`` has them."""
 
@@ -162,8 +164,15 @@ def _share(terms: Terms, weight: Tensor, settings: TrainSettings) -> Tensor:
 
 
 def noise_of_part(step: int, seed: int, part: int) -> int:
-    """Number that decides the dropout of one part of one step's batch."""
-    return (seed << 48) + (part << 32) + step
+    """Number that decides the dropout of one part of one step's batch.
+
+    Torch takes 64 bits of it. Seeds that leave room for part and step keep their bits, for
+    there are weights that name them; of others it is a hash.
+    """
+    if seed < 1 << SEED_BITS:
+        return (seed << 64 - SEED_BITS) + (part << 32) + step
+    digest = hashlib.sha256(f"{seed}/{part}/{step}".encode()).digest()
+    return int.from_bytes(digest[:8], "little") >> 1
 
 
 def learning_rate(settings: TrainSettings, step: int) -> float:

@@ -10,13 +10,14 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from infgen.config import ConfigError
+from infgen.config import ConfigError, RolloutSettings
 from infgen.exports import gpudrive, scenarionet
 from infgen.exports.rows import rows_of
 from infgen.exports.wosac import About
@@ -25,6 +26,7 @@ from infgen.scene import Scene
 from pipeline import stopping
 from pipeline.events import Event
 from pipeline.folders import PARTIAL, StoreError, publish, write_file, write_json
+from pipeline.locks import locked
 from pipeline.logs import Logs, unit_folders
 from pipeline.manifest import read_manifest
 from pipeline.root import MANIFEST
@@ -32,7 +34,7 @@ from pipeline.root import MANIFEST
 WOSAC = "wosac"
 REQUEST = "request.json"
 _SAFE_ID = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
-_VERSION = 1
+_VERSION = 2
 """Raised when the same rollouts would give other bytes."""
 
 
@@ -64,6 +66,21 @@ class Order:
     def partial(self) -> Path:
         """Folder of what is not finished yet."""
         return self.out.with_name(f"{self.out.name}{PARTIAL}")
+
+    @property
+    def lock(self) -> Path:
+        """File that is held while it is written; gone when all is there."""
+        out = self.out.absolute()
+        return out.with_name(f"{out.name}.lock")
+
+    def check_free(self) -> None:
+        """Refuse to write where something stands.
+
+        Raises:
+            ConfigError: naming it.
+        """
+        if self.out.exists():
+            raise ConfigError(f"{self.out} exists; remove it, or name another --out")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,10 +118,17 @@ class Exported:
 
 
 class Unit(NamedTuple):
-    """A folder of rollouts, and which each of its scenes has, in order."""
+    """A folder of rollouts, and which each of its scenes has, in order.
+
+    Attributes:
+        folder: Of the unit.
+        scenes: Indices of the rollouts of each scene.
+        lights: What lights showed after the history: ``now`` or ``log``.
+    """
 
     folder: Path
     scenes: Mapping[str, Sequence[int]]
+    lights: str
 
     @property
     def num_rollouts(self) -> int:
@@ -124,11 +148,12 @@ class Form(NamedTuple):
 
     Attributes:
         name: File of a rollout, by scenario id and index.
-        write: Writes the files of some rollouts of a scene below a folder.
+        write: Writes the files of some rollouts of a scene below a folder, told what lights
+            showed while they were played.
     """
 
     name: Callable[[str, int], str]
-    write: Callable[[Path, Scene, Sequence[Rollout]], None]
+    write: Callable[[Path, Scene, Sequence[Rollout], str], None]
 
 
 def export(order: Order, tell: Callable[[Event], None] = lambda _: None) -> Exported:
@@ -138,6 +163,7 @@ def export(order: Order, tell: Callable[[Event], None] = lambda _: None) -> Expo
         ConfigError: if the format is unknown, ``out`` exists, or there are no rollouts.
         ExportError: if an id cannot name a file.
         RolloutsError: if a scene of a submission is not as it must be.
+        LockedError: if another process writes there.
     """
     from pipeline.export_wosac import export_submission  # noqa: PLC0415
 
@@ -145,8 +171,7 @@ def export(order: Order, tell: Callable[[Event], None] = lambda _: None) -> Expo
         near = get_close_matches(order.to, FORMATS, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(FORMATS)}"
         raise ConfigError(f"no format {order.to!r}; {hint}")
-    if order.out.exists():
-        raise ConfigError(f"{order.out} exists; remove it, or name another --out")
+    order.check_free()
     units = find_units(order.rollouts)
     _say(tell, "work-started", units=1, made=0, what="scenes")
     write = export_submission if order.to == WOSAC else _export_folder
@@ -188,13 +213,21 @@ def find_units(rollouts: Path) -> list[Unit]:
         )
         for scenario_id, rollout in index.iter_rows():
             scenes.setdefault(scenario_id, []).append(rollout)
-        found.append(Unit(folder, scenes))
+        found.append(Unit(folder, scenes, _lights_of(folder)))
     for scenario_id in (each for unit in found for each in unit.scenes):
         if not _SAFE_ID.fullmatch(scenario_id):
             raise ExportError(f"scenario id {scenario_id!r} cannot name a file")
     if not any(unit.scenes for unit in found):
         raise ConfigError(f"{rollouts} holds no rollouts; `infgen rollout` plays some")
     return found
+
+
+def _lights_of(folder: Path) -> str:
+    """Tell what lights showed in a unit's rollouts: as it was then usual, if it is old."""
+    if not (folder / MANIFEST).is_file():
+        return RolloutSettings().lights
+    played = read_manifest(folder).get("settings", {}).get("rollout", {})
+    return str(played.get("lights", RolloutSettings().lights))
 
 
 def parts_of(unit: Unit) -> Iterator[Part]:
@@ -224,7 +257,23 @@ def not_played(rollouts: Path) -> list[str]:
     return list(read_manifest(rollouts).get("report", {}).get("refused", []))
 
 
-def begin(order: Order, units: Sequence[Unit]) -> None:
+@contextmanager
+def begin(order: Order, units: Sequence[Unit]) -> Iterator[None]:
+    """Make the partial folder, empty unless an equal order left it, and hold it alone.
+
+    Raises:
+        ConfigError: if another process has just written ``out``.
+        LockedError: if another process is at it.
+    """
+    with locked(order.lock):
+        order.check_free()
+        _clear(order, units)
+        yield
+        # Who has waited for it finds that ``out`` is there, so nobody needs it any more.
+        order.lock.unlink()
+
+
+def _clear(order: Order, units: Sequence[Unit]) -> None:
     """Make the partial folder, empty unless an equal order left it."""
     asked = {
         "version": _VERSION,
@@ -260,15 +309,15 @@ def _identity(units: Sequence[Unit]) -> str:
 def _export_folder(order: Order, units: Sequence[Unit], steps: Steps) -> Exported:
     """Write a folder of files, a scene at a time, those that are there already left out."""
     form, before = _FOLDERS[order.to], 0
-    begin(order, units)
-    with publish(order.out, resume=True) as folder:
+    with begin(order, units), publish(order.out, resume=True) as folder:
         for unit in units:
             made = {name for name in unit.scenes if _is_there(form, folder, unit, name)}
             before += len(made)
             steps.take(len(made))
             for part in parts_of(unit) if len(made) < len(unit.scenes) else ():
                 if part.scenario_id not in made:
-                    form.write(folder, order.logs.find(part.scenario_id), part.rollouts)
+                    scene = order.logs.find(part.scenario_id)
+                    form.write(folder, scene, part.rollouts, unit.lights)
                     steps.take()
         (folder / REQUEST).unlink()
         files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
@@ -306,15 +355,15 @@ def _scenarionet_name(scenario_id: str, rollout: int) -> str:
 def _json_form(
     file_name: Callable[[str, int], str],
     map_text: Callable[[Scene], str],
-    scene_text: Callable[[Rollout, Scene, str, str], str],
+    scene_text: Callable[[Rollout, Scene, str, str, str], str],
 ) -> Form:
     """Write a file per rollout, the map made once for all of a scene."""
 
-    def write(folder: Path, scene: Scene, rollouts: Sequence[Rollout]) -> None:
+    def write(folder: Path, scene: Scene, rollouts: Sequence[Rollout], lights: str) -> None:
         roads = map_text(scene)
         for one in rollouts:
             name = f"{one.scenario_id}_{one.index:03d}"
-            text = scene_text(one, scene, name, roads)
+            text = scene_text(one, scene, name, roads, lights)
             write_file(folder / file_name(one.scenario_id, one.index), text.encode())
 
     return Form(file_name, write)
@@ -325,7 +374,9 @@ def _parquet_name(scenario_id: str, rollout: int) -> str:
     return f"scenario_id={scenario_id}/rollouts.parquet"
 
 
-def _write_parquet(folder: Path, scene: Scene, rollouts: Sequence[Rollout]) -> None:
+def _write_parquet(
+    folder: Path, scene: Scene, rollouts: Sequence[Rollout], lights: str
+) -> None:
     import polars as pl  # noqa: PLC0415
 
     path = folder / _parquet_name(scene.scenario_id, 0)

@@ -72,6 +72,7 @@ def export_submission(order: Order, units: Sequence[Unit], steps: Steps) -> Expo
     Raises:
         ConfigError: if it is not told who submits what, or ``out`` names no archive.
         RolloutsError: naming the first scene that is not as it must be.
+        LockedError: if another process writes there.
     """
     about = order.about
     if about is None or not about.num_model_parameters:
@@ -80,17 +81,17 @@ def export_submission(order: Order, units: Sequence[Unit], steps: Steps) -> Expo
     if not order.out.name.endswith(_ENDINGS):
         raise ConfigError(f"--out {order.out}: expected a name ending in {_ENDINGS[0]}")
     _check_counts(units)
-    begin(order, units)
-    count = -(-steps.total // order.scenes_per_shard)
-    paths = [order.partial / _shard_name(shard, count) for shard in range(count)]
-    made = sum(1 for path in paths if path.is_file())  # In order: the first so many.
-    before = min(made * order.scenes_per_shard, steps.total)
-    steps.take(before)
-    parts = _scenes(units, before)
-    for path in paths[made:]:
-        _write_shard(path, islice(parts, order.scenes_per_shard), order, about, steps)
-    tallies = [read_json(_tally_of(path)) for path in paths]
-    _pack(paths, order)
+    with begin(order, units):
+        count = -(-steps.total // order.scenes_per_shard)
+        paths = [order.partial / _shard_name(shard, count) for shard in range(count)]
+        made = sum(1 for path in paths if path.is_file())  # In order: the first so many.
+        before = min(made * order.scenes_per_shard, steps.total)
+        steps.take(before)
+        parts = _scenes(units, before)
+        for path in paths[made:]:
+            _write_shard(path, islice(parts, order.scenes_per_shard), order, about, steps)
+        tallies = [read_json(_tally_of(path)) for path in paths]
+        _pack(paths, order)
     return Exported(
         format=order.to,
         out=str(order.out),

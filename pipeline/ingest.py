@@ -16,6 +16,7 @@ from infgen.config import IngestSettings
 from infgen.scene import Scene
 from infgen.sources.tfrecord import BadRecord, Record, iter_records
 from infgen.sources.womd import scene_or_fault
+from pipeline.duplicates import mark_duplicates, tell_left_out
 from pipeline.parquet import joined, table
 from pipeline.splits import split_of
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
@@ -44,6 +45,7 @@ _INDEX = {
 }
 _QUARANTINE = {"source": str, "record": int, "offset": int, "reason": str}
 _DUPLICATES = {**_QUARANTINE, "scenario_id": str, "first_source": str, "first_record": int}
+_MARKED = ("scenario_id", "split", "duplicate", "source", "record", "offset")
 
 
 def read_scenes(unit_folder: Path) -> Iterator[Scene]:
@@ -89,26 +91,22 @@ def finish(
 ) -> Report:
     """Join the units' tables, and name scenes that several files hold.
 
-    The first file (by name) that holds a scenario keeps it; the others' rows are marked in
-    the index and listed in ``duplicates.parquet``.
+    All are listed in ``duplicates.parquet``; those marked in the index do not count.
     """
-    import polars as pl  # noqa: PLC0415
-
     target.mkdir(parents=True, exist_ok=True)
     paths = [unit.path for unit in units]
-    index = joined(paths, "index.parquet", _INDEX)
-    first = pl.struct("source", "record").first().over("scenario_id").alias("first")
-    index = index.with_columns(duplicate=~pl.col("scenario_id").is_first_distinct())
-    twice = index.with_columns(first).filter("duplicate")
+    index = mark_duplicates(joined(paths, "index.parquet", _INDEX))
     quarantine = joined(paths, "quarantine.parquet", _QUARANTINE)
-    duplicates = _duplicates(twice)
+    duplicates = _duplicates(index)
     index.write_parquet(target / "index.parquet")
     quarantine.write_parquet(target / "quarantine.parquet")
     duplicates.write_parquet(target / "duplicates.parquet")
+    left_out = tell_left_out(index)
     return {
         "scenes": len(index),
         "quarantined": len(quarantine),
-        "duplicates": len(duplicates),
+        "duplicates": int(index["duplicate"].sum()),
+        **({"units": left_out} if left_out else {}),
     }
 
 
@@ -205,21 +203,26 @@ def num_bytes(record: Any) -> int:
     return total
 
 
-def _duplicates(twice: "pl.DataFrame") -> "pl.DataFrame":
+def _duplicates(index: "pl.DataFrame") -> "pl.DataFrame":
+    """Name the scenes that an earlier file holds too, of their split or of another."""
     import polars as pl  # noqa: PLC0415
 
-    first = pl.col("first").struct
-    return twice.select(
-        "source",
-        "record",
-        "offset",
-        pl.format("scenario {} is in {} too", "scenario_id", first["source"]).alias(
-            "reason"
-        ),
-        "scenario_id",
-        first["source"].alias("first_source"),
-        first["record"].alias("first_record"),
-    )
+    several = index.filter(pl.col("scenario_id").is_duplicated()).select(_MARKED)
+    first: dict[tuple[str, ...], tuple[str, int]] = {}
+    rows = []
+    for name, split, left_out, source, record, offset in several.iter_rows():
+        place = (source, record)
+        in_split = first.setdefault((name, split), place)
+        earlier = first.setdefault((name,), place)
+        if left_out:
+            earlier, fate = in_split, "left out"
+        elif earlier != place:
+            fate = "both count"
+        else:
+            continue
+        reason = f"scenario {name} is in {earlier[0]} too: {fate}"
+        rows.append((*place, offset, reason, name, *earlier))
+    return table([dict(zip(_DUPLICATES, row, strict=True)) for row in rows], _DUPLICATES)
 
 
 STAGE = Stage(
@@ -231,6 +234,7 @@ STAGE = Stage(
     finish=finish,
     modules=(
         "pipeline.columns",
+        "pipeline.duplicates",
         "pipeline.ingest",
         "pipeline.parquet",
         "pipeline.splits",

@@ -1,7 +1,7 @@
 """What a stage sees of the stages before it: finished units and folders, nothing else."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,14 +43,10 @@ class FinishedInputs:
     def units(self, stage: str) -> Sequence[Done]:
         """Finished units of an input stage, by name."""
         manifest = read_manifest(self.folder(stage))
+        more = manifest["report"].get("units", {})
         return [
-            Done(
-                unit["name"],
-                unit["key"],
-                self.root.unit(stage, unit["key"]),
-                unit["report"],
-            )
-            for unit in manifest["units"]
+            replace(done, report={**done.report, **more.get(done.name, {})})
+            for done in units_of(self.root, stage, manifest)
         ]
 
     def content(self, stage: str, *names: str) -> str:

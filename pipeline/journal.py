@@ -5,6 +5,7 @@ from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
 from typing import Any
 
+from infgen.config import TrainSettings
 from infgen.model.losses import figures, total
 from pipeline.checkpoint import Training, save_checkpoint
 from pipeline.course import Course
@@ -32,7 +33,7 @@ class Journal:
         self._every = max(1, how.steps // LOG_LINES)
         self._done = self._saved = first
         self._saved_at = time.monotonic()
-        self._log = TrainLog(folder / LOG, first)
+        self._log = TrainLog(folder / LOG, first, validated=is_validated(how, first))
         run = folder / RUN_FOLDER
         self.pace = Pace(run / PACE, how.steps, first, how.batch_scenes)
         self._events: EventFiles | None = None
@@ -108,3 +109,8 @@ class Journal:
         self._log.add(line)
         if self._events is not None:
             self._events.add(group, self._done, figures)
+
+
+def is_validated(how: TrainSettings, done: int) -> bool:
+    """Whether the network is validated after so many steps; in the end it is once more."""
+    return bool(how.validate_every and done and done % how.validate_every == 0)

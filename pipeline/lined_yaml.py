@@ -38,9 +38,17 @@ def load(path: Path) -> Lined:
         ConfigError: naming file and line, if it is not YAML, or a key stands twice.
     """
     try:
-        node = yaml.compose(path.read_text(), Loader=yaml.SafeLoader)
+        node = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
     except FileNotFoundError as error:
-        raise ConfigError(f"{path} is missing; `infgen init` writes one") from error
+        way = "`infgen init` writes a stages.yaml"
+        raise ConfigError(f"{path} is missing; {way}") from error
+    except IsADirectoryError as error:
+        raise ConfigError(f"{path} is a folder; expected a YAML file") from error
+    except UnicodeDecodeError as error:
+        where = f"byte {error.object[error.start]:#04x} at {error.start}"
+        raise ConfigError(f"{path} is no text ({where}); expected a YAML file") from error
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: {' '.join(str(error).split())}") from error
     loaded = _plain(node, path.name) if node is not None else Lined(path.name)

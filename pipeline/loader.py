@@ -1,4 +1,4 @@
-"""Token shards to batches: mapped into memory, in any order, prepared ahead of time.
+"""Token shards to batches: read scene by scene, in any order, prepared ahead of time.
 
 What a step reads follows from (seed, step) alone, so there is no position to save, and it
 does not matter who prepares it: a thread, or any number of processes.

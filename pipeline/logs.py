@@ -70,7 +70,7 @@ class RecordLogs:
         """
         while scenario_id not in self._places:
             if next(self._coming, None) is None:
-                raise self._missing()
+                raise self._missing(scenario_id)
         data = self._kept.pop(scenario_id, None)
         if data is None:
             return decode_scene(self._reread(self._places[scenario_id]))
@@ -107,12 +107,13 @@ class RecordLogs:
             raise RecordError(f"{place.url} at byte {place.offset}: {record.reason}")
         return record.data
 
-    def _missing(self) -> ValueError:
+    def _missing(self, scenario_id: str) -> ValueError:
         bad = "; ".join(self._bad[:MAX_NAMED])
         if not self._places:
             return ConfigError(f"no usable record: {bad}")
         unusable = f" ({len(self._bad)} unusable records: {bad})" if self._bad else ""
-        return MissingLogError(f"none of {len(self._places)} records holds it{unusable}")
+        none = f"scene {scenario_id}: none of {len(self._places)} records holds it"
+        return MissingLogError(f"{none}{unusable}")
 
 
 class StoreLogs:
@@ -136,7 +137,8 @@ class StoreLogs:
             StoreError: if its group is damaged.
         """
         if scenario_id not in self._places:
-            raise MissingLogError(f"none of {len(self._places)} ingested scenes has its id")
+            none = f"none of {len(self._places)} ingested scenes has its id"
+            raise MissingLogError(f"scene {scenario_id}: {none}")
         path, row = self._places[scenario_id]
         return self._group(path)[row]
 

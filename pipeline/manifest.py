@@ -87,10 +87,24 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     Raises:
         StoreError: if it is missing or damaged.
     """
-    manifest = read_json(folder / MANIFEST)
+    try:
+        manifest = read_json(folder / MANIFEST)
+    except StoreError as error:
+        raise StoreError(f"{error}{_way_out(folder)}") from error
     if not isinstance(manifest, dict) or "files" not in manifest:
-        raise StoreError(f"{folder / MANIFEST} is damaged: it lists no files")
+        path = folder / MANIFEST
+        raise StoreError(f"{path} is damaged: it lists no files{_way_out(folder)}")
     return manifest
+
+
+def _way_out(folder: Path) -> str:
+    """Say how a damaged stage, or one of its units, comes right; nothing of others."""
+    stage = folder.resolve().parent
+    stage = stage.parent if stage.name == "units" else stage
+    root = Root(stage.parent.parent)
+    if stage.parent != root.store:
+        return ""
+    return f"; `infgen run {stage.name} --root {root.path} --force` makes it again"
 
 
 def verify(root: Root, *, full: bool) -> Iterator[str]:
@@ -105,10 +119,13 @@ def verify(root: Root, *, full: bool) -> Iterator[str]:
         except StoreError as error:
             yield str(error)
             continue
-        yield from _damage(folder, manifest["files"], full=full)
+        way = _way_out(folder)
+        for line in _damage(folder, manifest["files"], full=full):
+            yield f"{line}{way}"
         for unit in manifest.get("units", []):
-            if not (root.unit(stage, unit["key"]) / MANIFEST).is_file():
-                yield f"{root.unit(stage, unit['key'])} is missing (unit {unit['name']})"
+            place = root.unit(stage, unit["key"])
+            if not (place / MANIFEST).is_file():
+                yield f"{place} is missing (unit {unit['name']}){way}"
 
 
 def _damage(

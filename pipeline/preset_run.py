@@ -115,9 +115,9 @@ class _Runs:
         for stage, planned in plan.stages.items():
             if (stage, planned.key) in self.failed:
                 return Ran(leg, "skipped", self.failed[stage, planned.key], plan)
-        self.comparison.request(leg, start).remember(plan, leg.name)
         try:
-            results = run(plan, self._orders(plan), self.events)
+            with self.comparison.request(leg, start).remembered(plan, leg.name):
+                results = run(plan, self._orders(plan), self.events)
         except StoreError as error:
             return Ran(leg, "failed", str(error), plan)
         return self._note(leg, plan, results)

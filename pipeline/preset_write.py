@@ -4,7 +4,6 @@ It is made once for what it shows, below ``store/comparison``, and ``presets/NAM
 the last one: a reader sees the whole of that, or of the one before.
 """
 
-import shutil
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -14,7 +13,7 @@ from typing import Any
 from infgen.views.page import figures, heading, page, paragraph
 from infgen.views.sheets import Sheet
 from pipeline.code_hash import code_hash
-from pipeline.folders import publish, write_file, write_json
+from pipeline.folders import publish, remove_folder, write_file, write_json
 from pipeline.manifest import Run, package_versions, seal
 from pipeline.plan import digest
 from pipeline.preset import Preset
@@ -61,8 +60,7 @@ def write_comparison(comparison: Comparison, ran: Sequence[Ran], *, again: bool)
     about = _about(preset, ran)
     folder = root.folder(STAGE, about["key"])
     if again:
-        (folder / MANIFEST).unlink(missing_ok=True)
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_folder(folder)
     if not (folder / MANIFEST).is_file():
         started, begun = datetime.now(UTC).isoformat(timespec="seconds"), time.monotonic()
         with publish(folder) as partial:

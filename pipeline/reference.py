@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infgen.config import ReferenceSettings, TokenSettings
-from pipeline.splits import in_split
+from pipeline.duplicates import read_scenes_of, scenes_of
+from pipeline.splits import files_of
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
 if TYPE_CHECKING:
@@ -21,13 +22,14 @@ SCENES_PER_GROUP = 64
 
 
 def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
-    """One unit per ingested file of the split."""
-    split = settings["reference"].split
-    return [
-        Unit(done.name, {"scenes": done.key}, {"scenes": str(done.path)})
-        for done in inputs.units("ingest")
-        if in_split(done.name, split)
-    ]
+    """One unit per ingested file of the split.
+
+    Raises:
+        PlanError: if there is no scene of the split.
+    """
+    every, split = inputs.units("ingest"), settings["reference"].split
+    files = files_of(every, split, to="measure", setting="reference.split")
+    return [Unit(done.name, {"scenes": done.key}, scenes_of(done)) for done in files]
 
 
 def work(
@@ -37,13 +39,12 @@ def work(
     from infgen.metrics.reference import no_counts  # noqa: PLC0415
     from infgen.metrics.table import LogCounts  # noqa: PLC0415
     from pipeline import reference_files as files  # noqa: PLC0415
-    from pipeline.ingest import read_scenes  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
     counts, logged = no_counts(), []
     group: list[Binned] = []
     skipped: dict[str, str] = {}
-    for scene in read_scenes(Path(unit.task["scenes"])):
+    for scene in read_scenes_of(unit.task):
         measured = _measure(scene, settings["tokenize"], settings["reference"])
         if isinstance(measured, str):
             skipped[scene.scenario_id] = measured
@@ -110,6 +111,7 @@ STAGE = Stage(
     work=work,
     finish=finish,
     modules=(
+        "pipeline.duplicates",
         "pipeline.reference",
         "pipeline.reference_files",
         "pipeline.reference_tables",

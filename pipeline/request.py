@@ -5,13 +5,15 @@ A command names records, a profile and settings, or leaves them to be as last ti
 starts a new request: settings of the last one then count no more.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.folders import StoreError, write_json
-from pipeline.plan import Plan, make_plan
+from infgen.config import ConfigError
+from pipeline.folders import StoreError, write_file, write_json
+from pipeline.plan import Plan, PlanError, make_plan
 from pipeline.root import Root, link, read_json
 from pipeline.settings import DEFAULT_FILE, StagesFile, load_stages
 from pipeline.sources import absolute
@@ -60,7 +62,7 @@ class Request:
 
     def made(self) -> Mapping[str, str]:
         """Keys of the stages that the last run under this profile was to make."""
-        return recall(self.root, self.profile or NO_PROFILE).get("keys", {})
+        return recall(self.root, self._name).get("keys", {})
 
     def remember(self, plan: Plan, name: str | None = None) -> None:
         """Make this the root's last request.
@@ -69,7 +71,7 @@ class Request:
             plan: What it leads to.
             name: To remember it by; the profile if None.
         """
-        name = name or self.profile or NO_PROFILE
+        name = name or self._name
         before = recall(self.root, name).get("keys", {})
         about = {
             "profile": self.profile,
@@ -82,6 +84,29 @@ class Request:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, about)
         link(self.root.refs / LAST, path)
+
+    @contextmanager
+    def remembered(self, plan: Plan, name: str | None = None) -> Iterator[None]:
+        """Remember this while it is made, and after that unless it is refused.
+
+        Others may look on while it is made, and a run that is killed goes on with it. Words
+        that are refused only then, by a stage, must not come back with the next command.
+        """
+        last, path = self.root.refs / LAST, ref(self.root, name or self._name)
+        pointed = last.resolve() if last.exists() else None
+        before = path.read_bytes() if path.is_file() else None
+        self.remember(plan, name)
+        ours = path.read_bytes()
+        try:
+            yield
+        except (ConfigError, PlanError):
+            if path.is_file() and path.read_bytes() == ours:  # Nobody asked since.
+                _put_back(last, pointed, path, before)
+            raise
+
+    @property
+    def _name(self) -> str:
+        return self.profile or NO_PROFILE
 
 
 def complete(
@@ -134,6 +159,18 @@ def find_file(named: Path | None, before: Mapping[str, Any]) -> Path:
         return own.absolute()
     remembered = before.get("file")
     return Path(remembered) if remembered else DEFAULT_FILE
+
+
+def _put_back(last: Path, pointed: Path | None, path: Path, before: bytes | None) -> None:
+    """Remember by a name, and as the last request, what was remembered before."""
+    if last.resolve() == path.resolve():
+        last.unlink()
+        if pointed is not None:
+            link(last, pointed)
+    if before is None:
+        path.unlink()
+    else:
+        write_file(path, before)
 
 
 def ref(root: Root, name: str) -> Path:

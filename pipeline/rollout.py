@@ -16,7 +16,7 @@ from infgen.config import RolloutSettings
 from pipeline.calibration import Biases, read_found
 from pipeline.parquet import Fields, joined, table
 from pipeline.playing import begin, load_player, play_all, read_some
-from pipeline.splits import in_split, spread
+from pipeline.splits import files_of, spread
 from pipeline.stage import Done, Inputs, Progress, Report, Stage, Unit
 
 if TYPE_CHECKING:
@@ -62,7 +62,11 @@ def narrow(sections: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
-    """Cut each shard, or a part of it, into units of about equally many scenes."""
+    """Cut each shard, or a part of it, into units of about equally many scenes.
+
+    Raises:
+        PlanError: if there is no scene of the split.
+    """
     weights = inputs.folder("train")
     identity = inputs.content("train", "model.safetensors", "model.json")
     found = read_found(inputs.folder("calibrate"))
@@ -70,9 +74,8 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
         add=found.add if settings.inserts else 0.0,
         leave=found.leave if settings.removes else 0.0,
     )
-    shards = [
-        done for done in inputs.units("ingest") if in_split(done.name, settings.split)
-    ]
+    every = inputs.units("ingest")
+    shards = files_of(every, settings.split, to="play", setting="rollout.split")
     units = []
     for done, rows in zip(shards, spread(shards, settings.scenes), strict=True):
         for first, after in pairwise(_edges(len(rows), settings.scenes_per_task)):

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from infgen.config import ConfigError
 from pipeline.folders import PARTIAL, StoreError, sync_folder
 
 MANIFEST = "manifest.json"
@@ -121,6 +122,31 @@ class Root:
         """Return the folder that ``latest/<stage>`` leads to, if it is whole."""
         folder = (self.latest / stage).resolve()
         return folder if (folder / MANIFEST).is_file() else None
+
+
+def find_root(folder: Path, *, made: bool = False) -> Root:
+    """Take a folder that a command names as a root.
+
+    Args:
+        folder: As it was named.
+        made: Whether something must have been made there: a misspelt root that is empty
+            would pass for one without damage.
+
+    Raises:
+        ConfigError: if it is a file; or if nothing was made there, but must have been.
+    """
+    for place in (folder, *folder.absolute().parents):
+        if place.exists() and not place.is_dir():
+            own = "" if place == folder else f": {place}"
+            raise ConfigError(f"--root {folder}{own} is a file; expected a folder")
+    root = Root(folder.absolute())
+    if made and not root.store.is_dir():
+        what = "nothing was made there yet" if folder.exists() else "no such root"
+        raise ConfigError(
+            f"{folder}: {what}; expected the --root of a run (`infgen run --root {folder}` "
+            "makes one)"
+        )
+    return root
 
 
 def link(name: Path, target: Path) -> None:

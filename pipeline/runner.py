@@ -5,7 +5,6 @@ gets its name; only when all units have theirs does the stage's folder get one. 
 else lies about is cleared, or gone on with, by the next run.
 """
 
-import shutil
 import time
 import traceback
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from pipeline import stopping
 from pipeline.cluster import Workers
 from pipeline.dispatch import WorkersLostError
 from pipeline.events import Events
-from pipeline.folders import PARTIAL, publish, write_json
+from pipeline.folders import PARTIAL, publish, remove_folder, write_json
 from pipeline.gauge import figures
 from pipeline.inputs import FinishedInputs, units_of
 from pipeline.locks import LockedError, locked
@@ -292,20 +291,28 @@ class _Making:
     def _forget(self, tasks: Sequence[Task]) -> None:
         """Remove what is to be made again, the stage before its units."""
         for folder in (self.folder, *[task.target for task in tasks]):
-            (folder / MANIFEST).unlink(missing_ok=True)
-            shutil.rmtree(folder, ignore_errors=True)
+            remove_folder(folder)
 
     def _clear(self) -> None:
         """Remove what killed runs left behind, but what this stage can go on from."""
         stage = self.root.stage(self.name)
-        for path in [*stage.glob(f"*{PARTIAL}"), *stage.glob(f"units/*{PARTIAL}")]:
-            resumable = len(path.name) == KEY_DIGITS + len(PARTIAL)
-            if self.forced or not (self.planned.stage.resumes and resumable):
+        for path in [*stage.glob("*"), *stage.glob("units/*")]:
+            if path.name.endswith(PARTIAL):
+                resumable = len(path.name) == KEY_DIGITS + len(PARTIAL)
+                if self.forced or not (self.planned.stage.resumes and resumable):
+                    _remove(path)
+            elif _is_half_removed(path):
                 _remove(path)
+
+
+def _is_half_removed(path: Path) -> bool:
+    """Tell whether this is a folder that is in the way of what its name stands for."""
+    has_key = len(path.name) == KEY_DIGITS and path.is_dir()
+    return has_key and not (path / MANIFEST).is_file()
 
 
 def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
+        remove_folder(path)  # A worker of a run that is gone may still write there.
     else:
-        path.unlink()
+        path.unlink(missing_ok=True)

@@ -26,8 +26,15 @@ def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
     """One unit per rollout unit.
 
     Raises:
-        ConfigError: if the rollouts are not of the reference's split.
+        ConfigError: if the rollouts are not of the reference's split, or if there is no
+            such version of Waymo's metric.
     """
+    from infgen.metrics.wosac_versions import VERSIONS  # noqa: PLC0415
+
+    if (version := settings["score"].wosac) not in VERSIONS:
+        raise ConfigError(
+            f"score.wosac is {version!r}; expected one of {', '.join(VERSIONS)}"
+        )
     _check_split(inputs.units("rollout"), settings["reference"].split)
     scenes = {done.name: done for done in inputs.units("ingest")}
     logs = {done.name: done for done in inputs.units("reference")}

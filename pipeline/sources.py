@@ -4,6 +4,10 @@ A plain TFRecord carries two checksums per record; hashing those tells two files
 well as hashing all of it, in a thousandth of the time. A GZIP file would have to be
 unpacked to see them, so its compressed bytes are hashed instead, as are those of any other
 file.
+
+A record whose data is damaged has the checksum that it should have, so a file of such
+records passes for a sound one until an ingest has read it. That is right as long as nobody
+mends it: afterwards, the file is told by all its bytes.
 """
 
 import glob
@@ -12,6 +16,8 @@ import os
 import struct
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +25,19 @@ import google_crc32c
 
 from infgen.config import ConfigError
 from infgen.sources.remote import file_system
+from infgen.sources.tfrecord import Record, read_record
 from pipeline.folders import StoreError, write_json
-from pipeline.root import Root, read_json
+from pipeline.root import MANIFEST, Root, read_json
 from pipeline.stage import Source
 
 BUILTIN = "builtin"
 """Stands for the synthetic records that come with the package."""
+INGEST = "ingest"
+"""The stage that says which records are damaged, ..."""
+DAMAGED = "data checksum does not match"
+"""... and the reason it gives."""
+WHOLE = "sha256:"
+"""Begins the identity of a file that is told by all its bytes."""
 BLOCK_BYTES = 1 << 22
 RECORDS_IN_FOLDER = "*.tfrecord*"
 HEADER_BYTES = 12
@@ -77,7 +90,8 @@ def _matches(pattern: str) -> list[str]:
     found = _remote(pattern) if "://" in pattern else _local(absolute(pattern))
     if not found:
         raise ConfigError(
-            f"no records match {pattern}; expected TFRecord files of WOMD Scenario protos"
+            f"no records match {pattern}; expected TFRecord files of WOMD Scenario protos, "
+            "as --records 'DIR/*.tfrecord*' or the variable INFGEN_RECORDS names them"
         )
     return found
 
@@ -118,7 +132,7 @@ class _Memory:
     """Identities of local files that have not changed since they were last read."""
 
     def __init__(self, root: Root) -> None:
-        self._path = root.fingerprints
+        self._root, self._path = root, root.fingerprints
         self._known: dict[str, list[Any]] = _remembered(self._path)
         self._changed = False
 
@@ -131,15 +145,46 @@ class _Memory:
         known = self._known.get(url)
         if known is not None and known[:3] == mark:
             return str(known[3])
-        self._known[url] = [*mark, fingerprint(Path(url))]
+        before = "" if known is None else str(known[3])
+        self._known[url] = [*mark, self._identity(Path(url), before)]
         self._changed = True
         return str(self._known[url][3])
+
+    def _identity(self, path: Path, before: str) -> str:
+        """Read a file's identity; all of it, if a record was damaged and is no more."""
+        found = fingerprint(path)
+        if found.startswith(WHOLE):
+            return found
+        damaged = self._damaged.get(found, ())
+        mended = any(isinstance(read_record(path, offset), Record) for offset in damaged)
+        if not mended and not before.startswith(WHOLE):
+            return found
+        whole = _hash_whole(path)
+        return whole if mended or whole == before else found
+
+    @cached_property
+    def _damaged(self) -> dict[str, set[int]]:
+        """Offsets of records that an ingest found damaged, by their file's identity."""
+        found: dict[str, set[int]] = defaultdict(set)
+        for path in self._root.units(INGEST).glob(f"*/{MANIFEST}"):
+            with suppress(StoreError, FileNotFoundError):  # It may just be being removed.
+                unit = read_json(path)
+                if unit["report"].get("quarantined"):
+                    found[unit["inputs"]["source"]] |= _damaged_offsets(path.parent)
+        return found
 
     def save(self) -> None:
         """Keep what was learned. Losing it costs only time."""
         if self._changed:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_json(self._path, self._known)
+
+
+def _damaged_offsets(unit: Path) -> set[int]:
+    import polars as pl  # noqa: PLC0415
+
+    rows = pl.read_parquet(unit / "quarantine.parquet")
+    return set(rows.filter(pl.col("reason") == DAMAGED)["offset"])
 
 
 def _remembered(path: Path) -> dict[str, list[Any]]:
@@ -154,12 +199,15 @@ def fingerprint(path: Path) -> str:
     """Identity of what a local file holds, whatever its name and times."""
     with path.open("rb", buffering=0) as file:
         marks = _record_marks(file.fileno(), path.stat().st_size)
-        if marks is not None:
-            return f"tfrecord:{marks}"
-        digest = hashlib.sha256()
+    return f"tfrecord:{marks}" if marks is not None else _hash_whole(path)
+
+
+def _hash_whole(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb", buffering=0) as file:
         while block := file.read(BLOCK_BYTES):
             digest.update(block)
-    return f"sha256:{digest.hexdigest()}"
+    return f"{WHOLE}{digest.hexdigest()}"
 
 
 def _record_marks(handle: int, size: int) -> str | None:
@@ -173,10 +221,11 @@ def _record_marks(handle: int, size: int) -> str | None:
         length, crc = struct.unpack("<QI", header)
         if crc != _masked(google_crc32c.value(header[:8])):
             return None
-        footer = os.pread(handle, FOOTER_BYTES, start + HEADER_BYTES + length)
         start += HEADER_BYTES + length + FOOTER_BYTES
-        digest.update(header + footer)
-    return digest.hexdigest() if start == size else None
+        if start > size:  # A crafted length may be more than any file could hold.
+            return None
+        digest.update(header + os.pread(handle, FOOTER_BYTES, start - FOOTER_BYTES))
+    return digest.hexdigest()
 
 
 def _masked(crc: int) -> int:

@@ -5,6 +5,8 @@ from itertools import accumulate, pairwise
 
 import numpy as np
 
+from pipeline.duplicates import rows_that_count
+from pipeline.plan import PlanError
 from pipeline.stage import Done
 
 
@@ -29,6 +31,33 @@ def in_split(name: str, split: str) -> bool:
     return split_of(name) == split
 
 
+def files_of(files: Sequence[Done], split: str, *, to: str, setting: str) -> list[Done]:
+    """Find the ingested files of a split that hold a scene.
+
+    Args:
+        files: Of all splits.
+        split: Whose.
+        to: What they are for; and ...
+        setting: ... what to set where there are none; both for the message.
+
+    Raises:
+        PlanError: if no file is of the split, or none of them holds a usable scene.
+    """
+    found = [done for done in files if in_split(done.name, split)]
+    if not found:
+        others = ", ".join(sorted({split_of(done.name) for done in files})) or "none"
+        raise PlanError(
+            f"no file of split {split!r} to {to} (there is: {others}); set {setting}, or "
+            "name records of that split"
+        )
+    if not any(done.report["scenes"] for done in found):
+        raise PlanError(
+            f"no scene of split {split!r} to {to}: no record of its {len(found)} files is "
+            "usable; quarantine.parquet of stage 'ingest' says why"
+        )
+    return found
+
+
 def spread(files: Sequence[Done], most: int) -> list[list[int]]:
     """Choose scenes of ingested files, evenly spread over all of them.
 
@@ -41,13 +70,14 @@ def spread(files: Sequence[Done], most: int) -> list[list[int]]:
     Returns:
         For each file the rows of its scenes, ascending.
     """
-    counts = [int(done.report["scenes"]) for done in files]
+    rows = [np.array(rows_that_count(done), int) for done in files]
+    counts = [len(each) for each in rows]
     total = sum(counts)
     chosen = np.arange(total)
     if 0 < most < total:
         chosen = np.arange(most) * total // most
     ends = accumulate(counts, initial=0)
     return [
-        (chosen[(chosen >= begin) & (chosen < end)] - begin).tolist()
-        for begin, end in pairwise(ends)
+        each[chosen[(chosen >= begin) & (chosen < end)] - begin].tolist()
+        for each, (begin, end) in zip(rows, pairwise(ends), strict=True)
     ]

@@ -17,7 +17,9 @@ Report = dict[str, Any]
 """Few, JSON-able figures of one unit or of a whole stage, the same each time it is made.
 
 Figures that vary from run to run (seconds, memory) go below the one key ``"run"``; they are
-kept apart from the artefact, which is byte-identical between runs.
+kept apart from the artefact, which is byte-identical between runs. What ``finish`` finds
+out about single units goes below the key ``"units"``, by name: stages that read these units
+find it in their reports.
 """
 
 

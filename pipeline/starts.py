@@ -41,4 +41,14 @@ def find_start(root: Path, setting: str, named: str) -> list[Source]:
             f"{WEIGHTS} and {ABOUT}, or the start of a key below {stage}"
         )
     folder = found[0].resolve()
-    return [Source(str(folder), START, str(read_json(folder / ABOUT)["weights"]))]
+    return [Source(str(folder), START, _fingerprint(folder / ABOUT, setting))]
+
+
+def _fingerprint(path: Path, setting: str) -> str:
+    about = read_json(path)
+    if not isinstance(about, dict) or "weights" not in about:
+        raise ConfigError(
+            f"{setting}: {path} lacks the entry 'weights'; expected a folder that stage "
+            f"'train' made, with {WEIGHTS} and the {ABOUT} that tells of them"
+        )
+    return str(about["weights"])

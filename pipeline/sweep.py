@@ -1,18 +1,22 @@
 """Finding and removing what no remembered request needs any more."""
 
-import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from pipeline.folders import PARTIAL, StoreError
+from pipeline.folders import PARTIAL, TRASH, StoreError, remove_folder
+from pipeline.lined_yaml import Lined, inner, load
 from pipeline.locks import locked
 from pipeline.manifest import read_manifest
 from pipeline.root import KEY_DIGITS, MANIFEST, Root, read_json
+from pipeline.settings import DEFAULT_FILE
+from pipeline.starts import START
 
 PARTIAL_AGE_S = 24 * 3600.0
+WEIGHTS_STAGE = "train"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +44,7 @@ def find_garbage(root: Root) -> list[Garbage]:
         kept = _kept(root, stage)
         for folder in _folders(root, stage):
             if folder.name.endswith(PARTIAL):
-                if _age_s(folder) > PARTIAL_AGE_S:
+                if folder.name.startswith(TRASH) or _age_s(folder) > PARTIAL_AGE_S:
                     found.append(Garbage(folder, _bytes(folder), "left by a killed run"))
             elif folder.name not in kept:
                 what = "unit" if folder.parent.name == "units" else "stage"
@@ -59,8 +63,7 @@ def sweep(root: Root) -> list[Garbage]:
             stack.enter_context(locked(root.lock(stage)))
         found = find_garbage(root)
         for garbage in found:
-            (garbage.path / MANIFEST).unlink(missing_ok=True)
-            shutil.rmtree(garbage.path)
+            remove_folder(garbage.path)
     return found
 
 
@@ -70,6 +73,8 @@ def _kept(root: Root, stage: str) -> set[str]:
     pointed = root.pointed(stage)
     if pointed is not None:
         folders.add(pointed.name)
+    if stage == WEIGHTS_STAGE:
+        folders |= _started_from(root)
     units = set()
     for folder in folders:
         if (root.stage(stage) / folder / MANIFEST).is_file():
@@ -79,10 +84,49 @@ def _kept(root: Root, stage: str) -> set[str]:
 
 
 def _remembered(root: Root, stage: str) -> Iterator[str]:
-    for path in sorted(root.refs.glob("*.json")):
-        key = read_json(path).get("keys", {}).get(stage)
+    for request in _requests(root):
+        key = request.get("keys", {}).get(stage)
         if key is not None:
             yield key
+
+
+def _requests(root: Root) -> list[dict[str, Any]]:
+    return [read_json(path) for path in sorted(root.refs.glob("*.json"))]
+
+
+def _started_from(root: Root) -> set[str]:
+    """Names of the folders of weights that remembered requests go on from."""
+    stage = root.stage(WEIGHTS_STAGE)
+    found = set()
+    for named in _starts(root):
+        key = named[:KEY_DIGITS]
+        found |= {path.name for path in stage.glob("*") if path.name.startswith(key)}
+        place = Path(named).resolve()
+        if place.is_relative_to(stage.resolve()):
+            found.add(place.name)
+    return found
+
+
+def _starts(root: Root) -> set[str]:
+    """All that remembered requests, and the files they are of, name as a start."""
+    requests, found = _requests(root), set()
+    for word in (word for request in requests for word in request.get("overrides", ())):
+        setting, _, value = word.partition("=")
+        if setting.endswith(f".{START}"):
+            found.add(value)
+    for path in {Path(request.get("file") or DEFAULT_FILE) for request in requests}:
+        file = load(path) if path.is_file() else Lined(path.name)
+        for part in ("params", "profiles"):
+            found |= set(_starts_in(inner(file, part)))
+    return found - {""}
+
+
+def _starts_in(settings: Mapping[str, Any]) -> Iterator[str]:
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _starts_in(value)
+        elif name == START:
+            yield str(value)
 
 
 def _under_way(root: Root, stage: str) -> set[str]:

@@ -17,6 +17,7 @@ from pipeline.sweep import Garbage
 from pipeline.watch import Look, Row
 
 if TYPE_CHECKING:
+    from pipeline.described import Section
     from pipeline.export import Exported
     from pipeline.preset_outlook import Outlook
     from pipeline.preset_run import Ran
@@ -176,6 +177,14 @@ def show_checks(checks: Sequence[Check]) -> None:
     """Print what was looked at, and how it is."""
     rows = [(check.what, check.state, check.note) for check in checks]
     show_table("doctor", ("what", "state", "note"), rows)
+
+
+def show_settings(found: "Sequence[Section]") -> None:
+    """Print a table of settings for each section."""
+    for section in found:
+        rows = [(each.name, str(each.default), each.meaning) for each in section.settings]
+        title = f"{section.name}: {section.about}"
+        show_table(title, ("setting", "default", "what it is"), rows)
 
 
 def show_towns(found: "Written") -> None:

@@ -1,4 +1,4 @@
-"""Stage ``tokenize``: scenes and codebooks to tokens that training maps into memory.
+"""Stage ``tokenize``: scenes and codebooks to tokens that training reads scene by scene.
 
 One unit per ingested file. Groups are uncompressed, so their chunk files are the arrays. A
 scene that cannot be written as tokens is a named row of ``refused.parquet``.
@@ -18,6 +18,7 @@ from infgen.tokens.figures import Figures, count, describe, no_figures
 from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
 from infgen.tokens.tracks import TokensError
+from pipeline.duplicates import read_scenes_of, scenes_of
 from pipeline.folders import write_json
 from pipeline.parquet import joined, table
 from pipeline.splits import split_of
@@ -46,7 +47,7 @@ _REFUSED = {"scenario_id": str, "split": str, "unit": str, "reason": str}
 
 
 def open_tokens(unit_folder: Path) -> "list[Unpacked[SceneTokens]]":
-    """Map the tokens of one unit into memory, group by group.
+    """Open the tokens of one unit, group by group; nothing of them is read yet.
 
     Raises:
         StoreError: if a group is damaged.
@@ -67,7 +68,7 @@ def plan(inputs: Inputs, settings: TokenSettings) -> list[Unit]:
         Unit(
             name=done.name,
             inputs={"scenes": done.key, "codebooks": identity},
-            task={"scenes": str(done.path), "codebooks": str(codebooks)},
+            task={**scenes_of(done), "codebooks": str(codebooks)},
         )
         for done in inputs.units("ingest")
     ]
@@ -75,13 +76,12 @@ def plan(inputs: Inputs, settings: TokenSettings) -> list[Unit]:
 
 def work(unit: Unit, target: Path, settings: TokenSettings, progress: Progress) -> Report:
     """Tokenize the scenes of one ingested file."""
-    from pipeline.ingest import read_scenes  # noqa: PLC0415
     from pipeline.vocabulary import load_codebooks  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
     motion, roads = load_codebooks(Path(unit.task["codebooks"]))
     shard = _Shard(target, unit.name)
-    for scene in read_scenes(Path(unit.task["scenes"])):
+    for scene in read_scenes_of(unit.task):
         try:
             shard.keep(scene, tokenize_scene(scene, motion, roads, settings))
         except TokensError as error:
@@ -206,6 +206,7 @@ STAGE = Stage(
     finish=finish,
     modules=(
         "pipeline.columns",
+        "pipeline.duplicates",
         "pipeline.store",
         "pipeline.tokenize",
     ),

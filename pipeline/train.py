@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings, build
+from pipeline.folders import write_json
+from pipeline.root import RUN_FOLDER, read_json
 from pipeline.splits import in_split
 from pipeline.stage import Done, Inputs, Progress, Report, Source, Stage, Unit
 from pipeline.starts import ABOUT, START, WEIGHTS, find_start
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 
 CODEBOOKS = ("motion.zarr", "roads.zarr")
 OUTPUTS = (WEIGHTS, ABOUT, "train.jsonl")
+DONE = "trained.json"
+"""Below ``run``: all else is written, and no checkpoint is needed any more."""
 
 
 def load_network(folder: Path) -> "Network":
@@ -74,9 +78,21 @@ def work(
     unit: Unit, target: Path, settings: Mapping[str, Any], progress: Progress
 ) -> Report:
     """Train, or go on training, and write the averaged weights."""
+    from pipeline.checkpoint import drop_checkpoints  # noqa: PLC0415
+
+    done = target / RUN_FOLDER / DONE
+    if not done.is_file():
+        write_json(done, _train(unit, target, settings, progress))
+    drop_checkpoints(target)
+    report: Report = read_json(done)
+    return report
+
+
+def _train(
+    unit: Unit, target: Path, settings: Mapping[str, Any], progress: Progress
+) -> Report:
     import torch  # noqa: PLC0415
 
-    from pipeline.checkpoint import drop_checkpoints  # noqa: PLC0415
     from pipeline.distributed import called_together  # noqa: PLC0415
     from pipeline.pace import peak_memory_mib  # noqa: PLC0415
     from pipeline.training import final_state, train  # noqa: PLC0415
@@ -91,7 +107,6 @@ def work(
         course, training = _prepare(unit.task, target, settings)
         found = train(course, training, progress, team)
     weights = save_network(target, training.network, final_state(training), how.steps)
-    drop_checkpoints(target)
     return {
         "steps": how.steps,
         "scenes": len(course.scenes),

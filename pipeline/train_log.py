@@ -13,15 +13,23 @@ class TrainLog:
     """Lines that wait in memory until ``flush`` puts them on disk.
 
     What a killed run wrote beyond its last checkpoint is cut off when it goes on.
+
+    Args:
+        path: Of the file.
+        first: Step of that checkpoint.
+        validated: Whether that step is validated before it is saved. What a later
+            validation wrote, the final one of the last step, is cut off, too.
     """
 
-    def __init__(self, path: Path, first: int) -> None:
+    def __init__(self, path: Path, first: int, *, validated: bool = True) -> None:
         self._path = path
         self._waiting: list[str] = []
         lines = path.read_text().splitlines(keepends=True) if path.is_file() else []
-        write_file(
-            path, "".join(line for line in lines if _is_before(line, first)).encode()
-        )
+        kept = [line for line in lines if _is_before(line, first)]
+        found = sum(_is_validation(line, first) for line in kept)
+        if found > validated:
+            kept.pop()
+        write_file(path, "".join(kept).encode())
 
     def add(self, line: Mapping[str, Any]) -> None:
         """Add a line; it has a ``step``."""
@@ -43,6 +51,11 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 def _is_whole(line: str) -> bool:
     return line.startswith("{") and line.rstrip().endswith("}")
+
+
+def _is_validation(line: str, step: int) -> bool:
+    about = json.loads(line)
+    return "validation" in about and int(about["step"]) == step
 
 
 def _is_before(line: str, step: int) -> bool:

@@ -13,7 +13,7 @@ from pipeline.checkpoint import Training, load_checkpoint
 from pipeline.course import Course, TrainingError, repeatable
 from pipeline.descent import Descent, NotFiniteError, Stepped
 from pipeline.distributed import PeerError, Team, own_device
-from pipeline.journal import Journal
+from pipeline.journal import Journal, is_validated
 from pipeline.loader import Recipe, train_batches
 from pipeline.precision import Pass
 from pipeline.stage import Progress
@@ -62,6 +62,8 @@ def train(
         journal = stack.enter_context(Journal(course, training, first, progress))
         run = _Run(course, training, descent.forward, journal)
         _go_down(course, recipe, descent, team, first, run)
+        if first < course.train.steps:
+            journal.save()  # Whatever ends what is left to do costs no step.
         found = run.validate()
         journal.flush()
         return Trained(found, run.figures())
@@ -84,9 +86,8 @@ class _Run:
 
     def after(self, done: int, stepped: Stepped) -> None:
         """Write down one step, and all that is due after it."""
-        every = self.course.train.validate_every
         self.journal.add(done, stepped)
-        if every and done % every == 0:
+        if is_validated(self.course.train, done):
             self.validate()
         self.journal.keep_up(stepped)
 

@@ -2,8 +2,9 @@
 
 import json
 import os
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, replace
 from functools import partial
@@ -12,10 +13,13 @@ from typing import Any
 
 import typer
 
+from infgen.config import ConfigError
 from pipeline import stopping, tables
 from pipeline.events import Events
+from pipeline.folders import StoreError
+from pipeline.locks import LockedError
 from pipeline.options import Asked, Comparing, Running
-from pipeline.plan import Plan
+from pipeline.plan import Plan, PlanError
 from pipeline.preset_legs import REPORT, Comparison, legs_of
 from pipeline.preset_outlook import Outlook, look_ahead
 from pipeline.preset_records import find_records
@@ -31,19 +35,22 @@ from pipeline.watch import Look, Watcher
 FAILED, WRONG, STALE, LOCKED = 1, 2, 3, 75
 """Exit codes, as ``cli.py`` tells them."""
 IDLE_LOOKS = 2
+MOST_NAMED = 3
+"""Quarantined records that are told of."""
 
 
 def run_stages(
     request: Request, targets: Sequence[str], running: Running, *, as_json: bool
 ) -> None:
     """Run, show what became of it, and leave with the exit code that says so."""
-    if running.dry_run:
-        show_plan(request, targets, running, as_json=as_json)
-        return
     plan = request.plan(targets, os.environ)
     orders = running.orders(targets, plan)
-    request.remember(plan)
-    with stopping.listening(), Screen() as screen:
+    if running.dry_run:
+        found = standings(plan, request.made(), strict_code=running.strict_code)
+        again = plan.after(orders.force)
+        tell_standings([_asked_again(each, again) for each in found], as_json=as_json)
+        return
+    with request.remembered(plan), stopping.listening(), Screen() as screen:
         events = Events(request.root, (screen,))
         results = make(plan, orders, events)
     if as_json:
@@ -120,12 +127,10 @@ def _tell_runs(
         tables.show_runs(ran, shown, events.log)
 
 
-def show_plan(
-    request: Request, targets: Sequence[str], running: Running, *, as_json: bool
-) -> None:
-    """Say what a run would make, and why."""
-    found = find_standings(request, targets, strict_code=running.strict_code)
-    tell_standings(found, as_json=as_json)
+def _asked_again(standing: Standing, again: Container[str]) -> Standing:
+    if standing.state != "cached" or standing.stage not in again:
+        return standing
+    return replace(standing, state="stale", why="made again, as it is asked to be", made=0)
 
 
 def tell_standings(found: Sequence[Standing], *, as_json: bool) -> None:
@@ -136,11 +141,9 @@ def tell_standings(found: Sequence[Standing], *, as_json: bool) -> None:
         tables.show_standings(found)
 
 
-def find_standings(
-    request: Request, targets: Sequence[str], *, strict_code: bool
-) -> list[Standing]:
-    """Find how the stages stand that the targets need; all of them without targets."""
-    plan = request.plan(targets, os.environ)
+def find_standings(request: Request, *, strict_code: bool) -> list[Standing]:
+    """Find how all stages stand."""
+    plan = request.plan([], os.environ)
     return standings(plan, request.made(), strict_code=strict_code)
 
 
@@ -185,15 +188,47 @@ def _check_quarantine(root: Root, results: Sequence[Result], max_bad: float) -> 
             continue
         share = bad / (bad + good)
         where = root.folder("ingest", result.key) / "quarantine.parquet"
-        typer.echo(
-            f"{bad} of {bad + good} records ({share:.2%}) are quarantined: {where}",
-            err=True,
-        )
+        told = f"{bad} of {bad + good} records ({share:.2%}) are quarantined: {where}"
+        typer.echo("\n".join([told, *_set_aside(where)]), err=True)
         if share > max_bad:
             typer.echo(f"that is more than --max-bad {max_bad:g}", err=True)
             raise typer.Exit(STALE)
 
 
-def print_json(value: Any) -> None:
-    """Print a value; what JSON does not know is written as its text."""
-    typer.echo(json.dumps(value, indent=1, default=str))
+def _set_aside(table: Path) -> Iterator[str]:
+    """Name some records that were set aside, and why."""
+    import polars as pl  # noqa: PLC0415
+
+    found = pl.read_parquet(table, columns=["source", "record", "reason"])
+    for source, record, reason in found.head(MOST_NAMED).iter_rows():
+        yield f"  {source}, record {record}: {reason}"
+    if found.height > MOST_NAMED:
+        yield f"  and {found.height - MOST_NAMED} more in that table"
+
+
+def print_json(value: Any, *, spread: bool | None = None) -> None:
+    """Print a value; what JSON does not know is written as its text.
+
+    Args:
+        value: To print.
+        spread: Over several lines; None for where somebody reads. In a file every run is
+            one line, so that ``>>`` makes JSONL of them.
+    """
+    spread = sys.stdout.isatty() if spread is None else spread
+    typer.echo(json.dumps(value, indent=1 if spread else None, default=str))
+
+
+def exit_code(error: BaseException) -> int:
+    """Exit code of a known error; an unknown one goes on as a traceback."""
+    if isinstance(error, stopping.Stopped):
+        return 128 + error.signal
+    if isinstance(error, LockedError):
+        return LOCKED
+    if isinstance(error, ConfigError | PlanError):
+        return WRONG
+    if isinstance(error, StoreError | OSError):
+        return FAILED
+    ours = type(error).__module__.split(".")[0] in ("infgen", "pipeline")
+    if isinstance(error, ValueError) and ours:
+        return FAILED
+    raise error

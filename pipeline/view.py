@@ -7,6 +7,7 @@ with the first of them and the log; without rollouts, the first log.
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from glob import has_magic
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from infgen.config import ConfigError
 from pipeline.events import Event
 from pipeline.folders import write_file
 from pipeline.root import Root
+from pipeline.sources import BUILTIN, RECORDS_IN_FOLDER
 from pipeline.view_files import STRIPS, VIDEOS, check_ending, write_strip, write_video
 
 if TYPE_CHECKING:
@@ -153,6 +155,21 @@ def find_film(wanted: Wanted) -> "Film":
 def is_root(folder: Path) -> bool:
     """Whether a folder is the root of an experiment."""
     return Root(folder).store.is_dir()
+
+
+def check_records(word: str) -> None:
+    """Refuse a word that is neither a root nor the name of records.
+
+    Raises:
+        ConfigError: saying so.
+    """
+    path = Path(word)
+    there = path.is_file() or (path.is_dir() and any(path.glob(RECORDS_IN_FOLDER)))
+    if not there and word != BUILTIN and "://" not in word and not has_magic(word):
+        raise ConfigError(
+            f"{word} is neither a root nor records; expected the --root of a run, "
+            f"TFRecords, or a folder of {RECORDS_IN_FOLDER}"
+        )
 
 
 def write_page(film: "Film", path: Path) -> Path:

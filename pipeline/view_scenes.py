@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from infgen.rollout.rollout import Rollout
 
 MOST_NAMED = 8
+MOST_BAD = 3
+"""Of records that cannot be used so many are told of."""
 MOST_ROLLOUTS = 3
 """So many rollouts are shown where none are asked for."""
 
@@ -42,7 +44,10 @@ def find_in_root(root: Root, prefix: str, rollouts: Sequence[int] | None) -> See
     played = root.pointed("rollout") if rollouts is None or rollouts else None
     if played is None:
         if rollouts:
-            raise ConfigError(f"{root.path} holds no rollouts; `infgen rollout` plays some")
+            raise ConfigError(
+                f"{root.path} holds no rollouts; `infgen rollout --root {root.path}` plays "
+                "some, and makes what is missing before (-n: only says what)"
+            )
         return Seen(_find_log(root, prefix), ())
     units = _units_of_scenes(played, "unit")
     if not units or (rollouts is None and prefix and not _matching(units, prefix)):
@@ -59,12 +64,15 @@ def find_in_records(patterns: Sequence[str], prefix: str) -> Scene:
         ConfigError: if there is none, naming some that there are.
     """
     passed: list[str] = []
-    for scenario_id, data in _records(find_urls(patterns)):
+    bad: list[str] = []
+    for scenario_id, data in _records(find_urls(patterns), bad):
         if scenario_id.startswith(prefix):
             return decode_scene(data)
         passed.append(scenario_id)
-    choose(passed, prefix, "these records")
-    raise ConfigError(f"{', '.join(patterns)}: no usable record")
+    if passed:
+        choose(passed, prefix, "these records")
+    why = "; ".join(bad[:MOST_BAD]) or "they are empty"
+    raise ConfigError(f"{', '.join(patterns)}: no usable record: {why}")
 
 
 def choose(ids: Iterable[str], prefix: str, where: str) -> str:
@@ -98,16 +106,21 @@ def _some(ids: Sequence[str]) -> str:
     return ", ".join(ids[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _records(urls: Sequence[str]) -> Iterator[tuple[str, bytes]]:
-    """Ids and bytes of all records that can be read so far as to have one."""
+def _records(urls: Sequence[str], bad: list[str]) -> Iterator[tuple[str, bytes]]:
+    """Ids and bytes of all records that can be read so far as to have one.
+
+    Why others cannot is added to ``bad``.
+    """
     for url in urls:
         for record in iter_records(url):
-            if isinstance(record, BadRecord):
-                continue
             try:
-                yield read_scenario_id(record.data), record.data
-            except RecordError:
+                if isinstance(record, BadRecord):
+                    raise RecordError(record.reason)
+                scenario_id = read_scenario_id(record.data)
+            except RecordError as error:
+                bad.append(f"{url}, record {record.number}: {error}")
                 continue
+            yield scenario_id, record.data
 
 
 def _units_of_scenes(stage: Path, column: str) -> dict[str, str]:

@@ -27,7 +27,7 @@ from infgen.tokens.segments import (
 )
 from infgen.tokens.tracks import Paths, TokensError, read_paths
 from infgen.views.codebooks import codebook_page
-from pipeline.ingest import read_scenes
+from pipeline.duplicates import read_scenes_of, scenes_of
 from pipeline.plan import PlanError
 from pipeline.splits import in_split, split_of
 from pipeline.stage import Done, Inputs, Progress, Report, Source, Stage, Unit
@@ -131,7 +131,7 @@ def plan(inputs: Inputs, settings: VocabSettings) -> list[Unit]:
         Unit(
             name=done.name,
             inputs={"scenes": done.key, "role": roles[done.name]},
-            task={"scenes": str(done.path), "role": roles[done.name]},
+            task={**scenes_of(done), "role": roles[done.name]},
         )
         for done in files
         if done.name in roles
@@ -142,7 +142,7 @@ def work(unit: Unit, target: Path, settings: VocabSettings, progress: Progress) 
     """Sample the moves, map pieces and tracks of one file."""
     role = unit.task["role"]
     samples = {side: _Sample(side, settings) for side in _SIDES}
-    for scene in read_scenes(Path(unit.task["scenes"])):
+    for scene in read_scenes_of(unit.task):
         held_out = role == BOTH and name_key(scene.scenario_id) % HELD_OUT_EVERY == 0
         samples[HELD_OUT if held_out or role == HELD_OUT else LEARN].take(scene)
     for sample in samples.values():
@@ -323,6 +323,7 @@ STAGE = Stage(
     finish=finish,
     reads=reads,
     modules=(
+        "pipeline.duplicates",
         "pipeline.vocabulary",
     ),
 )

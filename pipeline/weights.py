@@ -2,7 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,16 @@ from torch import Tensor
 
 from infgen.config import ModelSettings, TokenSettings, build
 from infgen.model.network import Network
+from infgen.pretrained import builtin_weights
 from infgen.tokens.codebook import MotionCodebook, RoadCodebook
 from pipeline.folders import StoreError, write_file, write_json
+from pipeline.root import read_json
 from pipeline.starts import ABOUT, WEIGHTS
 
 SCHEMA = "infgen.model/1"
+MAX_NAMED = 3
+MAX_SAID = 300
+_NEEDED = ("model", "tokenize", "vocabulary", "weights")
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> str:
@@ -90,9 +96,10 @@ def load_network(folder: Path) -> Network:
     )
     try:
         network.load_state_dict(tensors)
-    except RuntimeError as error:
+    except RuntimeError as error:  # It names every tensor.
+        said = textwrap.shorten(str(error), MAX_SAID, placeholder=" ...")
         raise StoreError(
-            f"{folder / WEIGHTS} does not fit its settings: {error}"
+            f"{folder / WEIGHTS} does not fit its settings in {ABOUT}: {said}"
         ) from error
     return network.eval()
 
@@ -122,6 +129,7 @@ def take_weights(network: Network, folder: Path) -> None:
         raise StoreError(
             f"{folder} was trained with vocabulary {about['vocabulary'][:12]}, expected "
             f"{own_books[:12]}; build-vocab must have the same settings and records"
+            f"{_way_out(folder)}"
         )
     found = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
     if found != about["weights"]:
@@ -135,11 +143,38 @@ def take_weights(network: Network, folder: Path) -> None:
     ]
     if unfit:
         raise StoreError(
-            f"{folder} has no weights of the right shape for {', '.join(unfit)}"
+            f"{folder} has no weights of the right shape for {_some(unfit)}"
+            f"{_other_settings(about, network)}{_way_out(folder)}"
         )
     with torch.no_grad():
         for name, parameter in parameters.items():
             parameter.copy_(tensors[name])
+
+
+def _some(names: Sequence[str]) -> str:
+    more = len(names) - MAX_NAMED
+    return ", ".join(names[:MAX_NAMED]) + (f" and {more} more tensors" if more > 0 else "")
+
+
+def _other_settings(about: Mapping[str, Any], network: Network) -> str:
+    """Say which settings of a network are not those that its weights were trained with."""
+    model, grid = asdict(network.settings), asdict(network.grid_settings)
+    for section, asked in (("model", model), ("tokenize", grid)):
+        had = about[section]
+        other = [
+            f"{section}.{name}={json.dumps(had[name])} (not {json.dumps(value)})"
+            for name, value in asked.items()
+            if had.get(name, value) != value
+        ]
+        if other:
+            return f"; they were trained with {', '.join(other)}"
+    return ""
+
+
+def _way_out(folder: Path) -> str:
+    """Say where the settings are that go with the weights of the package."""
+    own = folder.resolve() == builtin_weights().resolve()
+    return "; --profile pretrained has all that goes with them" if own else ""
 
 
 def read_about(folder: Path) -> dict[str, Any]:
@@ -151,9 +186,13 @@ def read_about(folder: Path) -> dict[str, Any]:
     path = folder / ABOUT
     if not path.is_file():
         raise StoreError(f"{path} is missing; run stage 'train' first")
-    about: dict[str, Any] = json.loads(path.read_text())
+    read = read_json(path)
+    about: dict[str, Any] = read if isinstance(read, dict) else {}
     if about.get("schema") != SCHEMA:
         raise StoreError(f"{path} holds {about.get('schema')!r}, expected {SCHEMA!r}")
+    lacks = [name for name in _NEEDED if name not in about]
+    if lacks:
+        raise StoreError(f"{path} lacks {', '.join(lacks)}; run stage 'train' again")
     return about
 
 

@@ -113,9 +113,9 @@ def do(task: Task, progress: Progress) -> Outcome:
     stage = load_stage(task.module)
     started, begun = datetime.now(UTC).isoformat(timespec="seconds"), time.monotonic()
     patience = stopping.patient() if stage.resumes else nullcontext()
-    with publish(task.target, resume=stage.resumes) as partial:
-        with patience:
-            report = stage.work(task.unit, partial, task.settings, progress)
+    # A stop that finds the work done waits until it has its name: it would be lost.
+    with patience, publish(task.target, resume=stage.resumes) as partial:
+        report = stage.work(task.unit, partial, task.settings, progress)
         same, varying = split_report(report)
         seconds = time.monotonic() - begun
         seal(partial, {**task.about, "report": same}, Run(started, seconds, varying))

@@ -43,7 +43,7 @@ from tests.clusters import Cluster  # noqa: E402
 STAGES = ("ingest", "build-vocab", "tokenize")
 VICTIMS = ("run", "worker", "scheduler")
 WORKERS = ("local:1", "local:2", "local:4")
-PER_RUN = {"run.json", "lock", "attempt.json", "pace.jsonl"}
+PER_RUN = {"run.json", "lock", "attempt.json", "pace.jsonl", "trained.json"}
 POLL_S = 0.005
 TRIES = 4
 """A kill that comes when all is done does not count; the next draws another moment."""

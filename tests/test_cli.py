@@ -29,7 +29,7 @@ profiles:
 VERBS = [
     *("run", "ingest", "build-vocab", "tokenize", "train", "rollout", "score", "report"),
     *("plan", "status", "dag", "gc", "verify", "show", "diff", "init", "doctor", "demo"),
-    *("towns", "calibrate", "reference", "wosac", "export", "view"),
+    *("towns", "calibrate", "reference", "wosac", "export", "view", "settings"),
 ]
 
 
@@ -150,12 +150,15 @@ def test_force_and_from_make_again(infgen):
         (["run", "--records", "none/*"], "no records match"),
         (["run", "--file", "none.yaml"], "none.yaml is missing"),
         (["status", "--records", "none/*"], "no records match"),
+        (["run", "--arms", "smart"], "expected --preset NAME beside it"),
+        (["run", "--seeds", "3"], "expected --preset NAME beside it"),
         (["show", "0123456"], "starts with '0123456'"),
         (["diff", "0123456", "total"], "starts with '0123456'"),
     ],
 )
 def test_wrong_words_are_one_line_and_exit_code_2(infgen, words, message):
     more = [] if {"--records", "show", "diff"} & set(words) else RUN[3:]
+    Path("R/store").mkdir(parents=True)
 
     code, _, err = infgen(*words, "--root", "R", *more)
 
@@ -230,9 +233,11 @@ def test_the_graph_is_shown_as_text_and_as_a_chart(infgen):
 def test_init_writes_the_packaged_file_once(infgen):
     Path("stages.yaml").unlink()
 
-    assert infgen("init")[0] == 0
+    code, out, _ = infgen("init")
+    assert (code, "`infgen run` in this folder uses it" in out) == (0, True)
     assert Path("stages.yaml").read_bytes() == DEFAULT_FILE.read_bytes()
     assert infgen("init")[0] == 2
+    assert "use it with --file mine.yaml" in infgen("init", "mine.yaml")[1]
 
 
 def test_doctor_finds_this_machine_fit(infgen):
@@ -271,6 +276,7 @@ def test_bad_records_are_counted_located_and_too_many_are_exit_code_3(infgen, on
     assert "more than --max-bad 0.001" in err
     table = next(Path("R/store/ingest").glob("*/quarantine.parquet")).resolve()
     assert str(table) in err
+    assert f"  {one_bad.name}, record 0: data checksum does not match" in err
 
     code, _, err = infgen("ingest", "--root", "R", "--max-bad", "0.5")
     assert code == 0

@@ -18,7 +18,12 @@ DOORS = {
     "dask": {"pipeline/cluster.py"},
     "distributed": {"pipeline/cluster.py"},
     "rich": {"pipeline/screen.py"},
-    "typer": {"cli.py", "pipeline/options.py", "pipeline/verbs.py"},
+    "typer": {
+        "cli.py",
+        "pipeline/options.py",
+        "pipeline/tools.py",
+        "pipeline/verbs.py",
+    },
     "yaml": {"pipeline/lined_yaml.py"},
     "cli": {"infgen/__main__.py"},
     "pickle": set(),

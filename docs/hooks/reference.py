@@ -9,20 +9,18 @@ A page says where, by a comment on a line of its own:
 
 import inspect
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, Field, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from importlib import import_module
 from typing import Any, get_type_hints
 
 import typer
 
 import cli
+from pipeline.described import documented, one_line, sections
 from pipeline.settings import DEFAULT_FILE, load_stages
-from pipeline.stages import load_stage
 
 _DIRECTIVE = re.compile(r"^<!-- (commands|settings|fields: \S+) -->$", re.MULTILINE)
-_ATTRIBUTE = re.compile(r"^    (\w+(?:,\s+\w+)*): ((?:.|\n     )*)", re.MULTILINE)
-"""One attribute of a docstring, or several that are told together."""
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
@@ -49,11 +47,11 @@ def commands() -> Iterator[str]:
 
 def _command(name: str, command: Any) -> Iterator[str]:
     what, *examples = inspect.cleandoc(command.help).split("\n\n")
-    yield f"## infgen {name}\n\n{_one_line(what)}\n"
+    yield f"## infgen {name}\n\n{one_line(what)}\n"
     for example in examples:
         shown = example.removeprefix("Example: ")
         is_call = shown != example
-        yield f"```text\n{_one_line(shown)}\n```\n" if is_call else f"{_one_line(shown)}\n"
+        yield f"```text\n{one_line(shown)}\n```\n" if is_call else f"{one_line(shown)}\n"
     rows = [
         [_flags(parameter), _default(parameter), parameter.help or ""]
         for parameter in command.params
@@ -77,28 +75,13 @@ def _default(parameter: Any) -> str:
 
 def settings() -> Iterator[str]:
     """Write every section of ``stages.yaml``, in the order of the stages."""
-    file, written = load_stages(DEFAULT_FILE, {}), set()
-    for entry in file.stages.values():
-        for section, kind in load_stage(entry.module).settings.items():
-            if section not in written:
-                written.add(section)
-                yield from _section(section, kind)
-
-
-def _section(section: str, kind: type) -> Iterator[str]:
-    about, described = documented(kind)
-    yield f"## {section}\n\n{about}\n"
-    rows = [
-        [f"`{field.name}`", f"`{_given(field)}`", described.get(field.name, "")]
-        for field in fields(kind)
-    ]
-    yield from _table(["setting", "default", "meaning"], rows)
-
-
-def _given(field: "Field[Any]") -> str:
-    if field.default_factory is not MISSING:
-        return str(field.default_factory())
-    return "" if field.default is MISSING else str(field.default)
+    for section in sections(load_stages(DEFAULT_FILE, {})):
+        yield f"## {section.name}\n\n{section.about}\n"
+        rows = [
+            [f"`{each.name.split('.')[1]}`", f"`{each.default}`", each.meaning]
+            for each in section.settings
+        ]
+        yield from _table(["setting", "default", "meaning"], rows)
 
 
 def record(kind: type) -> Iterator[str]:
@@ -116,22 +99,6 @@ def _shape(hint: Any) -> tuple[str, str]:
     if hasattr(hint, "dim_str"):
         return hint.dtypes[0], f"[{', '.join(hint.dim_str.split())}]"
     return getattr(hint, "__name__", str(hint)), ""
-
-
-def documented(kind: type) -> tuple[str, Mapping[str, str]]:
-    """What a dataclass's docstring says of it, and of each of its attributes."""
-    about, _, listed = inspect.cleandoc(kind.__doc__ or "").partition("\nAttributes:\n")
-    texts = {
-        name: _one_line(text)
-        for names, text in _ATTRIBUTE.findall(listed)
-        for name in re.split(r",\s+", names)
-    }
-    return _one_line(about), texts
-
-
-def _one_line(text: str) -> str:
-    plain = re.sub(r"\s*\(SPEC [^)]*\)", "", text)  # Which readers of the site do not have.
-    return " ".join(plain.replace("``", "`").split())
 
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:

@@ -20,7 +20,7 @@ from infgen.exports.features import (
     light_name,
     rounded,
 )
-from infgen.exports.states import NO_LIGHT, States, lights_of, states_of
+from infgen.exports.states import NO_LIGHT, Lights, States, lights_of, states_of
 from infgen.rollout.rollout import Rollout
 from infgen.scene import FeatureKind, Scene
 
@@ -42,7 +42,7 @@ def map_text(scene: Scene) -> str:
     return json.dumps([_road(feature) for feature in features_of(scene)])
 
 
-def scene_text(rollout: Rollout, scene: Scene, name: str, roads: str) -> str:
+def scene_text(rollout: Rollout, scene: Scene, name: str, roads: str, lights: str) -> str:
     """Write one rollout.
 
     Args:
@@ -50,6 +50,7 @@ def scene_text(rollout: Rollout, scene: Scene, name: str, roads: str) -> str:
         scene: That it continues.
         name: Of the file.
         roads: What ``map_text`` wrote of the scene.
+        lights: What lights showed while it was played: ``now`` or ``log``.
     """
     states = states_of(rollout, scene, STEPS)
     head = {
@@ -58,7 +59,7 @@ def scene_text(rollout: Rollout, scene: Scene, name: str, roads: str) -> str:
         "objects": [_object(states, row) for row in range(len(states.id))],
     }
     tail = {
-        "tl_states": _lights(scene, states.valid.shape[1]),
+        "tl_states": _lights(lights_of(scene, states.valid.shape[1], lights)),
         "metadata": _about(rollout, scene, states),
     }
     return f'{json.dumps(head)[:-1]}, "roads": {roads}, {json.dumps(tail)[1:]}\n'
@@ -103,8 +104,7 @@ def _road(feature: Feature) -> dict[str, Any]:
     }
 
 
-def _lights(scene: Scene, num_steps: int) -> dict[str, dict[str, Any]]:
-    lights = lights_of(scene, num_steps)
+def _lights(lights: Lights) -> dict[str, dict[str, Any]]:
     found = {}
     stops = _points(lights.stop_xyz_m)
     for lane, state, place in zip(

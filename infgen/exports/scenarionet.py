@@ -24,7 +24,7 @@ from infgen.exports.features import (
     rounded,
     womd_name,
 )
-from infgen.exports.states import NO_LIGHT, States, lights_of, states_of
+from infgen.exports.states import NO_LIGHT, Lights, States, lights_of, states_of
 from infgen.rollout.rollout import Rollout
 from infgen.scene import FeatureKind, LinkKind, RoadMap, Scene, Side
 
@@ -50,7 +50,7 @@ def map_text(scene: Scene) -> str:
     )
 
 
-def scene_text(rollout: Rollout, scene: Scene, name: str, roads: str) -> str:
+def scene_text(rollout: Rollout, scene: Scene, name: str, roads: str, lights: str) -> str:
     """Write one rollout, all of its steps.
 
     Args:
@@ -58,6 +58,7 @@ def scene_text(rollout: Rollout, scene: Scene, name: str, roads: str) -> str:
         scene: That it continues.
         name: Id of the description.
         roads: What ``map_text`` wrote of the scene.
+        lights: What lights showed while it was played: ``now`` or ``log``.
     """
     states = states_of(rollout, scene)
     head = {
@@ -68,7 +69,7 @@ def scene_text(rollout: Rollout, scene: Scene, name: str, roads: str) -> str:
         "tracks": {
             str(track): _track(states, row) for row, track in enumerate(states.id.tolist())
         },
-        "dynamic_map_states": _lights(scene, rollout.num_steps),
+        "dynamic_map_states": _lights(lights_of(scene, rollout.num_steps, lights)),
     }
     return f'{json.dumps(head)[:-1]}, "map_features": {roads}}}\n'
 
@@ -113,8 +114,8 @@ def _object(kind: str, number: int, num_steps: int) -> dict[str, Any]:
     }
 
 
-def _lights(scene: Scene, num_steps: int) -> dict[str, Any]:
-    lights = lights_of(scene, num_steps)
+def _lights(lights: Lights) -> dict[str, Any]:
+    num_steps = lights.state.shape[1]
     return {
         str(lane): {
             "type": "TRAFFIC_LIGHT",

@@ -36,9 +36,9 @@ class States:
 
 @dataclass(frozen=True, slots=True)
 class Lights:
-    """Signals of a played scene: the log's up to now, those of now ever after.
+    """Signals of a played scene: the log's while the play looked at them.
 
-    That is what the network sees while it plays.
+    After the last step at which it did, every light stays as it was then.
 
     Attributes:
         lane_id: Feature ids of the signalled lanes, ascending.
@@ -73,15 +73,25 @@ def states_of(rollout: Rollout, scene: Scene, num_steps: int | None = None) -> S
     )
 
 
-def lights_of(scene: Scene, num_steps: int) -> Lights:
-    """Give the state of every light up to now, and so many steps in all."""
-    signals = scene.signals
-    known = signals.step <= scene.now
+def lights_of(scene: Scene, num_steps: int, played: str) -> Lights:
+    """Give the state of every light at the first steps of a play.
+
+    Args:
+        scene: The log.
+        num_steps: How many steps.
+        played: What lights showed after the history, as ``rollout.lights`` says: ``now`` or
+            ``log``. A log is looked at to the end of its last whole half second.
+    """
+    signals, last = scene.signals, scene.now
+    if played == "log":
+        last = CLOCK.start_step(CLOCK.num_tokens(scene.tracks.num_steps))
+    last = min(last, num_steps - 1)
+    known = signals.step <= last
     lane_id, first = np.unique(signals.lane_id[known], return_index=True)
     state = np.full((len(lane_id), num_steps), NO_LIGHT, np.int8)
     lane = np.searchsorted(lane_id, signals.lane_id[known])
     state[lane, signals.step[known]] = signals.state[known]
-    state[:, scene.now + 1 :] = state[:, scene.now, None]
+    state[:, last + 1 :] = state[:, last, None]
     stop_m = signals.stop_xyz_m[known][first].astype(np.float64) + scene.origin_xyz_m
     return Lights(lane_id.astype(np.int64), state, stop_m)
 

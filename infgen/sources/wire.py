@@ -22,8 +22,8 @@ _MAX_DEPTH = 100
 _MAX_RUN = 512
 
 MAX_MESSAGES = 16_000_000
-"""Points or states of one record; the largest real record has about 100,000, five minutes of
-a crowded town 4 million."""
+"""Points or states of one record. The largest real one has about 100,000, five minutes of a
+crowded town have five million."""
 MAX_FIELDS = 500_000
 """Other fields of one message, or values of a repeated one. Real ones have thousands."""
 

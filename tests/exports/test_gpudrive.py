@@ -18,7 +18,7 @@ def scene(crossing, build_signals):
 @pytest.fixture
 def written(scene):
     rollout = with_newcomer(replay(scene), 40)
-    text = gpudrive.scene_text(rollout, scene, "a_000", gpudrive.map_text(scene))
+    text = gpudrive.scene_text(rollout, scene, "a_000", gpudrive.map_text(scene), "now")
     return json.loads(text)
 
 
@@ -90,9 +90,24 @@ def test_lights_and_roles_are_told(written):
     }
 
 
+def test_lights_change_as_they_did_while_it_was_played(crossing, build_signals):
+    states = [SignalState.STOP] * 60 + [SignalState.GO] * 80
+    rows = [(step, 1, state) for step, state in enumerate(states)]
+    scene = crossing(steps=140, signals=build_signals(rows))
+    rollout = replay(scene)
+
+    def written(lights):
+        text = gpudrive.scene_text(rollout, scene, "a", gpudrive.map_text(scene), lights)
+        return json.loads(text)["tl_states"]["1"]["state"]
+
+    assert written("now") == ["stop"] * 91
+    assert written("log") == ["stop"] * 60 + ["go"] * 31
+
+
 def test_roles_are_places_in_the_list_and_ids():
     scene = decoded_small()
-    text = gpudrive.scene_text(replay(scene), scene, "n", gpudrive.map_text(scene))
+    roads = gpudrive.map_text(scene)
+    text = gpudrive.scene_text(replay(scene), scene, "n", roads, "now")
 
     assert json.loads(text)["metadata"] == {
         "sdc_track_index": 0,

@@ -10,8 +10,9 @@ from tests.exports.replays import decoded_small, replay, with_newcomer
 FIRST_LEVEL = {"id", "version", "length", "metadata", "tracks", "dynamic_map_states"}
 
 
-def describe(rollout, scene):
-    text = scenarionet.scene_text(rollout, scene, "a_000", scenarionet.map_text(scene))
+def describe(rollout, scene, lights="now"):
+    roads = scenarionet.map_text(scene)
+    text = scenarionet.scene_text(rollout, scene, "a_000", roads, lights)
     return scenarionet.with_arrays(json.loads(text))
 
 
@@ -63,6 +64,19 @@ def test_lights_are_named_by_their_lane_and_unknown_where_the_log_is(written):
     assert light["type"] == "TRAFFIC_LIGHT"
     assert light["lane"] == 1
     assert light["state"]["object_state"] == [None] * 5 + ["LANE_STATE_GO"] * 86
+
+
+def test_lights_change_as_they_did_while_it_was_played(crossing, build_signals):
+    rows = [(step, 1, SignalState.STOP) for step in range(60)]
+    rows += [(step, 1, SignalState.GO) for step in range(60, 91)]
+    scene = crossing(signals=build_signals(rows))
+
+    def shown(lights):
+        found = describe(replay(scene), scene, lights)["dynamic_map_states"]["1"]
+        return found["state"]["object_state"]
+
+    assert shown("now") == ["LANE_STATE_STOP"] * 91
+    assert shown("log") == ["LANE_STATE_STOP"] * 60 + ["LANE_STATE_GO"] * 31
 
 
 def test_the_map_has_lines_outlines_and_the_relations_of_lanes():

@@ -1,8 +1,11 @@
 import numpy as np
 import pytest
 
+from infgen.clock import CLOCK
 from infgen.exports.states import NO_LIGHT, lights_of, states_of
 from infgen.scene import SignalState
+from infgen.tokens.signals import REMEMBERED, merge_states, remember
+from infgen.tokens.tokenizer import read_lights
 from tests.exports.replays import replay, with_newcomer
 
 
@@ -57,7 +60,7 @@ def test_lights_are_the_logs_up_to_now_and_then_stay(drive, build_signals):
     rows += [(2, 3, SignalState.ARROW_GO), (50, 9, SignalState.GO)]
     scene = drive(signals=build_signals(sorted(rows)))
 
-    lights = lights_of(scene, 120)
+    lights = lights_of(scene, 120, "now")
 
     assert lights.lane_id.tolist() == [3, 7]  # Lane 9 has a light only later.
     assert lights.state[1, :5].tolist() == [SignalState.STOP] * 5
@@ -67,5 +70,50 @@ def test_lights_are_the_logs_up_to_now_and_then_stay(drive, build_signals):
     assert lights.stop_xyz_m[0].tolist() == [1000, -2000, 10]
 
 
-def test_a_scene_without_lights_has_none(drive):
-    assert lights_of(drive(), 91).state.shape == (0, 91)
+@pytest.mark.parametrize(("steps", "last"), [(91, 90), (94, 90), (95, 90), (96, 95)])
+def test_lights_played_as_logged_stay_after_the_last_whole_half_second(
+    drive, build_signals, steps, last
+):
+    rows = [(step, 7, SignalState(step % 3 + 4)) for step in range(steps)]
+    rows.append((50, 9, SignalState.GO))
+    scene = drive(steps=steps, signals=build_signals(sorted(rows)))
+
+    lights = lights_of(scene, 120, "log")
+
+    assert lights.lane_id.tolist() == [7, 9]  # Lane 9 has a light only after now.
+    assert lights.state[0, : last + 1].tolist() == [s % 3 + 4 for s in range(last + 1)]
+    assert (lights.state[0, last + 1 :] == last % 3 + 4).all()
+    assert np.flatnonzero(lights.state[1] != NO_LIGHT).tolist() == [50]
+
+
+@pytest.mark.parametrize("steps", [91, 93])
+def test_lights_played_as_logged_are_those_that_the_network_sees(
+    crossing, build_signals, steps
+):
+    rows = [(step, 1, SignalState(step // 7 % 9)) for step in range(steps)]
+    scene = crossing(steps=steps, signals=build_signals(rows))
+    seen = read_lights(scene)
+    known, tokens = seen.shown.shape[1], 30
+
+    lights = lights_of(scene, CLOCK.end_step(tokens - 1) + 1, "log")
+
+    ends = [CLOCK.end_step(token) for token in range(tokens)]
+    told = remember(seen.shown, known, tokens)[0] % REMEMBERED
+    assert merge_states(lights.state[0, ends]).tolist() == told.tolist()
+
+
+@pytest.mark.parametrize("played", ["now", "log"])
+def test_a_play_shorter_than_its_log_has_lights_for_as_long_as_it_lasts(
+    drive, build_signals, played
+):
+    rows = [(step, 7, SignalState.STOP) for step in range(311)]
+    scene = drive(steps=311, signals=build_signals([*rows, (200, 9, SignalState.GO)]))
+
+    lights = lights_of(scene, 91, played)
+
+    assert lights.state.tolist() == [[SignalState.STOP] * 91]
+
+
+@pytest.mark.parametrize("played", ["now", "log"])
+def test_a_scene_without_lights_has_none(drive, played):
+    assert lights_of(drive(), 91, played).state.shape == (0, 91)

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from infgen.config import TrainSettings
 from pipeline.course import begin
@@ -32,6 +34,40 @@ def test_every_part_of_every_step_has_its_own_dropout():
     }
 
     assert len(draws) == 8000
+
+
+def test_small_seeds_give_the_dropout_that_finished_weights_were_made_with():
+    assert noise_of_part(step=5, seed=3, part=2) == (3 << 48) + (2 << 32) + 5
+    assert noise_of_part(0, 65535, 65535) == 0xFFFF_FFFF_0000_0000
+
+
+@given(
+    seed=st.integers(0, 2**63 - 1),
+    part=st.integers(0, 2**16 - 1),
+    step=st.integers(0, 2**32 - 1),
+)
+@example(seed=65535, part=65535, step=2**32 - 1)
+@example(seed=65536, part=0, step=0)
+@example(seed=2**63 - 1, part=1, step=7)
+def test_torch_takes_the_dropout_of_any_seed(seed, part, step):
+    noise = noise_of_part(step, seed, part)
+
+    torch.Generator().manual_seed(noise)
+    assert noise == noise_of_part(step, seed, part)
+    assert noise != noise_of_part(step + 1, seed, part)
+    assert seed < 65536 or noise != noise_of_part(step, seed - 1, part)
+
+
+@pytest.mark.parametrize("seed", [65536, 2**63 - 1])
+def test_a_step_is_done_with_a_large_seed(course, books, seed):
+    how = replace(course.train, seed=seed)
+    large = replace(course, train=how)
+    training, recipe = begin(large, *books), large.recipe(Team())
+    descent = Descent(training, how, Team(), recipe.parts)
+
+    stepped = descent.step(recipe[0], recipe.own, 0)
+
+    assert stepped.norm > 0
 
 
 @pytest.fixture

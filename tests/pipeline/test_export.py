@@ -2,10 +2,12 @@
 
 import gzip
 import json
+import os
 import shutil
 import tarfile
 from dataclasses import replace
 from pathlib import Path
+from threading import Timer
 
 import numpy as np
 import polars as pl
@@ -17,7 +19,7 @@ from infgen.exports.scenarionet import with_arrays
 from infgen.metrics.rollouts import RolloutsError
 from infgen.metrics.submission import read_submission
 from infgen.rollout.rollout import Rollout
-from infgen.scene import AgentKind, Scene
+from infgen.scene import AgentKind, Scene, Signals, SignalState
 from infgen.sources.tfrecord import iter_records
 from infgen.sources.womd import decode_scene
 from infgen.sources.womd_write import encode_scenario, write_tfrecord
@@ -25,6 +27,7 @@ from pipeline import ingest, rollout
 from pipeline.export import FORMATS, ExportError, Order, export
 from pipeline.export_wosac import read_about
 from pipeline.folders import StoreError, write_json
+from pipeline.locks import PATIENCE_S, LockedError, locked
 from pipeline.logs import open_logs
 from pipeline.root import Root
 from pipeline.stage import Unit
@@ -356,6 +359,94 @@ def test_a_killed_folder_goes_on_scene_by_scene_to_the_same_bytes(few, logs, tmp
     export(replace(order, out=tmp_path / "b"))
     assert files(tmp_path / "a") == files(tmp_path / "b")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("played", "later"), [("log", "GO"), ("now", "STOP"), (None, "STOP")]
+)
+def test_lights_are_those_that_were_played(scenes, tmp_path, played, later):
+    """As the manifest of the rollouts says; old ones do not."""
+    lane = int(scenes[0].road_map.feature_id[0])
+    states = [SignalState.STOP] * 30 + [SignalState.GO] * 61
+    lights = Signals(
+        step=np.arange(91, dtype=np.int16),
+        lane_id=np.full(91, lane),
+        state=np.array(states, np.int8),
+        stop_xyz_m=np.zeros((91, 3), np.float32),
+    )
+    scene = replace(scenes[0], signals=lights)
+    write_tfrecord(tmp_path / "logs.tfrecord", [encode_scenario(scene)])
+    rollouts = keep(tmp_path / "unit", [replay(scene)])
+    settings = {"rollout": {"lights": played} if played else {}}
+    write_json(rollouts / "manifest.json", {"files": {}, "settings": settings})
+    logs = open_logs([str(tmp_path / "logs.tfrecord")])
+
+    for to in ("gpudrive", "scenarionet"):
+        export(Order(to, rollouts, logs, tmp_path / to))
+
+    (path,) = (tmp_path / "gpudrive").iterdir()
+    shown = json.loads(path.read_text())["tl_states"][str(lane)]["state"]
+    assert (shown[29], shown[30], shown[90]) == ("stop", later.lower(), later.lower())
+    (path,) = (tmp_path / "scenarionet").iterdir()
+    light = json.loads(path.read_text())["dynamic_map_states"][str(lane)]
+    assert light["state"]["object_state"][90] == f"LANE_STATE_{later}"
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_one_process_at_a_time_writes_an_export(order, tmp_path, to):
+    """A second one is refused, and the first writes what it would have written alone."""
+    alone = replace(order, to=to, out=tmp_path / "alone.tar.gz")
+    export(alone)
+    twice, refused = replace(alone, out=tmp_path / "twice.tar.gz"), []
+
+    def tell(event):
+        if event["event"] == "progress" and event["done"] == 1:
+            with pytest.raises(LockedError) as error:
+                export(twice)
+            refused.append(str(error.value))
+
+    found = export(twice, tell)
+
+    assert len(refused) == 1
+    assert "is being made by process" in refused[0]
+    assert f"({twice.lock})" in refused[0]
+    assert (found.scenes, found.before) == (SCENES, 0)
+    written = [
+        {path.relative_to(out): path.read_bytes() for path in out.rglob("*.*")}
+        if out.is_dir()
+        else out.read_bytes()
+        for out in (alone.out, twice.out)
+    ]
+    assert written[0] == written[1]
+    assert {path.name for path in tmp_path.iterdir()} == {"alone.tar.gz", "twice.tar.gz"}
+
+
+def test_who_waited_for_another_process_finds_what_it_wrote(order):
+    """It is refused like any other that comes later, and writes nothing over it."""
+    holding = locked(order.lock)
+    holding.__enter__()
+
+    def finish():
+        order.out.write_bytes(b"whole")
+        holding.__exit__(None, None, None)
+
+    Timer(PATIENCE_S / 3, finish).start()
+
+    with pytest.raises(ConfigError, match="exists; remove it"):
+        export(order)
+    assert order.out.read_bytes() == b"whole"
+    assert not order.partial.exists()
+
+
+def test_the_command_says_in_one_line_who_is_at_it(infgen, few, logs, tmp_path):
+    words = ["--to", "parquet", few, "--records", logs, "--root", tmp_path]
+
+    with locked(tmp_path / "table.lock"):
+        code, _, err = infgen(*words, "--out", tmp_path / "table")
+
+    assert (code, err.count("\n")) == (75, 1)
+    assert f"is being made by process {os.getpid()} on " in err
+    assert not (tmp_path / "table").exists()
 
 
 def test_the_command_exports_the_latest_rollouts_of_a_root(

@@ -6,7 +6,8 @@ import time
 
 import pytest
 
-from pipeline.folders import publish, write_file, write_json
+from pipeline.folders import StoreError, publish, remove_folder, write_file, write_json
+from pipeline.root import MANIFEST
 
 
 def test_a_folder_appears_only_when_all_is_written(tmp_path):
@@ -42,14 +43,70 @@ def test_a_resuming_writer_finds_what_it_left(tmp_path):
         assert (partial / "file").read_text() == "half"
 
 
+def test_a_resuming_writer_does_not_publish_half_written_files(tmp_path):
+    with pytest.raises(RuntimeError):
+        write_half(tmp_path / "t", resume=True)
+    (tmp_path / "t.partial" / "deep").mkdir()
+    (tmp_path / "t.partial" / "about.json.0a1b2c3d.partial").write_text("{")
+    (tmp_path / "t.partial" / "deep" / "rows.parquet.partial").write_text("PAR")
+
+    with publish(tmp_path / "t", resume=True):
+        pass
+
+    assert sorted(p.name for p in (tmp_path / "t").rglob("*")) == ["deep", "file"]
+
+
+def write_sealed(partial, text):
+    (partial / "file").write_text(text)
+    (partial / MANIFEST).write_text("{}")
+
+
 def test_of_two_writers_the_first_to_finish_wins(tmp_path):
     with publish(tmp_path / "t") as late:
-        (late / "file").write_text("late")
+        write_sealed(late, "late")
         with publish(tmp_path / "t") as early:
-            (early / "file").write_text("early")
+            write_sealed(early, "early")
 
     assert (tmp_path / "t" / "file").read_text() == "early"
     assert os.listdir(tmp_path) == ["t"]
+
+
+def test_what_was_half_removed_gives_way_to_what_is_whole(tmp_path):
+    (tmp_path / "t").mkdir()
+    (tmp_path / "t" / "left").write_text("left")
+
+    with publish(tmp_path / "t") as partial:
+        write_sealed(partial, "new")
+
+    assert sorted(os.listdir(tmp_path / "t")) == ["file", MANIFEST]
+    assert os.listdir(tmp_path) == ["t"]
+
+
+def test_a_folder_of_somebody_else_is_not_replaced_in_silence(tmp_path):
+    def write():
+        with publish(tmp_path / "t", resume=True) as partial:
+            (partial / "file").write_text("ours")
+            (tmp_path / "t").mkdir()
+            (tmp_path / "t" / "theirs").write_text("theirs")
+
+    with pytest.raises(StoreError, match=r"t is in the way; move it elsewhere"):
+        write()
+
+    assert os.listdir(tmp_path / "t") == ["theirs"]
+
+
+def test_who_lost_its_folder_does_not_publish_what_it_writes_after_that(tmp_path):
+    def write():
+        with publish(tmp_path / "t") as partial:
+            (partial / "first").write_text("first")
+            remove_folder(partial)
+            partial.mkdir(parents=True)  # As zarr does for the file that it writes.
+            write_sealed(partial, "last")
+
+    with pytest.raises(StoreError, match="removed by another run while it was written"):
+        write()
+
+    assert os.listdir(tmp_path) == []
 
 
 WRITER = """

@@ -219,10 +219,10 @@ def test_finish_joins_the_tables_of_all_files(tmp_path):
     assert len(pl.read_parquet(folder / "duplicates.parquet")) == 0
 
 
-def test_an_id_that_several_files_hold_is_named_and_marked(tmp_path):
+def test_an_id_that_several_files_of_a_split_hold_is_named_and_marked(tmp_path):
     files = {
-        "a.tfrecord": [record("x"), record("a")],
-        "b.tfrecord": [record("b"), record("x")],
+        "training.tfrecord-0": [record("x"), record("a")],
+        "training.tfrecord-1": [record("b"), record("x")],
     }
 
     folder = run_stage(tmp_path, files)
@@ -231,14 +231,69 @@ def test_an_id_that_several_files_hold_is_named_and_marked(tmp_path):
     assert index["duplicate"].to_list() == [False, False, False, True]
     (row,) = pl.read_parquet(folder / "duplicates.parquet").rows(named=True)
     assert row == {
-        "source": "b.tfrecord",
+        "source": "training.tfrecord-1",
         "record": 1,
         "offset": len(record("b")) + 16,
-        "reason": "scenario x is in a.tfrecord too",
+        "reason": "scenario x is in training.tfrecord-0 too: left out",
         "scenario_id": "x",
-        "first_source": "a.tfrecord",
+        "first_source": "training.tfrecord-0",
         "first_record": 0,
     }
+
+
+def test_an_id_that_two_splits_hold_is_named_and_counts_in_both(tmp_path):
+    files = {
+        "training.tfrecord-0": [record("x")],
+        "validation.tfrecord-0": [record("x")],
+        "validation.tfrecord-1": [record("x")],
+    }
+
+    folder = run_stage(tmp_path, files)
+
+    index = pl.read_parquet(folder / "index.parquet")
+    assert index["duplicate"].to_list() == [False, False, True]
+    duplicates = pl.read_parquet(folder / "duplicates.parquet")
+    assert duplicates.select("source", "reason", "first_source").rows() == [
+        (
+            "validation.tfrecord-0",
+            "scenario x is in training.tfrecord-0 too: both count",
+            "training.tfrecord-0",
+        ),
+        (
+            "validation.tfrecord-1",
+            "scenario x is in validation.tfrecord-0 too: left out",
+            "validation.tfrecord-0",
+        ),
+    ]
+
+
+def test_the_report_says_which_rows_of_which_file_do_not_count(tmp_path):
+    names = ["training.tfrecord-0", "training.tfrecord-0.gz", "training.tfrecord-1"]
+    records = [[record(i) for i in ids] for ids in ("abcd", "abcd", "cxbad")]
+    done = [
+        run_unit(write_tfrecord(tmp_path / name, each), tmp_path / f"{name}.unit")
+        for name, each in zip(names, records, strict=True)
+    ]
+
+    report = STAGE.finish(Files(), done, tmp_path / "all", IngestSettings(), no_progress)
+
+    assert report == {
+        "scenes": 13,
+        "quarantined": 0,
+        "duplicates": 8,
+        "units": {
+            "training.tfrecord-0.gz": {"left_out": [[0, 4]]},
+            "training.tfrecord-1": {"left_out": [[0, 1], [2, 5]]},
+        },
+    }
+
+
+def test_the_report_of_files_without_duplicates_names_no_file(tmp_path, three):
+    done = [run_unit(three, tmp_path / "unit")]
+
+    report = STAGE.finish(Files(), done, tmp_path / "all", IngestSettings(), no_progress)
+
+    assert report == {"scenes": 3, "quarantined": 0, "duplicates": 0}
 
 
 def test_a_stage_without_files_has_empty_tables(tmp_path):

@@ -1,7 +1,12 @@
 """Batches are the same whoever makes them, and wherever training begins."""
 
+import json
+import os
+import subprocess
+import sys
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -118,6 +123,54 @@ def test_scenes_of_several_groups_are_one_sequence(shards):
     assert [scene.scenario_id for scene in scenes[4:]] == ["validation-1", "validation-2"]
     with pytest.raises(IndexError):
         scenes[6]
+
+
+OVER_MANY_SHARDS = """
+import json, os, resource, sys
+from pathlib import Path
+from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.model.tensors import map_tensors
+from pipeline.course import Course
+from pipeline.distributed import Team
+from pipeline.loader import TokenScenes, train_batches
+
+def main():
+    shards, count, workers = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+    scenes = TokenScenes([shards] * count)
+    grid = TokenSettings(grid_radius_m=60.0, grid_step_m=4.0)
+    how = TrainSettings(batch_scenes=3 * count)
+    recipe = Course(ModelSettings(), how, grid, scenes, [], shards).recipe(Team())
+    ids = [parts[0].scenario_ids for parts in train_batches(recipe, range(2), workers)]
+    maps = Path("/proc/self/maps").read_text()
+    print(json.dumps([ids, len(os.listdir("/proc/self/fd")), str(shards) in maps]))
+
+if __name__ == "__main__":
+    resource.setrlimit(resource.RLIMIT_NOFILE, (128, 128))
+    main()
+"""
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_there_may_be_more_shards_than_files_that_may_be_open(shards, tmp_path, workers):
+    # In a process of its own: nobody may raise the limit again.
+    script = tmp_path / "over_many_shards.py"
+    script.write_text(OVER_MANY_SHARDS)
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, script, shards / "training", "150", str(workers)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(root)},
+        timeout=240,
+        check=False,
+    )
+
+    assert done.returncode == 0, done.stderr
+    ids, descriptors, mapped = json.loads(done.stdout)
+    once = sorted(f"training-{i}" for i in range(3) for _ in range(150))
+    assert [sorted(batch) for batch in ids] == [once, once]
+    assert descriptors < 32
+    assert not mapped
 
 
 def test_sizes_are_known_without_reading_scenes(shards, course):

@@ -77,9 +77,9 @@ def test_both_hold_the_same_logs(source, ingested, records):
 
 
 def test_a_missing_log_says_how_many_there_are(source, ingested, records):
-    with pytest.raises(MissingLogError, match=f"none of {len(records)} records holds it"):
+    with pytest.raises(MissingLogError, match=f"stray: none of {len(records)} records"):
         open_logs([str(source)]).find("stray")
-    with pytest.raises(MissingLogError, match=f"none of {len(records)} ingested scenes"):
+    with pytest.raises(MissingLogError, match=f"scene stray: none of {len(records)} ing"):
         open_logs([str(ingested)]).find("stray")
 
 

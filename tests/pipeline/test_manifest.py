@@ -19,6 +19,10 @@ def damage(root, *, full=False):
     return list(verify(root, full=full))
 
 
+def way_out(root, stage="count"):
+    return f"; `infgen run {stage} --root {root.path} --force` makes it again"
+
+
 def test_a_file_is_listed_with_its_bytes_and_checksum(tmp_path):
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "file").write_bytes(b"123456789")
@@ -44,7 +48,7 @@ def test_a_missing_file_is_named(made):
     root, _, unit = made
     (unit / "count.json").unlink()
 
-    assert damage(root) == [f"{unit / 'count.json'} is missing"]
+    assert damage(root) == [f"{unit / 'count.json'} is missing{way_out(root)}"]
 
 
 def test_a_file_of_another_size_is_named(made):
@@ -70,14 +74,14 @@ def test_a_file_too_many_is_named(made):
     root, _, unit = made
     (unit / "stray").write_text("?")
 
-    assert damage(root) == [f"{unit / 'stray'} is not in the manifest"]
+    assert damage(root) == [f"{unit / 'stray'} is not in the manifest{way_out(root)}"]
 
 
 def test_a_unit_that_is_gone_is_named(made):
     root, _, unit = made
     shutil.rmtree(unit)
 
-    assert damage(root) == [f"{unit} is missing (unit a.txt)"]
+    assert damage(root) == [f"{unit} is missing (unit a.txt){way_out(root)}"]
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}"])
@@ -87,8 +91,16 @@ def test_a_damaged_manifest_is_named(made, text):
 
     (line,) = damage(root)
     assert line.startswith(f"{stage / 'manifest.json'} is damaged")
-    with pytest.raises(StoreError, match="is damaged"):
+    assert line.endswith(way_out(root))
+    with pytest.raises(StoreError, match=r"is damaged.*`infgen run count --root"):
         read_manifest(stage)
+
+
+def test_a_damaged_folder_that_no_root_holds_has_no_stage_to_run(tmp_path):
+    (tmp_path / "manifest.json").write_text("{}")
+
+    with pytest.raises(StoreError, match=r"lists no files$"):
+        read_manifest(tmp_path)
 
 
 def test_what_is_not_finished_is_no_damage(made):

@@ -10,9 +10,10 @@ from pipeline.events import Events
 from pipeline.preset_legs import Comparison, legs_of
 from pipeline.preset_outlook import look_ahead
 from pipeline.preset_records import find_records
-from pipeline.preset_run import run_legs
+from pipeline.preset_run import Ran, run_legs
+from pipeline.preset_write import write_comparison
 from pipeline.request import LAST, recall
-from pipeline.root import Root, read_json
+from pipeline.root import MANIFEST, Root, read_json
 from pipeline.runner import Orders
 from pipeline.settings import load_stages
 from tests.pipeline.conftest import TOYS
@@ -277,3 +278,16 @@ def test_towns_are_written_once_where_no_records_are_named(shop, monkeypatch):
     out = shop.root.path / "towns"
     assert found.records == (str(out / "training.tfrecord-*-of-00002.gz"),)
     assert (asked[0].out, asked[0].scenes, asked[0].split) == (out, 3, "training")
+
+
+def test_a_comparison_that_was_half_removed_is_written_anew(shop):
+    ran = [Ran(leg, "skipped", "nobody made it") for leg in shop.legs()]
+    shown = write_comparison(shop.comparison(), ran, again=False)
+    page = (shown / "comparison.html").read_bytes()
+    (shown / MANIFEST).unlink()
+    (shown / "comparison.html").unlink()
+
+    for again in (False, True):
+        assert write_comparison(shop.comparison(), ran, again=again) == shown
+        assert (shown / MANIFEST).is_file()
+        assert (shown / "comparison.html").read_bytes() == page

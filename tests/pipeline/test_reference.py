@@ -108,11 +108,11 @@ def test_a_log_too_short_for_a_window_is_skipped_by_name(tmp_path, scenes, cross
     assert done.report["skipped"] == {"short": "50 steps hold no window of 8 s"}
 
 
-def test_a_split_without_logs_has_an_empty_reference(tmp_path):
-    inputs = Inputs([], [])
+def test_logs_too_short_for_a_window_make_an_empty_reference(tmp_path, crossing):
+    inputs = Inputs([ingested(tmp_path / "logs", [crossing(steps=40)])], [])
     report = inputs.refer(tmp_path / "reference")
 
-    assert report == {"logs": 0, "skipped": 0}
+    assert report == {"logs": 0, "skipped": 1}
     assert np.isnan(read_against(inputs.reference, {}, ReferenceSettings()).split_near)
     assert json.loads((inputs.reference / "means.json").read_text())["near"] == "nan"
 

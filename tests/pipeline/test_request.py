@@ -1,8 +1,10 @@
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from infgen.config import ConfigError
+from pipeline.plan import PlanError
 from pipeline.request import complete
 from pipeline.settings import DEFAULT_FILE
 
@@ -59,6 +61,57 @@ def test_asking_alone_is_not_remembered(ask):
     ask("total.times=3")
 
     assert ask().overrides == ()
+
+
+def told(root):
+    """All that a root remembers, by name of the file."""
+    return {path.name: path.read_text() for path in root.refs.iterdir()}
+
+
+def is_asked(ask, request):
+    return ask() == request
+
+
+def make(request, error, meanwhile=lambda: True):
+    """Remember a request while something else goes on, until making it ends in an error."""
+    with request.remembered(request.plan((), {})):
+        assert meanwhile()
+        raise error("not so")
+
+
+@pytest.mark.parametrize("refused", [ConfigError, PlanError])
+def test_what_is_refused_while_it_is_made_is_forgotten_again(ask, workshop, refused):
+    ask.run(records=TEXTS)
+    before = told(workshop.root)
+    for request in (ask("total.times=3"), ask(profile="short")):
+        with pytest.raises(refused):
+            make(request, refused, partial(is_asked, ask, request))
+        assert told(workshop.root) == before
+
+
+def test_a_first_request_that_is_refused_leaves_no_memory(ask, workshop):
+    request = ask(records=TEXTS)
+    with pytest.raises(ConfigError):
+        make(request, ConfigError)
+
+    assert told(workshop.root) == {}
+
+
+def test_what_fails_or_is_stopped_is_remembered(ask, workshop):
+    request = ask("total.times=3", records=TEXTS)
+    with pytest.raises(KeyboardInterrupt):
+        make(request, KeyboardInterrupt)
+
+    assert ask() == request
+
+
+def test_what_another_command_asked_meanwhile_stays(ask, workshop):
+    ask.run(records=TEXTS)
+    request = ask("total.times=3")
+    with pytest.raises(ConfigError):
+        make(request, ConfigError, lambda: ask.run("climb.steps=2", records=TEXTS))
+
+    assert ask().overrides == ("climb.steps=2",)
 
 
 def test_each_profile_remembers_its_own_keys(ask, workshop):

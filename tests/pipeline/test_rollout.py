@@ -64,7 +64,7 @@ def test_the_split_is_cut_into_units_of_a_few_scenes(inputs):
 
 @pytest.mark.parametrize(
     ("scenes", "most", "parts"),
-    [(9, 8, [5, 4]), (17, 8, [6, 6, 5]), (8, 8, [8]), (0, 8, [])],
+    [(9, 8, [5, 4]), (17, 8, [6, 6, 5]), (8, 8, [8])],
 )
 def test_units_are_of_about_equal_work(inputs, scenes, most, parts):
     shard = Done("validation.tfrecord-1", "key", inputs.scenes[1].path, {"scenes": scenes})

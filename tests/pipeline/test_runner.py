@@ -8,6 +8,7 @@ import pytest
 from pipeline.locks import LockedError, locked
 from pipeline.manifest import read_manifest, verify
 from pipeline.plan import PlanError
+from pipeline.root import MANIFEST
 from pipeline.runner import Orders
 from pipeline.stage import Unit
 from pipeline.stages import load_stage
@@ -176,6 +177,72 @@ def test_what_a_killed_run_left_is_cleared(workshop):
     workshop.run()
 
     assert not left.exists()
+
+
+def half_removed(folder):
+    """What a kill leaves of a folder that was being removed, its manifest first."""
+    (folder / MANIFEST).unlink()
+    return folder
+
+
+def test_a_unit_that_was_half_removed_is_made_again(workshop):
+    workshop.run()
+    unit = next(iter(read_manifest(workshop.root.pointed("count"))["units"]))
+    half_removed(workshop.root.unit("count", unit["key"]))
+    half_removed(workshop.root.pointed("count"))
+
+    results = workshop.run()
+
+    assert states(results)["count"] == "made"
+    assert results["count"].made == 1
+    assert set(states(workshop.run()).values()) == {"cached"}
+    assert list(verify(workshop.root, full=True)) == []
+
+
+def test_a_stage_that_was_half_removed_is_made_again(workshop):
+    workshop.run()
+    half_removed(workshop.root.pointed("count"))
+
+    assert states(workshop.run())["count"] == "made"
+    assert states(workshop.run())["count"] == "cached"
+
+
+def test_a_kill_while_folders_are_removed_leaves_none_half_removed(workshop, monkeypatch):
+    workshop.run()
+    before = workshop.files()
+
+    def die(path, **how):
+        raise SystemExit
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", die)
+        with pytest.raises(SystemExit):
+            workshop.run(orders=Orders(force=frozenset({"count"})))
+
+    workshop.run()
+
+    assert workshop.files() == before
+
+
+def test_a_worker_of_a_dead_run_that_still_writes_is_no_hindrance(workshop, monkeypatch):
+    left = workshop.root.units("count") / "0123456789abcdef.dead.partial"
+    left.mkdir(parents=True)
+    working = os.open(left, os.O_RDONLY)
+    remove, tries = os.rmdir, []
+
+    def write_first(name, **where):
+        if os.path.samestat(os.fstat(working), os.stat(name, **where)) and not tries:
+            tries.append((left.exists(), name))
+            os.close(os.open("late.txt", os.O_CREAT, dir_fd=working))
+        remove(name, **where)
+
+    monkeypatch.setattr(os, "rmdir", write_first)
+
+    assert states(workshop.run())["count"] == "made"
+
+    os.close(working)
+    assert [there for there, _ in tries] == [False]  # Nobody finds it by its name.
+    assert not list(workshop.root.store.rglob("*.partial"))
 
 
 def test_a_resuming_stage_goes_on_where_it_was(workshop):

@@ -167,6 +167,13 @@ def test_rollouts_of_another_split_than_the_reference_are_a_wrong_setting(tmp_pa
         score.plan(inputs, SETTINGS)
 
 
+def test_a_metric_that_does_not_exist_is_refused_before_anything_is_scored(inputs):
+    settings = {**SETTINGS, "score": ScoreSettings(wosac="wosac-2099")}
+
+    with pytest.raises(ConfigError, match="'wosac-2099'; expected one of wosac-2023"):
+        score.plan(inputs, settings)
+
+
 def test_how_rollouts_are_cut_into_units_changes_no_number(tmp_path, scenes, result):
     rollouts = [as_rollout(scene, at, 0.5 * at) for scene in scenes for at in range(2)]
     units = [
@@ -321,10 +328,11 @@ def test_the_same_units_give_the_same_bytes(tmp_path, inputs):
         assert one.read_bytes() == two.read_bytes(), name
 
 
-def test_without_rollouts_there_is_an_empty_table(tmp_path):
-    summary, scores, report = run(tmp_path / "score", Inputs([], []))
+def test_without_rollouts_there_is_an_empty_table(tmp_path, scenes):
+    inputs = Inputs([ingested(tmp_path / "l", scenes)], [])
+    summary, scores, report = run(tmp_path / "score", inputs)
 
-    assert len(scores) == 0
+    assert scores["metric"].str.starts_with("log/").all()
     assert report["scenes"] == summary["scenes"] == 0
     assert report["composite_paper"] is report["composite_corrected"] is None
 

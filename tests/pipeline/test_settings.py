@@ -214,6 +214,17 @@ def test_a_missing_file_is_named(tmp_path):
         load_stages(tmp_path / "none.yaml", {})
 
 
+def test_what_is_no_text_is_named(tmp_path):
+    (tmp_path / "bad.bin").write_bytes(b"a\xff")
+
+    with pytest.raises(ConfigError, match=r"bad\.bin is no text \(byte 0xff at 1\)"):
+        load_stages(tmp_path / "bad.bin", {})
+    with pytest.raises(ConfigError, match="is a folder; expected a YAML file"):
+        load_stages(tmp_path, {})
+    with pytest.raises(ConfigError, match=r"x.yaml cannot be read: Not a directory"):
+        load_stages(tmp_path / "bad.bin" / "x.yaml", {})
+
+
 def test_nothing_is_executed_or_built_by_tags(load):
     with pytest.raises(ConfigError, match="could not determine a constructor"):
         load(GOOD.replace("steps: 10", "steps: !!python/object/apply:os.getcwd []"))

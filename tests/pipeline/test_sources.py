@@ -5,10 +5,20 @@ import struct
 import fsspec
 import google_crc32c
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from infgen.config import ConfigError
+from infgen.sources.tfrecord import BadRecord, iter_records
+from infgen.sources.womd_write import encode_scenario
+from pipeline.events import Events
+from pipeline.request import Request
 from pipeline.root import Root
+from pipeline.runner import Orders, run
+from pipeline.settings import DEFAULT_FILE
 from pipeline.sources import absolute, find_sources, fingerprint
+from pipeline.status import standings
+from pipeline.sweep import sweep
 
 
 def masked(data):
@@ -65,6 +75,31 @@ def test_a_damaged_length_is_told_by_all_bytes(write):
     assert fingerprint(write("a", bytes(data))).startswith("sha256:")
 
 
+@given(
+    length=st.integers(0, 2**64 - 1),
+    held=st.binary(max_size=40),
+    before=st.lists(st.binary(max_size=8), max_size=2),
+)
+@example(length=2**63 - 8, held=b"", before=[])
+@example(length=2**63 - 1, held=b"12345678", before=[b"one"])
+@example(length=2**64 - 1, held=b"", before=[])
+@example(length=3, held=b"one" + masked(b"one"), before=[b"two"])
+def test_a_length_that_its_file_does_not_hold_is_told_by_all_bytes(
+    tmp_path_factory, length, held, before
+):
+    """Whatever a sound header says, the file is told and read, and nothing is raised."""
+    header = struct.pack("<Q", length)
+    path = tmp_path_factory.mktemp("crafted") / "a"
+    path.write_bytes(tfrecord(*before) + header + masked(header) + held)
+
+    whole = len(held) == length + 4
+
+    assert fingerprint(path).startswith("tfrecord:" if whole else "sha256:")
+    records = list(iter_records(path))
+    assert [record.number for record in records[: len(before)]] == list(range(len(before)))
+    assert whole or isinstance(records[-1], BadRecord)
+
+
 def test_other_files_are_told_by_all_their_bytes(write):
     packed = write("a.gz", gzip.compress(tfrecord(b"one")))
 
@@ -107,6 +142,108 @@ def test_a_damaged_memory_costs_only_time(write, root):
     root.fingerprints.write_text("{")
 
     assert find_sources([str(path)], root) == before
+
+
+@pytest.fixture
+def ingest(root):
+    """``ingest(files)`` makes the stage of some files and gives what became of it."""
+
+    def make(*files):
+        request = Request(root, DEFAULT_FILE, None, tuple(map(str, files)), ())
+        plan = request.plan(("ingest",), {})
+        (standing,) = standings(plan, request.made())
+        request.remember(plan)
+        (result,) = run(plan, Orders(), Events(root, ()))
+        return standing, result
+
+    return make
+
+
+@pytest.fixture
+def records(scenes):
+    return [encode_scenario(scene) for scene in scenes]
+
+
+@pytest.fixture
+def damaged(write, records):
+    """A file whose second record is damaged, as a bad download leaves it."""
+    data = bytearray(tfrecord(*records))
+    data[len(tfrecord(records[0])) + 12 + len(records[1]) // 2] ^= 1
+    return write("bad.tfrecord", bytes(data))
+
+
+def download(path, *records):
+    """Put another file in its place."""
+    fresh = path.with_name("fresh")
+    fresh.write_bytes(tfrecord(*records))
+    fresh.replace(path)
+
+
+def test_a_damaged_file_is_read_again_when_it_was_mended(write, ingest, damaged, records):
+    good = write("good.tfrecord", tfrecord(records[0]))
+    _, before = ingest(damaged, good)
+    assert (before.report["quarantined"], before.made) == (1, 2)
+    assert ingest(damaged, good)[0].state == "cached"
+
+    download(damaged, *records)
+
+    standing, mended = ingest(damaged, good)
+    assert (standing.state, standing.why) == (
+        "stale",
+        "1 changed file bad.tfrecord; 1 of 2 units made",
+    )
+    assert (mended.state, mended.made, mended.report["quarantined"]) == ("made", 1, 0)
+    assert ingest(damaged, good)[0].state == "cached"
+
+
+@pytest.mark.parametrize("lost", ["memory", "damaged scenes", None])
+def test_a_mended_file_stays_told_by_all_its_bytes(ingest, damaged, records, root, lost):
+    ingest(damaged)
+    download(damaged, *records)
+    _, mended = ingest(damaged)
+
+    os.utime(damaged, ns=(1, 1))
+    if lost == "memory":
+        root.fingerprints.unlink()
+    elif lost:
+        assert len(sweep(root)) == 2  # The stage and its unit.
+
+    standing, again = ingest(damaged)
+    assert (standing.state, again.key) == ("cached", mended.key)
+
+
+def test_a_file_cut_short_is_told_as_any_other_once_it_is_whole(write, records, root):
+    path = write("a.tfrecord", tfrecord(*records)[:-1])
+    (short,) = find_sources([str(path)], root)
+
+    download(path, *records)
+
+    (whole,) = find_sources([str(path)], root)
+    assert short.fingerprint.startswith("sha256:")
+    assert whole.fingerprint == fingerprint(path)
+
+
+def test_a_file_that_is_still_as_damaged_is_not_read_again(ingest, damaged):
+    _, before = ingest(damaged)
+    copy = damaged.with_name("copy")
+    copy.write_bytes(damaged.read_bytes())
+    copy.replace(damaged)
+
+    standing, after = ingest(damaged)
+    assert (standing.state, after.key) == ("cached", before.key)
+
+
+def test_sound_records_that_are_no_use_give_no_reason_to_read_a_file_again(
+    write, ingest, records
+):
+    path = write("odd.tfrecord", tfrecord(b"no scene", *records, records[0]))
+    _, before = ingest(path)
+    assert before.report["quarantined"] == 2
+
+    os.utime(path, ns=(1, 1))
+
+    standing, after = ingest(path)
+    assert (standing.state, after.key) == ("cached", before.key)
 
 
 def test_nothing_found_is_an_error_that_names_the_pattern(root, tmp_path):

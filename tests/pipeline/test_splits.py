@@ -2,7 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.splits import in_split, split_of, spread
+from pipeline.plan import PlanError
+from pipeline.splits import files_of, in_split, split_of, spread
 from pipeline.stage import Done
 
 
@@ -35,7 +36,7 @@ def test_a_file_is_of_its_own_split_only():
 ALL = [list(range(9)), [0], [0, 1, 2, 3]]
 
 
-def files_of(*counts):
+def ingested(*counts):
     return [Done(str(at), "key", Path(), {"scenes": n}) for at, n in enumerate(counts)]
 
 
@@ -51,9 +52,26 @@ def files_of(*counts):
     ],
 )
 def test_scenes_are_taken_evenly_from_all_files_and_within_each(most, taken):
-    assert spread(files_of(9, 1, 4), most) == taken
+    assert spread(ingested(9, 1, 4), most) == taken
 
 
 def test_of_towns_of_ten_views_each_one_view_is_taken_of_every_town():
-    assert spread(files_of(20, 20, 20), 6) == [[0, 10]] * 3
+    assert spread(ingested(20, 20, 20), 6) == [[0, 10]] * 3
     assert spread([], 6) == []
+
+
+def test_a_split_without_a_scene_is_refused_with_the_splits_there_are():
+    files = [
+        Done("training.tfrecord-0", "key", Path(), {"scenes": 3}),
+        Done("validation.tfrecord-0", "key", Path(), {"scenes": 0}),
+        Done("validation.tfrecord-1", "key", Path(), {"scenes": 2}),
+    ]
+
+    found = files_of(files, "validation", to="play", setting="rollout.split")
+
+    assert [done.name for done in found] == [done.name for done in files[1:]]
+    wrong = r"no file of split 'test' to play \(there is: training, validation\); set"
+    with pytest.raises(PlanError, match=wrong):
+        files_of(files, "test", to="play", setting="rollout.split")
+    with pytest.raises(PlanError, match="no record of its 1 files is usable"):
+        files_of(files[:2], "validation", to="play", setting="rollout.split")

@@ -1,20 +1,22 @@
 """Weights to begin with: those of the package, of a folder, of a key."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 
-from infgen.config import ConfigError, VocabSettings
+from infgen.config import ConfigError, ModelSettings, TokenSettings, VocabSettings
+from infgen.model.network import Network
 from infgen.pretrained import builtin_weights
 from infgen.scene import Scene
 from pipeline import ingest, vocabulary
-from pipeline.folders import write_json
+from pipeline.folders import StoreError, write_json
 from pipeline.root import Root
 from pipeline.stage import Done
 from pipeline.starts import ABOUT, WEIGHTS, find_start
 from pipeline.store import write_records
-from pipeline.weights import load_codebooks, load_network, read_about
+from pipeline.weights import load_codebooks, load_network, read_about, take_weights
 from pipeline.weights import vocabulary_fingerprint as fingerprint
 
 LARGEST_BYTES = 8 << 20
@@ -76,6 +78,31 @@ def test_the_start_of_a_key_is_enough_if_it_is_of_one_run_only(tmp_path):
         find_start(tmp_path, "x.start", "abcd")
     with pytest.raises(ConfigError, match=r"expected 'builtin', a folder with"):
         find_start(tmp_path, "x.start", "ef")
+
+
+@pytest.mark.parametrize("about", [{}, [], {"schema": "infgen.model/1"}])
+def test_a_page_that_does_not_tell_of_weights_is_refused(tmp_path, about):
+    write_json(tmp_path / ABOUT, about)
+
+    with pytest.raises(ConfigError, match=r"x.start: .*model.json lacks the entry 'weig"):
+        find_start(tmp_path, "x.start", str(tmp_path))
+
+
+def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_it():
+    small = ModelSettings(
+        width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4
+    )
+    books = load_codebooks(builtin_weights())
+    network = Network(small, *books, TokenSettings())
+
+    with pytest.raises(StoreError) as told:
+        take_weights(network, builtin_weights())
+
+    message = str(told.value)
+    assert re.search(r"for \S+, \S+, \S+ and \d+ more tensors; they were", message)
+    assert "model.width=48 (not 16)" in message
+    assert "--profile pretrained" in message
+    assert len(message) < 1000
 
 
 def test_codebooks_are_those_of_the_weights_and_measured_on_the_records(tmp_path, drive):

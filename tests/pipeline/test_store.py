@@ -1,5 +1,7 @@
+import os
 import shutil
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,13 +51,43 @@ def test_records_come_back_from_disk(tmp_path, compress):
     assert_same(read_records(tmp_path / "w.zarr", Walk, SCHEMA, mapped=False), walks())
 
 
-def test_mapped_records_are_the_same_and_nothing_is_copied(group):
+def test_mapped_records_are_the_same_and_not_to_be_written(group):
     mapped = read_records(group, Walk, SCHEMA, mapped=True)
 
     assert_same(mapped, walks())
-    assert isinstance(mapped.column("path_m").base, np.memmap)
     with pytest.raises(ValueError, match="read-only"):
         mapped[2].path_m[:] = 0
+
+
+def test_of_mapped_columns_only_what_is_asked_for_is_read(group):
+    columns, _ = map_group(group)
+    everything = columns["mood"][:]
+    (group / "mood" / "c" / "0").write_bytes(everything[:6].tobytes())
+
+    np.testing.assert_array_equal(columns["mood"][2:6], [2, 0, 1, 2])
+    assert len(columns["mood"]) == len(everything) == 15
+    assert len(columns["mood"][6:3]) == 0
+    with pytest.raises(StoreError, match="mood/c/0 is cut short"):
+        columns["mood"][5:7]
+
+
+def test_nothing_of_a_mapped_group_is_kept_open(group):
+    before = os.listdir("/proc/self/fd")
+
+    kept = [read_records(group, Walk, SCHEMA, mapped=True) for _ in range(20)]
+    records = [record for each in kept for record in each]
+
+    assert len(records) == 100
+    assert len(os.listdir("/proc/self/fd")) == len(before)
+    assert str(group) not in Path("/proc/self/maps").read_text()
+
+
+def test_a_group_that_is_gone_since_it_was_mapped_is_an_error(group):
+    mapped = read_records(group, Walk, SCHEMA, mapped=True)
+    shutil.rmtree(group)
+
+    with pytest.raises(StoreError, match=r"walks\.zarr.*cannot be read"):
+        mapped[2]
 
 
 @pytest.mark.parametrize("compress", [False, True])

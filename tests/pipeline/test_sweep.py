@@ -1,7 +1,10 @@
 import os
+import shutil
+import sys
 
 import pytest
 
+from pipeline.folders import remove_folder
 from pipeline.locks import LockedError, locked
 from pipeline.runner import Orders
 from pipeline.sweep import PARTIAL_AGE_S, find_garbage, sweep
@@ -87,3 +90,75 @@ def test_nothing_is_swept_while_a_run_goes_on(workshop):
 
 def test_an_empty_root_has_no_garbage(workshop):
     assert find_garbage(workshop.root) == []
+
+
+def test_trash_is_garbage_at_once(workshop, monkeypatch):
+    workshop.run()
+    unit = next(workshop.root.units("count").iterdir())
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", lambda path, **how: None)
+        remove_folder(unit)
+
+    assert kinds(sweep(workshop.root)) == ["left by a killed run"]
+
+    assert list(workshop.root.units("count").glob("trash.*")) == []
+
+
+TRAINING = """\
+version: 1
+stages:
+  count: {module: toy_count, deps: [sources], params: [count]}
+  train: {module: toy_train, deps: [count], params: [train]}
+"""
+
+
+@pytest.fixture
+def trainer(workshop):
+    """The workshop, where weights are trained, and others go on from them."""
+    workshop.file.write_text(TRAINING)
+    yield workshop
+    sys.modules.pop("toy_train", None)
+
+
+def test_weights_that_a_request_starts_from_are_kept(trainer):
+    first = trainer.run()["train"].key
+    start = f"train.start={first[:16]}"
+    trainer.run(start)
+
+    assert sweep(trainer.root) == []
+
+    assert trainer.run(start)["train"].state == "cached"
+
+
+def test_weights_that_only_a_profile_starts_from_are_kept(trainer):
+    first = trainer.run()["train"].key[:16]
+    profile = f"profiles:\n  tuned: {{train: {{start: '{first}', steps: 2}}}}\n"
+    trainer.file.write_text(TRAINING + profile)
+    request = trainer.request(profile="tuned")
+    trainer.request("train.seed=3").remember(request.plan((), {}))
+    request.remember(request.plan((), {}))
+    trainer.run("train.seed=3")
+
+    assert sweep(trainer.root) == []
+
+    assert request.plan((), {})["train"].sources
+
+
+def test_weights_are_kept_by_their_folder_and_for_a_stage_not_made_yet(trainer):
+    first = trainer.run()["train"].key[:16]
+    folder = trainer.root.stage("train") / first
+    trainer.run("train.seed=3")
+    plan = trainer.plan("train.seed=3")
+    trainer.request(f"build-vocab.start={folder}").remember(plan)
+
+    assert sweep(trainer.root) == []
+
+
+def test_weights_that_nothing_starts_from_any_more_are_garbage(trainer):
+    first = trainer.run()["train"].key[:16]
+    trainer.run(f"train.start={first}")
+    trainer.run("train.seed=3")
+
+    found = {each.path.name for each in sweep(trainer.root)}
+
+    assert first in found

@@ -7,7 +7,9 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +17,17 @@ import pytest
 import torch
 
 from infgen.config import ConfigError
+from pipeline import stopping
 from pipeline.checkpoint import POINTER
 from pipeline.folders import StoreError
 from pipeline.manifest import list_files
-from pipeline.root import RUN_FOLDER
+from pipeline.root import MANIFEST, RUN_FOLDER
 from pipeline.stage import Done, Source
 from pipeline.stopping import Stopped
-from pipeline.train import OUTPUTS, STAGE, finish, load_network, plan, reads, work
+from pipeline.train import DONE, OUTPUTS, STAGE, finish, load_network, plan, reads, work
 from pipeline.train_log import read_log
 from pipeline.weights import read_about
+from pipeline.work import Task, do
 
 TERMS = ("motion", "stay", "add", "cell", "kind", "size", "heading", "offset", "map")
 
@@ -120,6 +124,120 @@ def test_a_run_that_is_stopped_saves_and_goes_on_to_the_same_bytes(
     assert contents(tmp_path) == contents(whole[0])
 
 
+@pytest.fixture(scope="module")
+def do_unit(train_unit, train_settings, quiet):
+    """``do_unit(folder, **changes)`` makes that folder as the engine does."""
+
+    def do_in(folder, **changes):
+        how = replace(train_settings["train"], **changes)
+        settings = {**train_settings, "train": how}
+        return do(Task("pipeline.train", train_unit, folder, settings, {}), quiet)
+
+    return do_in
+
+
+LAST_MOMENTS = (
+    "pipeline.training.validate",
+    "pipeline.weights.save_network",
+    "pipeline.checkpoint.drop_checkpoints",
+    "pipeline.work.seal",
+    "pipeline.folders.sync_tree",
+)
+"""What is called after the last step, in this order."""
+RARELY = {"checkpoint_every": 0, "checkpoint_minutes": 0.0}
+
+
+def happen_after(patch, name, call, happen):
+    """Let something happen right after a call of a function."""
+    module, function = name.rsplit(".", 1)
+    real, calls = getattr(sys.modules[module], function), []
+
+    def call_real(*arguments, **named):
+        found = real(*arguments, **named)
+        calls.append(name)
+        if len(calls) == call:
+            happen()
+        return found
+
+    patch.setattr(name, call_real)
+
+
+@pytest.mark.parametrize("moment", LAST_MOMENTS)
+def test_a_stop_after_the_last_step_waits_until_the_unit_has_its_name(
+    do_unit, tmp_path, monkeypatch, moment
+):
+    stop = partial(os.kill, os.getpid(), signal.SIGTERM)
+    happen_after(monkeypatch, moment, 1, stop)
+
+    with stopping.listening(), pytest.raises(Stopped):
+        do_unit(tmp_path / "unit", **RARELY, steps=1, validate_every=0)
+
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["unit"]
+    assert (tmp_path / "unit" / MANIFEST).is_file()
+    assert not list((tmp_path / "unit").glob("checkpoint*"))
+
+
+class Killed(BaseException):
+    """Nothing that it passes saves anything."""
+
+
+def die():
+    raise Killed
+
+
+@pytest.fixture
+def do_twice(do_unit, tmp_path, monkeypatch):
+    """``do_twice(moment, call, **changes)``: is killed after that call, and goes on."""
+
+    def do_again(moment, call, **changes):
+        folder = tmp_path / "unit"
+        with monkeypatch.context() as patch:
+            happen_after(patch, moment, call, die)
+            with pytest.raises(Killed):
+                do_unit(folder, **RARELY, **changes)
+        assert not folder.exists()
+        outcome = do_unit(folder, **RARELY, **changes)
+        notes = read_log(folder / RUN_FOLDER / "pace.jsonl")
+        assert [note["step"] for note in notes] == [1, 2, 3, 4, 5, 6]
+        return folder, outcome.report
+
+    return do_again
+
+
+@pytest.mark.parametrize("moment", LAST_MOMENTS)
+def test_a_kill_after_the_last_step_costs_no_step_and_changes_no_byte(
+    whole, do_twice, moment
+):
+    validation = moment.endswith("validate")
+
+    folder, report = do_twice(moment, call=2 if validation else 1)
+
+    for name in OUTPUTS:
+        assert (folder / name).read_bytes() == (whole[0] / name).read_bytes()
+    assert report == {name: value for name, value in whole[1].items() if name != "run"}
+
+
+def test_a_kill_where_the_last_step_is_validated_twice_changes_no_byte(
+    make, do_twice, tmp_path
+):
+    make(tmp_path / "whole", validate_every=3)
+
+    folder, _ = do_twice("pipeline.weights.save_network", 1, validate_every=3)
+
+    log = (folder / "train.jsonl").read_bytes()
+    assert log == (tmp_path / "whole" / "train.jsonl").read_bytes()
+
+
+def test_half_written_files_of_a_killed_run_are_not_published(do_unit, tmp_path):
+    left = tmp_path / "unit.partial" / "checkpoint.json.0a1b2c3d.partial"
+    left.parent.mkdir()
+    left.write_text("{")
+
+    do_unit(tmp_path / "unit", steps=0)
+
+    assert not list(tmp_path.rglob("*.partial"))
+
+
 SCRIPT = """
 import json, sys
 from pathlib import Path
@@ -178,8 +296,9 @@ def test_a_run_that_is_killed_again_and_again_ends_with_the_same_bytes(
 
 
 def checkpoint_step(folder):
-    pointer = folder / POINTER
-    return json.loads(pointer.read_text())["step"] if pointer.exists() else 0
+    with suppress(FileNotFoundError):
+        return json.loads((folder / POINTER).read_text())["step"]
+    return 6 if (folder / RUN_FOLDER / DONE).exists() else 0
 
 
 def test_weights_are_all_that_loading_needs(whole, train_settings, metre_moves, bent_roads):
@@ -200,9 +319,10 @@ def test_missing_or_damaged_weights_are_named(whole, tmp_path, name):
     with pytest.raises(StoreError, match=name):
         load_network(tmp_path)
 
-    (tmp_path / name).write_bytes(b"{}")
-    with pytest.raises(StoreError, match=name):
-        load_network(tmp_path)
+    for damage in (b"{", b"{}", b"[]"):
+        (tmp_path / name).write_bytes(damage)
+        with pytest.raises(StoreError, match=name):
+            load_network(tmp_path)
 
 
 def test_weights_of_other_sizes_are_refused(whole, tmp_path):
@@ -212,7 +332,7 @@ def test_weights_of_other_sizes_are_refused(whole, tmp_path):
     about["model"]["width"] = 32
     (tmp_path / "model.json").write_text(json.dumps(about))
 
-    with pytest.raises(StoreError, match="does not fit its settings"):
+    with pytest.raises(StoreError, match=r"does not fit its settings .{,400}$"):
         load_network(tmp_path)
 
 

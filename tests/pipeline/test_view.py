@@ -134,10 +134,27 @@ def test_a_scene_that_no_record_holds_is_told_with_some_that_there_are(source, s
         find_film(Wanted(Root(source), records=(str(source),), scene="x"))
 
 
+def test_a_file_without_records_says_what_is_wrong_with_it(tmp_path, capsys):
+    path = tmp_path / "x.tfrecord"
+    path.write_text("nothing of the kind, and long enough")
+
+    assert infgen("view", path) == 2
+    assert "no usable record: " in (err := capsys.readouterr().err)
+    assert f"{path}, record 0: length checksum" in err
+
+
+@pytest.mark.parametrize("name", ["nosuch", "empty", "note.txt"])
+def test_what_is_neither_a_root_nor_records_is_told_so(tmp_path, capsys, name):
+    (tmp_path / "empty").mkdir()
+
+    assert infgen("view", tmp_path / name) == 2
+    assert f"{name} is neither a root nor records; expected" in capsys.readouterr().err
+
+
 def test_an_empty_root_says_how_to_fill_it(tmp_path):
     with pytest.raises(ConfigError, match="holds no scenes; `infgen demo` makes some"):
         find_film(Wanted(Root(tmp_path)))
-    with pytest.raises(ConfigError, match="holds no rollouts; `infgen rollout`"):
+    with pytest.raises(ConfigError, match="holds no rollouts; `infgen rollout --root"):
         find_film(Wanted(Root(tmp_path), rollouts=(1,)))
 
 
