@@ -1,8 +1,9 @@
 """The nearest of many segments, for many points: the same answer as trying them all.
 
-Points are gathered in cells, coarse then fine. What is nearest to some point of a cell
-cannot be farther from its middle than the nearest to the middle by more than the cell's
-width; only those segments are handed down, and tried for each point at the end.
+Points are gathered in cells, coarse then fine. From the middle of a cell to one of its
+points the distance to a segment changes by no more than the way there, times a little where
+the segment is steep. That tells which segments can be nearest to some point of a cell; only
+they are handed down, and tried for each point at the end.
 """
 
 from itertools import pairwise
@@ -35,12 +36,13 @@ def nearest_by_cells(
     The place on a segment is found in the plane, the distance to it in space.
     """
     segments = np.ascontiguousarray(np.concatenate([start_m, along_m], axis=1).T)
+    change = _most_change(along_m)
     known = Candidates(np.array([0, len(start_m)]), np.arange(len(start_m)))
     group = np.zeros(len(points_m), dtype=np.int64)
     for width_m in CELLS_M:
         parent, group = group, _cells(points_m, width_m, group)
         middle_m, radius_m, above = _bounds(points_m, group, parent)
-        known = _narrow(middle_m, radius_m, above, known, segments)
+        known = _narrow(middle_m, radius_m, above, known, segments, change)
     return _first_nearest(points_m, group, known, segments)
 
 
@@ -66,12 +68,24 @@ def _bounds(
     return middle_m, radius_m, parent[order][first]
 
 
+def _most_change(along_m: np.ndarray) -> Float32[np.ndarray, " segment"]:
+    """By how much the distance to a segment changes at most, per metre that one goes.
+
+    The place on it is found in the plane: it moves up and down with its slope, beside the
+    point itself. That is the norm of [[1, 0], [slope, 1]].
+    """
+    flat_m = np.hypot(along_m[:, 0], along_m[:, 1])
+    slope = np.abs(along_m[:, 2]) / np.where(flat_m > 0, flat_m, np.inf)
+    return (slope + np.sqrt(slope * slope + 4)) / 2
+
+
 def _narrow(
     middle_m: np.ndarray,
     radius_m: np.ndarray,
     parent: np.ndarray,
     known: Candidates,
     segments: np.ndarray,
+    change: np.ndarray,
 ) -> Candidates:
     """Keep the segments that may be nearest to some point within reach of a middle."""
     counts, kept = [], []
@@ -79,8 +93,9 @@ def _narrow(
         start, segment = _expand(known, parent[some])
         point = np.repeat(np.arange(some.start, some.stop), np.diff(start))
         gap_m = _distance_m(middle_m[point].T, segment, segments)
-        at_most_m = np.minimum.reduceat(gap_m, start[:-1]) + 2 * radius_m[some] + SLACK_M
-        keep = gap_m <= np.repeat(at_most_m, np.diff(start))
+        stray_m = change[segment] * radius_m[point]
+        at_most_m = np.minimum.reduceat(gap_m + stray_m, start[:-1]) + SLACK_M
+        keep = gap_m - stray_m <= np.repeat(at_most_m, np.diff(start))
         kept.append(segment[keep])
         counts.append(np.add.reduceat(keep, start[:-1], dtype=np.int64))
     none = np.zeros(0, dtype=np.int64)

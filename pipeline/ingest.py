@@ -59,7 +59,7 @@ def read_scenes(unit_folder: Path) -> Iterator[Scene]:
     from pipeline.store import read_records  # noqa: PLC0415
 
     for path in sorted(unit_folder.glob("scenes-*.zarr")):
-        yield from read_records(path, Scene, SCHEMA, mapped=False)
+        yield from read_records(path, Scene, SCHEMA, whole=True)
 
 
 def plan(inputs: Inputs, settings: IngestSettings) -> Sequence[Unit]:

@@ -149,7 +149,7 @@ class StoreLogs:
         if path not in self._open:
             while len(self._open) >= OPEN_GROUPS:
                 self._open.pop(next(iter(self._open)))
-            self._open[path] = read_records(path, Scene, SCHEMA, mapped=False)
+            self._open[path] = read_records(path, Scene, SCHEMA, whole=True)
         return self._open[path]
 
 

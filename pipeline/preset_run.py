@@ -75,9 +75,11 @@ def run_legs(
         events: Told of everything.
 
     Raises:
-        ConfigError: for settings that cannot be.
+        ConfigError: for settings that cannot be, of any of them, before the first.
         LockedError: if another run makes one of their stages.
     """
+    for leg in legs:  # Days may lie before the last of them.
+        comparison.plan(leg, None)
     runs = _Runs(comparison, orders, events)
     ran: list[Ran] = []
     for leg in legs:

@@ -39,7 +39,7 @@ def write_binned(target: Path, number: int, binned: Sequence[Binned]) -> None:
 def read_binned(folder: Path) -> Iterator[Binned]:
     """Read the bins of one unit, a group in memory at a time."""
     for path in sorted(folder.glob("binned-*.zarr")):
-        yield from read_records(path, Binned, BINNED_SCHEMA, mapped=False)
+        yield from read_records(path, Binned, BINNED_SCHEMA, whole=True)
 
 
 def write_counts(target: Path, counts: Counts) -> None:
@@ -49,7 +49,7 @@ def write_counts(target: Path, counts: Counts) -> None:
 
 def read_counts(folder: Path) -> Counts:
     """Read the histograms of a unit, or of a whole split."""
-    return read_records(folder / COUNTS, Counts, COUNTS_SCHEMA, mapped=False)[0]
+    return read_records(folder / COUNTS, Counts, COUNTS_SCHEMA, whole=True)[0]
 
 
 def write_logged(target: Path, logged: Sequence[Logged]) -> None:
@@ -59,7 +59,7 @@ def write_logged(target: Path, logged: Sequence[Logged]) -> None:
 
 def read_logged(folder: Path) -> dict[str, LogCounts]:
     """Read the numbers of agents of one file's logs, by scenario id."""
-    logged = read_records(folder / LOGGED, Logged, LOGGED_SCHEMA, mapped=False)
+    logged = read_records(folder / LOGGED, Logged, LOGGED_SCHEMA, whole=True)
     return {one.scenario_id: one.counts for one in logged}
 
 

@@ -136,7 +136,7 @@ def read_rollouts(folder: Path) -> "Iterator[Rollout]":
     from pipeline.store import read_records  # noqa: PLC0415
 
     for path in sorted(folder.glob("rollouts-*.zarr")):
-        yield from read_records(path, Rollout, SCHEMA, mapped=False)
+        yield from read_records(path, Rollout, SCHEMA, whole=True)
 
 
 def finish(

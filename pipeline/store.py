@@ -20,7 +20,7 @@ from pipeline.folders import StoreError, publish, write_file, write_json
 __all__ = [
     "StoreError",
     "Stored",
-    "map_group",
+    "open_group",
     "publish",
     "read_group",
     "read_records",
@@ -144,7 +144,7 @@ def read_group(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     return columns, dict(group.attrs)
 
 
-def map_group(path: Path) -> tuple[dict[str, Stored], dict[str, Any]]:
+def open_group(path: Path) -> tuple[dict[str, Stored], dict[str, Any]]:
     """Find where the columns of an uncompressed group lie, without reading them.
 
     Raises:
@@ -156,7 +156,9 @@ def map_group(path: Path) -> tuple[dict[str, Stored], dict[str, Any]]:
         meta = _json(meta_file)
         name, dtype = meta_file.parent.name, np.dtype(meta["data_type"])
         if [codec["name"] for codec in meta["codecs"]] != ["bytes", "crc32c"]:
-            raise StoreError(f"{meta_file.parent} is compressed and cannot be mapped")
+            raise StoreError(
+                f"{meta_file.parent} is compressed and cannot be read in parts"
+            )
         columns[name] = _stored(_chunk(path, name), dtype, int(meta["shape"][0]))
     return columns, about.get("attributes", {})
 
@@ -169,14 +171,14 @@ def write_records(
     write_group(path, pack(records, kind), attributes, compress=compress)
 
 
-def read_records(path: Path, kind: type[T], schema: str, *, mapped: bool) -> Unpacked[T]:
-    """Open a group of records: all read and verified, or mapped and each read on demand.
+def read_records(path: Path, kind: type[T], schema: str, *, whole: bool) -> Unpacked[T]:
+    """Open a group of records: all read at once and verified, or each on demand.
 
     Raises:
         StoreError: if the group holds another schema, or is damaged.
     """
     columns: Columns
-    columns, attributes = map_group(path) if mapped else read_group(path)
+    columns, attributes = read_group(path) if whole else open_group(path)
     if attributes.get("schema") != schema:
         found = attributes.get("schema")
         raise StoreError(

@@ -55,7 +55,7 @@ def open_tokens(unit_folder: Path) -> "list[Unpacked[SceneTokens]]":
     from pipeline.store import read_records  # noqa: PLC0415
 
     return [
-        read_records(path, SceneTokens, SCHEMA, mapped=True)
+        read_records(path, SceneTokens, SCHEMA, whole=False)
         for path in sorted(unit_folder.glob("tokens-*.zarr"))
     ]
 

@@ -311,7 +311,7 @@ def _write(path: Path, records: Sequence[Any], kind: type, schema: str) -> None:
 def _read(path: Path, kind: type[T], schema: str) -> "Unpacked[T]":
     from pipeline.store import read_records  # noqa: PLC0415
 
-    return read_records(path, kind, schema, mapped=False)
+    return read_records(path, kind, schema, whole=True)
 
 
 STAGE = Stage(

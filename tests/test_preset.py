@@ -30,10 +30,16 @@ PRESETS = """
     plays: {long: {}}
     arms:
       infgen: {published: InfGen, plays: [long]}
-      odd: {label: Odd one, model: {width: 15}, plays: [long]}
+      odd: {label: Odd one, train: {motion_weight: 1e39}, plays: [long]}
       odder: {profile: smart, start: odd, plays: [long]}
+  wrong:
+    profile: small,benchmark,tiny
+    plays: {long: {}}
+    arms:
+      infgen: {published: InfGen, plays: [long]}
+      wrong: {model: {width: 15}, plays: [long]}
 """
-"""Beside those of the package: one that goes well, and one that does not."""
+"""Beside those of the package: one that goes well, one that does not, one that cannot."""
 RUNS = 2 * (3 + 1)
 SETTINGS = (
     *(
@@ -184,7 +190,7 @@ def test_a_failing_arm_is_named_beside_those_that_are_there_and_the_exit_code_is
 
     assert code == 1
     error = capsys.readouterr().err
-    assert "odd, seed 0, long: train: weights: ValueError: width 15" in error
+    assert re.search(r"odd, seed 0, long: train: weights: .*not finite", error)
     shown = desk[0] / "R/presets/odd"
     told = json.loads((shown / "comparison.json").read_text())
     assert list(told["arms"]) == ["infgen"]
@@ -192,6 +198,15 @@ def test_a_failing_arm_is_named_beside_those_that_are_there_and_the_exit_code_is
     page = (shown / "comparison.html").read_text()
     assert "odder, seed 0, long: there are no weights of odd" in page
     assert (shown / "tables/table-2-long-term.csv").is_file()
+
+
+def test_an_arm_that_cannot_be_is_refused_before_any_other_is_begun(desk, capsys):
+    capsys.readouterr()
+
+    assert call("run", "report", "--preset", "wrong", *SETTINGS, *FROM) == 2
+    error = capsys.readouterr().err
+    assert "model.width is 15; expected a multiple of model.heads (2)" in error
+    assert "run 1 of" not in error
 
 
 def test_fewer_arms_and_seeds_are_fewer_rows(desk, capsys):

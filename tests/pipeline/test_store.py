@@ -9,7 +9,7 @@ from jaxtyping import Float32, Int16
 
 from infgen.scene import Scene
 from pipeline.folders import StoreError
-from pipeline.store import map_group, read_group, read_records, write_group, write_records
+from pipeline.store import open_group, read_group, read_records, write_group, write_records
 
 SCHEMA = "infgen.walks/1"
 
@@ -48,19 +48,19 @@ def group(tmp_path):
 def test_records_come_back_from_disk(tmp_path, compress):
     write_records(tmp_path / "w.zarr", walks(), Walk, SCHEMA, compress=compress)
 
-    assert_same(read_records(tmp_path / "w.zarr", Walk, SCHEMA, mapped=False), walks())
+    assert_same(read_records(tmp_path / "w.zarr", Walk, SCHEMA, whole=True), walks())
 
 
-def test_mapped_records_are_the_same_and_not_to_be_written(group):
-    mapped = read_records(group, Walk, SCHEMA, mapped=True)
+def test_records_read_in_parts_are_the_same_and_not_to_be_written(group):
+    opened = read_records(group, Walk, SCHEMA, whole=False)
 
-    assert_same(mapped, walks())
+    assert_same(opened, walks())
     with pytest.raises(ValueError, match="read-only"):
-        mapped[2].path_m[:] = 0
+        opened[2].path_m[:] = 0
 
 
-def test_of_mapped_columns_only_what_is_asked_for_is_read(group):
-    columns, _ = map_group(group)
+def test_of_columns_on_disk_only_what_is_asked_for_is_read(group):
+    columns, _ = open_group(group)
     everything = columns["mood"][:]
     (group / "mood" / "c" / "0").write_bytes(everything[:6].tobytes())
 
@@ -71,10 +71,10 @@ def test_of_mapped_columns_only_what_is_asked_for_is_read(group):
         columns["mood"][5:7]
 
 
-def test_nothing_of_a_mapped_group_is_kept_open(group):
+def test_nothing_of_an_open_group_is_kept_open(group):
     before = os.listdir("/proc/self/fd")
 
-    kept = [read_records(group, Walk, SCHEMA, mapped=True) for _ in range(20)]
+    kept = [read_records(group, Walk, SCHEMA, whole=False) for _ in range(20)]
     records = [record for each in kept for record in each]
 
     assert len(records) == 100
@@ -82,29 +82,29 @@ def test_nothing_of_a_mapped_group_is_kept_open(group):
     assert str(group) not in Path("/proc/self/maps").read_text()
 
 
-def test_a_group_that_is_gone_since_it_was_mapped_is_an_error(group):
-    mapped = read_records(group, Walk, SCHEMA, mapped=True)
+def test_a_group_that_is_gone_since_it_was_opened_is_an_error(group):
+    opened = read_records(group, Walk, SCHEMA, whole=False)
     shutil.rmtree(group)
 
     with pytest.raises(StoreError, match=r"walks\.zarr.*cannot be read"):
-        mapped[2]
+        opened[2]
 
 
 @pytest.mark.parametrize("compress", [False, True])
-@pytest.mark.parametrize("mapped", [False, True])
-def test_no_records_at_all_come_back_too(tmp_path, compress, mapped):
-    if mapped and compress:
-        pytest.skip("compressed groups are not mapped")
+@pytest.mark.parametrize("whole", [True, False])
+def test_no_records_at_all_come_back_too(tmp_path, compress, whole):
+    if compress and not whole:
+        pytest.skip("compressed groups are not read in parts")
     write_records(tmp_path / "w.zarr", [], Walk, SCHEMA, compress=compress)
 
-    assert len(read_records(tmp_path / "w.zarr", Walk, SCHEMA, mapped=mapped)) == 0
+    assert len(read_records(tmp_path / "w.zarr", Walk, SCHEMA, whole=whole)) == 0
 
 
 def test_a_scene_comes_back_from_disk(tmp_path, crossing):
     scene = crossing()
     write_records(tmp_path / "s.zarr", [scene], Scene, "infgen.scenes/1", compress=True)
 
-    (read,) = read_records(tmp_path / "s.zarr", Scene, "infgen.scenes/1", mapped=False)
+    (read,) = read_records(tmp_path / "s.zarr", Scene, "infgen.scenes/1", whole=True)
 
     np.testing.assert_array_equal(read.tracks.xyz_m, scene.tracks.xyz_m)
     np.testing.assert_array_equal(read.road_map.xyz_m, scene.road_map.xyz_m)
@@ -142,14 +142,14 @@ def test_another_schema_is_refused_by_name(group):
     with pytest.raises(
         StoreError, match=r"holds 'infgen.walks/1', expected 'infgen.runs/1'"
     ):
-        read_records(group, Walk, "infgen.runs/1", mapped=True)
+        read_records(group, Walk, "infgen.runs/1", whole=False)
 
 
-def test_a_compressed_group_cannot_be_mapped(tmp_path):
+def test_a_compressed_group_cannot_be_read_in_parts(tmp_path):
     write_records(tmp_path / "w.zarr", walks(), Walk, SCHEMA, compress=True)
 
-    with pytest.raises(StoreError, match="compressed and cannot be mapped"):
-        map_group(tmp_path / "w.zarr")
+    with pytest.raises(StoreError, match="compressed and cannot be read in parts"):
+        open_group(tmp_path / "w.zarr")
 
 
 def flip(path, place):
@@ -187,7 +187,7 @@ def test_damage_is_an_error_when_read(tmp_path, damage, compress):
     DAMAGES[damage](group)
 
     with pytest.raises(StoreError, match=r"walks\.zarr"):
-        read_records(group, Walk, SCHEMA, mapped=False)
+        read_records(group, Walk, SCHEMA, whole=True)
 
 
 @pytest.mark.parametrize("damage", sorted(DAMAGES.keys() - ONLY_SEEN_WHEN_READ))
@@ -195,7 +195,7 @@ def test_damage_of_form_is_an_error_when_mapped(group, damage):
     DAMAGES[damage](group)
 
     with pytest.raises(StoreError, match=r"walks\.zarr"):
-        read_records(group, Walk, SCHEMA, mapped=True)
+        read_records(group, Walk, SCHEMA, whole=False)
 
 
 def test_a_group_is_never_written_over(group):

@@ -15,7 +15,7 @@ from infgen.tokens.tokenizer import tokenize_scene
 from pipeline import ingest, vocabulary
 from pipeline import tokenize as stage
 from pipeline.stage import Done, Unit
-from pipeline.store import map_group, write_records
+from pipeline.store import open_group, write_records
 
 SETTINGS = TokenSettings()
 
@@ -126,7 +126,7 @@ def test_tokens_on_disk_are_those_of_the_tokenizer(
 
 
 def test_tokens_can_be_read_in_parts(tokenized):
-    columns, about = map_group(tokenized[0].path / "tokens-000.zarr")
+    columns, about = open_group(tokenized[0].path / "tokens-000.zarr")
 
     assert len(columns["pose"][3:6]) == 3
     assert about == {"schema": "infgen.tokens/2", "count": 2}
