@@ -11,8 +11,9 @@ how many half seconds the ego, and other vehicles, set off after standing for tw
 The second has who comes after now, from when it is near: speed in the first second, who
 begins off the road or on top of somebody, pedestrians and cyclists; below it stands how far
 apart logs and rollouts are in speeds and in the side newcomers come from. A rollout whose
-ego leaves the map, where a street out of town ends, counts until then; how many do is said.
-The last line is one JSON object.
+ego leaves the map, where a street out of town ends, counts until then. It is said how many
+do, how long one stands at most, and by how much agents, its speed and off-road shares drift
+from the first span, and from the second, to the last. The last line is one JSON object.
 """
 
 import argparse
@@ -30,6 +31,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from infgen.clock import CLOCK
 from infgen.config import TokenSettings, build
+from infgen.metrics.intervals import Interval, bootstrap
 from infgen.metrics.kinematics import speed, speed_valid
 from infgen.metrics.placement import count_per_token
 from infgen.metrics.road import road_edge_m
@@ -49,6 +51,8 @@ STILL_M = 0.1
 """Who moves less in half a second stands ..."""
 STOOD_TOKENS = 4
 """... and has stood after so many of them."""
+DRIFTING = ("agents", "ego_mps", "off_road")
+RESAMPLES = 2000
 COLUMNS = {
     "agents": ("agents", ".1f"),
     "ego_mps": ("ego, m/s", ".2f"),
@@ -70,6 +74,25 @@ class Side:
     newcomers: Newcomers = field(default_factory=Newcomers)
     count: int = 0
     left_map_s: list[float] = field(default_factory=list)
+    ego_stood_s: list[float] = field(default_factory=list)
+    until: list[dict[str, Float64[np.ndarray, "2 span"]]] = field(default_factory=list)
+    """Sums and counts after each scene."""
+
+    def end_scene(self) -> None:
+        """Note what there is: the next values are of another scene."""
+        self.until.append({name: sums.copy() for name, sums in self.sums.items()})
+
+    def drift(self, name: str, first: int) -> Interval:
+        """Tell by what share a figure is larger in the last span than in another."""
+        sums = np.stack([one[name] for one in self.until])  # [scene, 2, span]
+        each = np.diff(sums, axis=0, prepend=np.zeros_like(sums[:1]))
+        ends = each[:, :, [first, -1]].reshape(len(each), 4).astype(np.float64)
+
+        def follow(means: np.ndarray) -> np.ndarray:
+            before, after, seen_before, seen_after = np.maximum(means, 1e-12).T
+            return (after / seen_after / (before / seen_before) - 1)[:, None]
+
+        return bootstrap(ends, follow, RESAMPLES, 0)
 
     def means(self, name: str) -> Float64[np.ndarray, " span"]:
         """Means of one figure; NaN for spans that nothing reaches."""
@@ -148,6 +171,9 @@ def _take_starts(side: Side, traffic: Traffic, others: np.ndarray, look: Look) -
     seen = valid[1:] & valid[:-1]  # [half second, agent]
     way_m = np.hypot(np.diff(x_m, axis=0), np.diff(y_m, axis=0))
     still = seen & (way_m < STILL_M)
+    moves = np.flatnonzero(~still[knots[:-1] >= traffic.now, traffic.ego])
+    ends = np.concatenate([[-1], moves, [np.count_nonzero(knots[:-1] >= traffic.now)]])
+    side.ego_stood_s.append(float((np.diff(ends).max() - 1) * CLOCK.token_s))
     if len(still) <= STOOD_TOKENS:
         return
     before = sliding_window_view(still[:-1], STOOD_TOKENS, axis=0)
@@ -198,6 +224,8 @@ def measure(root: Path, look: Look) -> tuple[Side, Side]:
             print(f"<!-- no log of {scenario_id}: {error} -->")
         for traffic in played:
             take(sides[1], traffic, place, look)
+        for side in sides:
+            side.end_scene()
     if not sides:
         raise FileNotFoundError(f"{root} has no rollouts")
     return sides[0], sides[1]
@@ -244,7 +272,10 @@ def report(logs: Side, played: Side, look: Look) -> dict[str, Any]:
             f"{who}: the ego left the map in {len(side.left_map_s)} of {side.count} "
             f"(after {after_s or 'no'} s)"
         )
-        found[f"left_map_{who}_s"] = side.left_map_s
+        stood_s = max(side.ego_stood_s, default=0.0)
+        print(f"{who}: the ego stands for at most {stood_s:g} s")
+        found[f"left_map_{who}_s"], found[f"ego_stood_{who}_s"] = side.left_map_s, stood_s
+    found["drift"] = _tell_drift(logs, played)
     newcomers = {"logs": logs.newcomers.numbers(), "rollouts": played.newcomers.numbers()}
     found["newcomers"] = newcomers
     apart = apart_bits(logs.newcomers, played.newcomers)
@@ -260,6 +291,24 @@ def report(logs: Side, played: Side, look: Look) -> dict[str, Any]:
     for name, what in (("first_speed_js", "first speeds"), ("bearing_js", "bearings")):
         told = _cell(found[name], ".3f")
         print(f"{what}, Jensen-Shannon divergence in bits: {told}")
+    return found
+
+
+def _tell_drift(logs: Side, played: Side) -> dict[str, Any]:
+    """Print by how much figures drift, with 95 % of resamples of the scenes."""
+    found: dict[str, Any] = {}
+    for first in range(min(2, logs.sums["agents"].shape[1] - 1)):
+        for who, side in (("logs", logs), ("rollouts", played)):
+            some = {name: side.drift(name, first) for name in DRIFTING}
+            told = ", ".join(
+                f"{COLUMNS[name][0]} {one.mean[0]:+.1%} "
+                f"({one.low[0]:+.0%} to {one.high[0]:+.0%})"
+                for name, one in some.items()
+            )
+            print(f"{who}, span {first + 1} to the last: {told}")
+            found[f"{who}_from_{first + 1}"] = {
+                name: _numbers(np.concatenate(one)) for name, one in some.items()
+            }
     return found
 
 
