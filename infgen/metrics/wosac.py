@@ -153,7 +153,9 @@ def combine(
         for rule in version.rules
     }
     # A generated scene has no log it should be near (the official value is 0).
-    displacement_m = simulated.average_displacement_error * (not version.whole_log)
+    displacement_m = simulated.average_displacement_error
+    if version.whole_log:
+        displacement_m = np.zeros_like(displacement_m)
     return Scores(
         scenario_id=scenario_id,
         version=version.name,
