@@ -12,10 +12,9 @@ import typer
 
 from infgen import __version__
 from infgen.config import ConfigError
-from pipeline import described, lookup, ranks, stopping, tables, tools
-from pipeline.doctor import examine
-from pipeline.manifest import verify as find_damage
-from pipeline.options import (
+from pipeline.commands import tables, tools
+from pipeline.commands.doctor import examine
+from pipeline.commands.options import (
     WORK,
     Asked,
     Comparing,
@@ -25,13 +24,8 @@ from pipeline.options import (
     StrictCode,
     gathers,
 )
-from pipeline.request import OWN_FILE, find_file
-from pipeline.root import find_root
-from pipeline.screen import show_table
-from pipeline.settings import DEFAULT_FILE, load_stages
-from pipeline.sweep import find_garbage
-from pipeline.sweep import sweep as remove_garbage
-from pipeline.verbs import (
+from pipeline.commands.screen import show_table
+from pipeline.commands.verbs import (
     FAILED,
     STALE,
     compare_arms,
@@ -42,6 +36,15 @@ from pipeline.verbs import (
     tell_standings,
     watch_stages,
 )
+from pipeline.engine import artefacts, signals
+from pipeline.engine.garbage import find_garbage
+from pipeline.engine.garbage import sweep as remove_garbage
+from pipeline.engine.layout import find_root
+from pipeline.engine.manifest import verify as find_damage
+from pipeline.settings import described
+from pipeline.settings.request import OWN_FILE, find_file
+from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
+from pipeline.stages.train import ranks
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -263,8 +266,8 @@ def show(key: Key, root: RootFolder = WORK) -> None:
 
     Example: infgen show tokenize --root R
     """
-    found = lookup.find(find_root(root, made=True), key)
-    print_json(lookup.describe(found), spread=True)
+    found = artefacts.find(find_root(root, made=True), key)
+    print_json(artefacts.describe(found), spread=True)
 
 
 @app.command()
@@ -274,8 +277,8 @@ def diff(one: Key, other: Key, root: RootFolder = WORK, json_: Json = False) -> 
     Example: infgen diff 3f2a91 77c0de --root R
     """
     place = find_root(root, made=True)
-    folders = [lookup.find(place, key) for key in (one, other)]
-    found = list(lookup.differences(*folders))
+    folders = [artefacts.find(place, key) for key in (one, other)]
+    found = list(artefacts.differences(*folders))
     if json_:
         print_json({"differences": [list(each) for each in found]})
     else:
@@ -353,7 +356,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = sys.argv[1:] if arguments is None else arguments
     try:
         ranks.run(lambda: app(args=arguments), os.environ)
-    except (ValueError, OSError, stopping.Stopped) as error:
+    except (ValueError, OSError, signals.Stopped) as error:
         code = exit_code(error)
         typer.echo(f"infgen: {error}", err=True)
         if "--json" in words:  # Whoever gathers lines finds this one, too.

@@ -24,16 +24,16 @@ from liveliness import STILL_M
 from loader import shards
 from torch import Tensor
 
-from infgen.model.batch import Agents, Limits, collate
+from infgen.model.batching.batch import Agents, Limits, collate
 from infgen.model.network import Network
-from infgen.model.stop_lines import CLASSES, LONG_SINCE, StopLines
+from infgen.model.signal_features import CLASSES, LONG_SINCE, StopLines
 from infgen.scene import AgentKind
 from infgen.tokens.scene_tokens import SceneTokens, SignalClass
-from pipeline.loader import TokenScenes
-from pipeline.manifest import read_manifest
-from pipeline.screen import show_table
-from pipeline.splits import in_split
-from pipeline.weights import load_network
+from pipeline.commands.screen import show_table
+from pipeline.engine.manifest import read_manifest
+from pipeline.stages.train.loader import TokenScenes
+from pipeline.storage.splits import in_split
+from pipeline.storage.weights import load_network
 
 CLOSE_M = 12.0
 """A stop line so far ahead of a vehicle's centre is its next one."""

@@ -31,16 +31,16 @@ from rollout import Case, Pace, make_network
 
 from infgen.clock import CLOCK
 from infgen.config import RolloutSettings, TokenSettings
-from infgen.model.columns import Column, MotionStep
 from infgen.model.network import Network
-from infgen.model.steps import Memory, Stepper
-from infgen.rollout.player import Player
+from infgen.model.stepping import Memory, Stepper
+from infgen.model.token_step import Column, MotionStep
 from infgen.rollout.population import Population
+from infgen.rollout.recording import Start
 from infgen.rollout.session import Session
-from infgen.rollout.trace import Start
+from infgen.rollout.simulator import Player
 from infgen.scene import Scene
 from infgen.tokens.tokenizer import tokenize_scene
-from pipeline.weights import load_network
+from pipeline.storage.weights import load_network
 
 SAMPLED = ("life", "kind", "move", "presence")
 

@@ -22,8 +22,8 @@ from infgen.sources import wire
 from infgen.sources.tfrecord import Record, iter_records
 from infgen.sources.wire import BYTES, Spans, tag
 from infgen.sources.womd import scene_or_fault
-from pipeline.ingest import STAGE
-from pipeline.stage import Report, Unit
+from pipeline.engine.stage import Report, Unit
+from pipeline.stages.ingest import STAGE
 
 SHARED = Path(__file__).parents[1] / "../shared/data/womd"
 BUILTIN = Path(infgen.__file__).parent / "sources/towns/records"

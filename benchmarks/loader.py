@@ -25,18 +25,18 @@ from tokenize_speed import default_records
 from torch import Tensor
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
-from infgen.model.batch import Batch, Limits
+from infgen.model.batching.batch import Batch, Limits
 from infgen.model.tensors import map_tensors
 from infgen.tokens.scene_tokens import SceneTokens
-from pipeline.course import Course
-from pipeline.distributed import Team
-from pipeline.events import Events
-from pipeline.loader import Recipe, TokenScenes, train_batches
-from pipeline.request import Request
-from pipeline.root import Root
-from pipeline.runner import Orders, run
-from pipeline.screen import show_table
-from pipeline.settings import DEFAULT_FILE
+from pipeline.commands.screen import show_table
+from pipeline.engine.events import Events
+from pipeline.engine.layout import Root
+from pipeline.engine.runner import Orders, run
+from pipeline.settings.request import Request
+from pipeline.settings.stages_file import DEFAULT_FILE
+from pipeline.stages.train.loader import Recipe, TokenScenes, train_batches
+from pipeline.stages.train.process_group import Team
+from pipeline.stages.train.setup import Course
 
 SECONDS = 6.0
 """How long each figure is measured."""

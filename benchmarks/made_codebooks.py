@@ -6,10 +6,10 @@ What a step costs does not depend on which moves there are, so benchmarks need n
 import numpy as np
 
 from infgen.config import VocabSettings
-from infgen.tokens.arcs import line_arcs
-from infgen.tokens.codebook import BOX_LW_M, MotionCodebook, RoadCodebook
-from infgen.tokens.fan import fan
-from infgen.tokens.limits import limits_of
+from infgen.tokens.clustering.made_map_samples import line_arcs
+from infgen.tokens.clustering.made_motion_samples import fan
+from infgen.tokens.clustering.physical_limits import limits_of
+from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook, RoadCodebook
 
 FAN_SPACING_M, ARC_SPACING_M = (0.1, 0.025, 0.05), 0.05
 """By kind: fine enough to fill a codebook."""

@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from infgen.clock import CLOCK
 from infgen.metrics.interaction import nearest_object_m
-from infgen.metrics.reference import divergence_bits
+from infgen.metrics.long_term.reference import divergence_bits
 from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic
-from infgen.road_edges import RoadEdges
 from infgen.scene import AgentKind
+from infgen.spatial.road_edges import RoadEdges
 
 STEPS_PER_S = round(1 / CLOCK.step_s)
 SPEED_EDGES_MPS = np.arange(0.0, 26.0)

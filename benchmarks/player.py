@@ -23,9 +23,9 @@ import numpy as np
 from infgen.clock import CLOCK
 from infgen.scene import AgentKind
 from infgen.tokens.scene_tokens import SignalClass
-from infgen.views.drawn_map import DrawnMap, Lights, RoadLook
 from infgen.views.player import player_page
-from infgen.views.showing import Film, Role, Showing
+from infgen.views.scene.drawn_map import DrawnMap, Lights, RoadLook
+from infgen.views.scene.view_model import Film, Role, Showing
 
 AGENTS, ROAD_TOKENS, STEPS, NOW = 128, 2000, 311, 10
 TOKEN_M, STREET_M, REACH_M = 5.0, 500.0, 140.0

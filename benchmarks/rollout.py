@@ -41,15 +41,15 @@ from torch.utils.flop_counter import FlopCounterMode
 from infgen.clock import CLOCK
 from infgen.config import RolloutSettings, TokenSettings
 from infgen.model.network import Network
-from infgen.model.steps import Stepper
-from infgen.rollout.player import Player
+from infgen.model.stepping import Stepper
+from infgen.rollout.recording import Frame, Start
 from infgen.rollout.session import Session
-from infgen.rollout.trace import Frame, Start
+from infgen.rollout.simulator import Player
 from infgen.scene import Scene
-from infgen.tokens.codebook import MotionCodebook
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
-from pipeline.screen import show_table
+from infgen.tokens.vocabulary import MotionCodebook
+from pipeline.commands.screen import show_table
 
 LENGTH_S = 30.0
 SWEEP_S = 10.0

@@ -25,13 +25,11 @@ from futures import (
 from records import read_split
 
 from infgen.config import ReferenceSettings, TokenSettings
-from infgen.metrics import wosac
-from infgen.metrics.binned import Binned, bin_traffic
-from infgen.metrics.counts import mean_counts
+from infgen.metrics.agent_count import mean_counts
 from infgen.metrics.intervals import scene_mean
-from infgen.metrics.logged import FUTURE_STEPS
-from infgen.metrics.protocols import FEATURES, PROTOCOLS
-from infgen.metrics.reference import (
+from infgen.metrics.long_term.binned import Binned, bin_traffic
+from infgen.metrics.long_term.protocols import FEATURES, PROTOCOLS
+from infgen.metrics.long_term.reference import (
     Counts,
     count_log,
     count_simulated,
@@ -39,11 +37,13 @@ from infgen.metrics.reference import (
     log_probabilities,
     no_counts,
 )
-from infgen.metrics.table import Against, LogCounts, make_row, named
+from infgen.metrics.long_term.table import Against, LogCounts, make_row, named
+from infgen.metrics.long_term.windows import Windows, cut_windows
 from infgen.metrics.traffic import Traffic, from_log
-from infgen.metrics.windows import Windows, cut_windows
-from infgen.road_edges import edges_of
+from infgen.metrics.wosac import metric
+from infgen.metrics.wosac.logged import FUTURE_STEPS
 from infgen.scene import Scene
+from infgen.spatial.road_edges import edges_of
 
 LONG_STEPS = 300
 VERSIONS = ("wosac-2025", "wosac-2024")
@@ -131,19 +131,19 @@ def _mean(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 def score_wosac(
     scenes: Sequence[Scene], rollouts: int
-) -> dict[str, dict[str, wosac.Scores]]:
+) -> dict[str, dict[str, metric.Scores]]:
     """Mean official scores by player and version."""
-    found: dict[str, dict[str, list[wosac.Scores]]] = {}
+    found: dict[str, dict[str, list[metric.Scores]]] = {}
     for at, scene in enumerate(scenes):
         try:
-            log = wosac.from_scene(scene)
+            log = metric.from_scene(scene)
             futures = {
                 "log": logged_future(log, rollouts),
                 "log + noise": noisy_future(log, rollouts, seed=at),
                 "kept velocity": constant_velocity(log, rollouts),
             }
             scores = {
-                name: wosac.score_versions(log, future, VERSIONS)
+                name: metric.score_versions(log, future, VERSIONS)
                 for name, future in futures.items()
             }
         except ValueError as error:
@@ -153,7 +153,7 @@ def score_wosac(
             for one in of_scene:
                 found.setdefault(name, {}).setdefault(one.version, []).append(one)
     return {
-        name: {version: wosac.mean_scores(all_) for version, all_ in of_player.items()}
+        name: {version: metric.mean_scores(all_) for version, all_ in of_player.items()}
         for name, of_player in found.items()
     }
 

@@ -22,16 +22,16 @@ from futures import kept_velocity, noisy_future
 from records import read_split
 
 from infgen.config import ReferenceSettings, TokenSettings
-from infgen.metrics import wosac
-from infgen.metrics.binned import Binned, bin_traffic
 from infgen.metrics.interaction import nearest_object_m, time_to_collision_s
 from infgen.metrics.kinematics import measure_kinematics
-from infgen.metrics.logged import HISTORY_STEPS, LOG_STEPS, LogError, LoggedScene
+from infgen.metrics.long_term.binned import Binned, bin_traffic
 from infgen.metrics.road import road_edge_m
-from infgen.metrics.rollouts import Rollouts, played
-from infgen.metrics.signals import build_stop_lines, runs_red_light
 from infgen.metrics.traffic import Traffic, from_log
-from infgen.road_edges import RoadEdges, build_edges, edges_of
+from infgen.metrics.wosac import metric
+from infgen.metrics.wosac.logged import HISTORY_STEPS, LOG_STEPS, LogError, LoggedScene
+from infgen.metrics.wosac.rollouts import Rollouts, played
+from infgen.metrics.wosac.signals import build_stop_lines, runs_red_light
+from infgen.spatial.road_edges import RoadEdges, build_edges, edges_of
 
 ROLLOUTS = 32
 LONG_STEPS = 300
@@ -51,8 +51,8 @@ def read_logs(limit: int) -> list[LoggedScene]:
     found = []
     for scene in islice(read_split("validation"), limit or None):
         try:
-            log = wosac.from_scene(scene)
-            wosac.score(log, noisy_future(log, 1, seed=0))
+            log = metric.from_scene(scene)
+            metric.score(log, noisy_future(log, 1, seed=0))
         except (LogError, ValueError):
             continue
         found.append(log)
@@ -64,7 +64,7 @@ def time_scenes(logs: Sequence[LoggedScene]) -> np.ndarray:
     seconds = []
     for at, log in enumerate(logs):
         future = noisy_future(log, ROLLOUTS, seed=at)
-        seconds.append(cpu_s(lambda log=log, future=future: wosac.score(log, future)))  # type: ignore[misc]
+        seconds.append(cpu_s(lambda log=log, future=future: metric.score(log, future)))  # type: ignore[misc]
     return np.array(seconds)
 
 
@@ -82,7 +82,7 @@ def time_features(log: LoggedScene, future: Rollouts) -> dict[str, float]:
         "time to collision": cpu_s(lambda: time_to_collision_s(motion, objects, FUTURE)),
         "road edge": cpu_s(lambda: road_edge_m(motion, objects, FUTURE, edges)),
         "red light": cpu_s(lambda: runs_red_light(motion, objects, lines)),
-        "all": cpu_s(lambda: wosac.score(log, future)),
+        "all": cpu_s(lambda: metric.score(log, future)),
     }
 
 
@@ -106,7 +106,7 @@ def time_counts(log: LoggedScene) -> dict[int, float]:
     for count in COUNTS:
         axes = ("x_m", "y_m", "z_m", "heading_rad")
         future = replace(most, **{axis: getattr(most, axis)[:count] for axis in axes})
-        seconds[count] = cpu_s(lambda future=future: wosac.score(log, future))  # type: ignore[misc]
+        seconds[count] = cpu_s(lambda future=future: metric.score(log, future))  # type: ignore[misc]
     return seconds
 
 

@@ -20,17 +20,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 from infgen.tokens.tokenizer import tokenize_scene
-from pipeline.events import Events
-from pipeline.ingest import read_scenes
-from pipeline.inputs import FinishedInputs
-from pipeline.plan import Planned
-from pipeline.request import Request
-from pipeline.root import Root
-from pipeline.runner import Orders, run
-from pipeline.settings import DEFAULT_FILE
-from pipeline.sources import BUILTIN
-from pipeline.stage import Inputs, Unit
-from pipeline.vocabulary import load_codebooks
+from pipeline.engine.events import Events
+from pipeline.engine.inputs import FinishedInputs
+from pipeline.engine.layout import Root
+from pipeline.engine.plan import Planned
+from pipeline.engine.runner import Orders, run
+from pipeline.engine.stage import Inputs, Unit
+from pipeline.settings.request import Request
+from pipeline.settings.stages_file import DEFAULT_FILE
+from pipeline.stages.ingest import read_scenes
+from pipeline.stages.vocabulary import load_codebooks
+from pipeline.storage.source_files import BUILTIN
 
 SHARED = Path(__file__).parents[1] / "../shared/data/womd"
 DEFAULT_RECORDS = ("training.*-0000[0-2]-of-*", "validation.*-00000-of-*")

@@ -21,12 +21,12 @@ from records import BUILT_IN, SHARED
 
 from infgen.scene import Scene
 from infgen.sources.womd import iter_scenes
-from infgen.views.agent_marks import Crowd
-from infgen.views.encoding import write_png
-from infgen.views.looks import THEMES, Theme
-from infgen.views.painter import Canvas
-from infgen.views.scenery import all_marks, view_of
-from infgen.views.showing import make_film
+from infgen.views.scene.agent_marks import Crowd
+from infgen.views.scene.style import THEMES, Theme
+from infgen.views.scene.view import all_marks, view_of
+from infgen.views.scene.view_model import make_film
+from infgen.views.video.encoding import write_png
+from infgen.views.video.painter import Canvas
 
 SIDE_PX, GAP_PX = 300, 6
 

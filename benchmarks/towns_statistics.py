@@ -19,14 +19,14 @@ from records import BUILT_IN, SHARED
 from infgen.clock import CLOCK
 from infgen.config import TokenSettings
 from infgen.metrics.kinematics import measure_kinematics, speed_valid
-from infgen.metrics.placement import count_per_token
+from infgen.metrics.long_term.placement import count_per_token
 from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic, from_log
-from infgen.road_edges import edges_of
 from infgen.scene import AgentKind, FeatureKind, LaneType, Scene
 from infgen.sources.womd import iter_scenes
-from infgen.tokens.patterns import encode_patterns
-from infgen.tokens.roads import road_pieces
+from infgen.spatial.road_edges import edges_of
+from infgen.tokens.map import road_pieces
+from infgen.tokens.validity_patterns import encode_patterns
 
 NEAR_M = 75.0
 STILL_M = 1.0

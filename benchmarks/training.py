@@ -40,14 +40,14 @@ from measuring import (
 from torch.utils.flop_counter import FlopCounterMode
 
 from infgen.config import TokenSettings, TrainSettings
-from infgen.model.batch import Batch, Limits, collate, to_device
+from infgen.model.batching.batch import Batch, Limits, collate, to_device
 from infgen.model.network import Network
 from infgen.tokens.tokenizer import tokenize_scene
-from pipeline.checkpoint import Training
-from pipeline.course import repeatable
-from pipeline.descent import Descent
-from pipeline.distributed import Team
-from pipeline.screen import show_table
+from pipeline.commands.screen import show_table
+from pipeline.stages.train.optimizer_step import Descent
+from pipeline.stages.train.process_group import Team
+from pipeline.stages.train.setup import repeatable
+from pipeline.storage.checkpoint import Training
 
 FEW_NEIGHBOURS = 5
 """Map tokens per agent that the public reference sees."""

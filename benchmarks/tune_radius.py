@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from infgen.config import ReferenceSettings, build
-from infgen.metrics.protocols import PROTOCOLS
-from infgen.metrics.tune_radius import best_radius_m, placement_by_radius
-from pipeline.logs import unit_folders
-from pipeline.manifest import read_manifest
-from pipeline.reference_files import read_against
-from pipeline.rollout import read_rollouts
+from infgen.metrics.long_term.protocols import PROTOCOLS
+from infgen.metrics.long_term.tune_radius import best_radius_m, placement_by_radius
+from pipeline.engine.manifest import read_manifest
+from pipeline.stages.reference_files import read_against
+from pipeline.stages.rollout import read_rollouts
+from pipeline.storage.scene_lookup import unit_folders
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -24,16 +24,16 @@ from infgen.clock import CLOCK
 from infgen.config import RolloutSettings
 from infgen.geometry import to_local
 from infgen.model.network import Network
-from infgen.model.steps import Stepper
-from infgen.rollout.player import Player
+from infgen.model.stepping import Stepper
 from infgen.rollout.population import EGO_ROW, Population
+from infgen.rollout.recording import Start
 from infgen.rollout.session import Session
-from infgen.rollout.trace import Start
+from infgen.rollout.simulator import Player
 from infgen.scene import FeatureKind, Scene
 from infgen.tokens.scene_tokens import Presence
 from infgen.tokens.tokenizer import tokenize_scene
-from pipeline.ingest import read_scenes
-from pipeline.weights import load_network
+from pipeline.stages.ingest import read_scenes
+from pipeline.storage.weights import load_network
 
 FRESH = RolloutSettings(add_bias=-1.5, leave_bias=-4.0)
 """What has learned nothing says yes and no alike: too many would come and go."""

@@ -7,9 +7,9 @@ from infgen.clock import CLOCK
 from infgen.config import ModelSettings, TokenSettings, VocabSettings
 from infgen.model.network import Network
 from infgen.scene import AgentKind, FeatureKind, LaneType, RoadMap, Scene, Signals, Tracks
-from infgen.tokens.codebook import BOX_LW_M, MotionCodebook, RoadCodebook
-from infgen.tokens.fan import fan
-from infgen.tokens.limits import limits_of
+from infgen.tokens.clustering.made_motion_samples import fan
+from infgen.tokens.clustering.physical_limits import limits_of
+from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook, RoadCodebook
 
 SMALL = ModelSettings(width=32, heads=4, map_blocks=1, motion_blocks=1, scene_blocks=1)
 STREET_M = 600.0

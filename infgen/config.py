@@ -12,12 +12,12 @@ from infgen.coerce import build as build
 from infgen.coerce import check_numbers, free
 from infgen.coerce import decisive as decisive
 from infgen.coerce import settle as settle
-from infgen.config_calibrate import CalibrateSettings as CalibrateSettings
-from infgen.config_rollout import RolloutSettings as RolloutSettings
-from infgen.config_score import ReferenceSettings as ReferenceSettings
-from infgen.config_score import ReportSettings as ReportSettings
-from infgen.config_score import ScoreSettings as ScoreSettings
-from infgen.config_vocab import VocabSettings as VocabSettings
+from infgen.metrics.settings import ReferenceSettings as ReferenceSettings
+from infgen.metrics.settings import ReportSettings as ReportSettings
+from infgen.metrics.settings import ScoreSettings as ScoreSettings
+from infgen.rollout.calibration_settings import CalibrateSettings as CalibrateSettings
+from infgen.rollout.settings import RolloutSettings as RolloutSettings
+from infgen.tokens.clustering.settings import VocabSettings as VocabSettings
 
 
 @dataclass(frozen=True, slots=True)

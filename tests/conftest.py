@@ -17,7 +17,7 @@ from infgen.scene import (
     SignalState,
     Tracks,
 )
-from infgen.tokens.codebook import BOX_LW_M, MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook, RoadCodebook
 
 settings.register_profile("infgen", deadline=None)
 settings.load_profile("infgen")  # How long an example takes is a matter of the machine.

@@ -13,7 +13,7 @@ import pytest
 
 from cli import main
 from infgen.sources.towns import builtin_records
-from pipeline.settings import DEFAULT_FILE
+from pipeline.settings.stages_file import DEFAULT_FILE
 
 HERE = Path(__file__).parent
 TOYS = HERE / "pipeline" / "toys"

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from infgen import __version__
-from pipeline.settings import DEFAULT_FILE, load_stages
-from pipeline.stages import MODULES, load_stage
+from pipeline.engine.registry import MODULES, load_stage
+from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
 from tests.test_cli import RUN, VERBS, infgen, toys  # noqa: F401
 
 OF_A_ROOT = (("gc", "--yes"), ("verify",), ("show", "total"), ("diff", "total", "count"))

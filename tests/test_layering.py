@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.stages import MODULES
+from pipeline.engine.registry import MODULES
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted(
@@ -13,18 +13,18 @@ FILES = sorted(
 )
 INFGEN = ROOT / "infgen"
 DOORS = {
-    "zarr": {"pipeline/store.py"},
+    "zarr": {"pipeline/storage/zarr_store.py"},
     "numcodecs": set(),
-    "dask": {"pipeline/cluster.py"},
-    "distributed": {"pipeline/cluster.py"},
-    "rich": {"pipeline/screen.py"},
+    "dask": {"pipeline/workers/dask_cluster.py"},
+    "distributed": {"pipeline/workers/dask_cluster.py"},
+    "rich": {"pipeline/commands/screen.py"},
     "typer": {
         "cli.py",
-        "pipeline/options.py",
-        "pipeline/tools.py",
-        "pipeline/verbs.py",
+        "pipeline/commands/options.py",
+        "pipeline/commands/tools.py",
+        "pipeline/commands/verbs.py",
     },
-    "yaml": {"pipeline/lined_yaml.py"},
+    "yaml": {"pipeline/settings/lined_yaml.py"},
     "cli": {"infgen/__main__.py"},
     "pickle": set(),
     "joblib": set(),

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cli import main
-from pipeline.settings import DEFAULT_FILE
+from pipeline.settings.stages_file import DEFAULT_FILE
 
 PRESETS = """
   pair:

@@ -17,8 +17,8 @@ from typing import Any, get_type_hints
 import typer
 
 import cli
-from pipeline.described import documented, one_line, sections
-from pipeline.settings import DEFAULT_FILE, load_stages
+from pipeline.settings.described import documented, one_line, sections
+from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
 
 _DIRECTIVE = re.compile(r"^<!-- (commands|settings|fields: \S+) -->$", re.MULTILINE)
 

@@ -1,6 +1,6 @@
 """Submissions to the Waymo Open Sim Agents Challenge, written without protobuf.
 
-Inverse of ``infgen.metrics.submission``. What Waymo's own check asks of a scene: exactly 32
+Inverse of ``infgen.metrics.wosac.submission``. What Waymo's own check asks of a scene: exactly 32
 rollouts, in each of them every track that the log shows at now (whatever its kind) and
 nobody else, each with 80 steps.
 
@@ -20,9 +20,9 @@ from jaxtyping import Float32, Int64
 
 from infgen.clock import CLOCK
 from infgen.config import ConfigError
-from infgen.metrics.logged import FUTURE_STEPS
-from infgen.metrics.rollouts import Rollouts, RolloutsError, from_rollouts, list_ids
-from infgen.metrics.submission import NUM_ROLLOUTS
+from infgen.metrics.wosac.logged import FUTURE_STEPS
+from infgen.metrics.wosac.rollouts import Rollouts, RolloutsError, from_rollouts, list_ids
+from infgen.metrics.wosac.submission import NUM_ROLLOUTS
 from infgen.rollout.rollout import Rollout
 from infgen.scene import AgentKind, Scene
 from infgen.sources.wire import BYTES, VARINT

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from infgen.metrics.motion import Motion
-from infgen.road_edges import RoadEdges, signed_distance_m
+from infgen.spatial.road_edges import RoadEdges, signed_distance_m
 
 NO_ROAD_M = np.float32(-1e10)
 """Distance of a box that is not there."""

@@ -7,10 +7,10 @@ from jaxtyping import Bool
 
 from infgen.clock import CLOCK
 from infgen.config import TokenSettings
+from infgen.metrics.long_term.placement import Events, logged_events, simulated_events
 from infgen.metrics.motion import Motion
-from infgen.metrics.placement import Events, logged_events, simulated_events
-from infgen.rollout.kerbs import Lanes, lanes_distance_m
 from infgen.rollout.rollout import Rollout
+from infgen.rollout.rules.off_road import Lanes, lanes_distance_m
 from infgen.scene import AgentKind, Scene
 
 

@@ -19,16 +19,16 @@ from infgen.model.layers import (
     mlp,
     normed,
 )
-from infgen.model.moves import MoveHead
-from infgen.model.outputs import MotionOutputs
-from infgen.model.pairs import Shared
+from infgen.model.logits import MotionOutputs
+from infgen.model.motion_head import MoveHead
+from infgen.model.neighbour_attention import Shared
+from infgen.model.neighbours import Around, Reach, RoadFeatures
 from infgen.model.relations import Rows, direction, relation_embedding
-from infgen.model.sight import Around, Reach, RoadFeatures
-from infgen.model.stop_lines import LightAhead
+from infgen.model.signal_features import LightAhead
 from infgen.scene import AgentKind
-from infgen.tokens.codebook import MotionCodebook
 from infgen.tokens.grid import Grid
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
+from infgen.tokens.vocabulary import MotionCodebook
 
 NUM_PATTERNS = 1 << CLOCK.steps_per_token
 KINDS = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST)

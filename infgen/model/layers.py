@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from infgen.model.pairs import Shared, look_at_pairs
+from infgen.model.neighbour_attention import Shared, look_at_pairs
 
 FEED_FORWARD = 4
 """The feed-forward part is so many times as wide as the features."""

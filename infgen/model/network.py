@@ -9,23 +9,23 @@ from torch.nn import functional
 from infgen.clock import CLOCK
 from infgen.config import ModelSettings, TokenSettings
 from infgen.model.agents import AgentEmbedding, AgentRows, MotionStack, Sight
-from infgen.model.batch import Agents, Batch
-from infgen.model.entries import CellStack, DetailStack
-from infgen.model.ground import Lying
+from infgen.model.batching.batch import Agents, Batch
+from infgen.model.cell_features import Lying
+from infgen.model.insertion import CellStack, DetailStack
 from infgen.model.layers import initialise, normed
-from infgen.model.outputs import (
+from infgen.model.logits import (
     DetailOutputs,
     EntryOutputs,
     MotionOutputs,
     Outputs,
     RoadOutputs,
 )
-from infgen.model.pairs import Shared
+from infgen.model.map import RoadEncoder
+from infgen.model.neighbour_attention import Shared
+from infgen.model.neighbours import RoadFeatures, cell_pose, look_around, see_roads
 from infgen.model.relations import Rows, relations
-from infgen.model.roads import RoadEncoder
-from infgen.model.sight import RoadFeatures, cell_pose, look_around, see_roads
-from infgen.tokens.codebook import MotionCodebook, RoadCodebook
 from infgen.tokens.grid import Grid, make_grid
+from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
 
 EGO = 0
 """Row of the ego, in batches as in simulation."""

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 from torch.nn import functional
 
-from infgen.model.tables import RelationEmbedding, Span
+from infgen.model.relation_tables import RelationEmbedding, Span
 
 BLOCK_PAIRS = 1 << 17
 """Distances held at once while neighbours are searched."""

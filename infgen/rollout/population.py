@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int16, Int32, Int64
 
 from infgen.geometry import to_world, wrap_angle
-from infgen.rollout.trace import NOBODY, Start
-from infgen.tokens.codebook import MotionCodebook
+from infgen.rollout.recording import NOBODY, Start
 from infgen.tokens.grid import Grid, encode_cell, from_grid, to_grid
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
+from infgen.tokens.vocabulary import MotionCodebook
 
 EGO_ROW = 0
 

@@ -21,16 +21,13 @@ from torch import Tensor
 
 from infgen.clock import CLOCK
 from infgen.geometry import wrap_angle
-from infgen.model.batch import Roads, collate_roads
-from infgen.model.columns import MotionStep
+from infgen.model.batching.batch import Roads, collate_roads
 from infgen.model.relations import Rows
-from infgen.model.steps import Memory
-from infgen.model.stop_lines import StopLines
-from infgen.rollout.fullness import Fullness
-from infgen.rollout.lookout import look_out
-from infgen.rollout.newcomers import Asking, add_newcomers
-from infgen.rollout.patience import Patience
-from infgen.rollout.player import Player
+from infgen.model.signal_features import StopLines
+from infgen.model.stepping import Memory
+from infgen.model.token_step import MotionStep
+from infgen.rollout.insertion import Asking, add_newcomers
+from infgen.rollout.insertion_mask import make_room
 from infgen.rollout.population import (
     EGO_ROW,
     Population,
@@ -38,11 +35,14 @@ from infgen.rollout.population import (
     move_on,
     settle,
 )
-from infgen.rollout.room import make_room
+from infgen.rollout.random_streams import Purpose, Stream
+from infgen.rollout.recording import NOBODY, Frame, Start, number_maps
+from infgen.rollout.rules.density import Fullness
+from infgen.rollout.rules.rejection import look_out
+from infgen.rollout.rules.stalls import Patience
 from infgen.rollout.sampling import choose, happens
-from infgen.rollout.streams import Purpose, Stream
-from infgen.rollout.trace import NOBODY, Frame, Start, number_maps
-from infgen.tokens.moves import follow, make_move_table
+from infgen.rollout.simulator import Player
+from infgen.tokens.motion_tokens import follow, make_move_table
 from infgen.tokens.scene_tokens import Presence
 
 

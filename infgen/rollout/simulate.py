@@ -3,9 +3,9 @@
 from collections.abc import Iterator, Sequence
 
 from infgen.clock import CLOCK
-from infgen.rollout.player import Player
+from infgen.rollout.recording import Frame, Start
 from infgen.rollout.session import Session
-from infgen.rollout.trace import Frame, Start
+from infgen.rollout.simulator import Player
 
 
 def simulate(player: Player, starts: Sequence[Start]) -> Iterator[Frame]:

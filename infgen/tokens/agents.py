@@ -15,19 +15,19 @@ from jaxtyping import Bool, Float32, Int8, Int16
 
 from infgen.clock import CLOCK, Clock
 from infgen.geometry import to_world
-from infgen.tokens.codebook import MotionCodebook
-from infgen.tokens.entries import (
+from infgen.tokens.grid import Grid, encode_cell, to_grid
+from infgen.tokens.insertion import (
     Entries,
     decode_entries,
     encode_entries,
     entry_order,
     join_entries,
 )
-from infgen.tokens.grid import Grid, encode_cell, to_grid
-from infgen.tokens.moves import MoveTable, advance, nearest_moves
+from infgen.tokens.motion_tokens import MoveTable, advance, nearest_moves
 from infgen.tokens.presence import live, observe, resumes, seen_tokens
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence, SceneTokens
 from infgen.tokens.tracks import Paths
+from infgen.tokens.vocabulary import MotionCodebook
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,10 +14,10 @@ import numpy as np
 
 from infgen.config import TokenSettings
 from infgen.tokens.agents import AgentMatrix, Anchors, replay
-from infgen.tokens.codebook import MotionCodebook
-from infgen.tokens.entries import Entries
 from infgen.tokens.grid import make_grid
+from infgen.tokens.insertion import Entries
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_MOVE, Presence, SceneTokens, Word
+from infgen.tokens.vocabulary import MotionCodebook
 
 _NOBODY = -1
 _MOVES, _CONTROLS, _ENTRIES, _END = range(4)

@@ -14,7 +14,7 @@ from infgen.clock import CLOCK, Clock
 from infgen.config import TokenSettings
 from infgen.geometry import wrap_angle
 from infgen.scene import AgentKind, Scene, Tracks
-from infgen.tokens.patterns import encode_patterns
+from infgen.tokens.validity_patterns import encode_patterns
 
 MAX_TURN_RAD = 1.5
 """No agent turns farther in one step; a heading that does is an error of the log."""

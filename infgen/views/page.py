@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from html import escape
 
-from infgen.views.axes import NUM_COLOURS
+from infgen.views.charts.axes import NUM_COLOURS
 
 _COLOURS = """
 :root { --paper: #fff; --ink: #1c1c1c; --faint: #d8d8d8; --quiet: #606060; --road: #9a9a9a;

@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from infgen.sources.towns import builtin_records
-from pipeline.locks import locked
-from pipeline.settings import DEFAULT_FILE
+from pipeline.engine.locks import locked
+from pipeline.settings.stages_file import DEFAULT_FILE
 from tests.docs.pages import REPOSITORY, Block, commands
 
 FIRST = 'infgen run report --root work --records "$WOMD/*.tfrecord*" --profile small'

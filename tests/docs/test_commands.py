@@ -9,8 +9,8 @@ import pytest
 import typer
 
 import cli
-from pipeline.settings import DEFAULT_FILE, load_stages
-from pipeline.stages import MODULES
+from pipeline.engine.registry import MODULES
+from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
 from tests.docs.pages import PAGES, REPOSITORY, RUN, blocks, lines
 
 ALL = [block for page in PAGES for block in blocks(page)]

@@ -12,8 +12,8 @@ import typer
 
 import cli
 from infgen.scene import Tracks
-from pipeline.settings import DEFAULT_FILE, load_stages
-from pipeline.stages import load_stage
+from pipeline.engine.registry import load_stage
+from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
 from tests.docs.pages import REPOSITORY
 
 LOADED = re.compile(r"<(?:script|link|img|iframe)[^>]*(?:src|href)=\"?(https?:|//)[^>]*>")

@@ -8,9 +8,9 @@ import pytest
 
 from infgen.config import RolloutSettings
 from infgen.scene import Scene
-from pipeline.ingest import SCHEMA
-from pipeline.store import write_records
-from pipeline.weights import save_network, state_of
+from pipeline.stages.ingest import SCHEMA
+from pipeline.storage.weights import save_network, state_of
+from pipeline.storage.zarr_store import write_records
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 ALONE = RolloutSettings(insert=False, remove=False, max_agents=8)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from infgen.config import ConfigError
 from infgen.exports.wosac import About, complete, encode_about, encode_futures, in_words
-from infgen.metrics.rollouts import Rollouts, RolloutsError
-from infgen.metrics.submission import read_submission
+from infgen.metrics.wosac.rollouts import Rollouts, RolloutsError
+from infgen.metrics.wosac.submission import read_submission
 from infgen.scene import AgentKind
 from tests.exports.replays import replay, with_newcomer, without
 from tests.exports.submission_proto import Submission

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from infgen.metrics.likelihood import Bernoulli, Histogram
-from infgen.metrics.logged import LoggedScene
-from infgen.metrics.rollouts import Rollouts
-from infgen.metrics.wosac_versions import INTERACTIVE, KINEMATIC, MAP_BASED, Rule, Version
+from infgen.metrics.wosac.logged import LoggedScene
+from infgen.metrics.wosac.rollouts import Rollouts
+from infgen.metrics.wosac.versions import INTERACTIVE, KINEMATIC, MAP_BASED, Rule, Version
 
 GOLDEN = Path(__file__).parents[3] / "shared" / "golden" / "wosac"
 SETS = sorted(

@@ -2,7 +2,7 @@ import numpy as np
 
 from infgen.metrics.road import NO_ROAD_M, road_edge_m
 from tests.metrics.moving import boxes
-from tests.test_road_edges import EAST
+from tests.spatial.test_road_edges import EAST
 
 STEPS = slice(0, 11)
 FIRST = np.array([0])

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from infgen.config import TokenSettings
+from infgen.metrics.flow import count_turnover
 from infgen.metrics.traffic import OFF_MAP_M, from_log, on_map
-from infgen.metrics.turnover import count_turnover
-from infgen.rollout.kerbs import lane_pieces
+from infgen.rollout.rules.off_road import lane_pieces
 from tests.conftest import straight_road
 
 LANE_M = 40.0

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from infgen.metrics import wosac
-from infgen.metrics.features import Features
 from infgen.metrics.likelihood import Histogram
-from infgen.metrics.wosac import combine, happens, log_likelihoods, measure_both
-from infgen.metrics.wosac_versions import VERSIONS
+from infgen.metrics.wosac import metric
+from infgen.metrics.wosac.features import Features
+from infgen.metrics.wosac.metric import combine, happens, log_likelihoods, measure_both
+from infgen.metrics.wosac.versions import VERSIONS
 from infgen.sources.womd import iter_scenes
 from tests.metrics.golden import (
     GOLDEN,
@@ -147,9 +147,9 @@ def test_every_score_is_the_official_one_from_features_to_metametric(
 @pytest.mark.parametrize("name", SETS)
 def test_scores_from_the_raw_record_are_the_official_ones(name):
     scene = next(iter_scenes(GOLDEN / name.split("/")[0] / "scenario.tfrecord"))
-    log = wosac.from_scene(scene)
+    log = metric.from_scene(scene)
 
-    scores = wosac.score_versions(log, golden_rollouts(name), tuple(SHIPPED))
+    scores = metric.score_versions(log, golden_rollouts(name), tuple(SHIPPED))
 
     for found in scores:
         official = golden_metrics(name)[SHIPPED[found.version]]

@@ -8,9 +8,8 @@ import torch
 
 from infgen.config import ModelSettings, TokenSettings
 from infgen.geometry import to_world
-from infgen.model.batch import Limits
+from infgen.model.batching.batch import Limits
 from infgen.model.network import Network
-from infgen.tokens.codebook import BOX_LW_M, MotionCodebook, RoadCodebook
 from infgen.tokens.grid import encode_cell, encode_heading, make_grid, to_grid
 from infgen.tokens.scene_tokens import (
     FIRST_MOVE,
@@ -20,6 +19,7 @@ from infgen.tokens.scene_tokens import (
     SceneTokens,
     SignalClass,
 )
+from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook, RoadCodebook
 
 NUM_MOVES, NUM_ROADS = 24, 12
 GRID = TokenSettings(grid_radius_m=60.0, grid_step_m=4.0, heading_step_deg=10.0)

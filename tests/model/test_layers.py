@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from infgen.model import pairs
+from infgen.model import neighbour_attention
 from infgen.model.layers import (
     Attention,
     FourierEmbedding,
@@ -17,7 +17,7 @@ from infgen.model.layers import (
     initialise,
     normed,
 )
-from infgen.model.pairs import Shared
+from infgen.model.neighbour_attention import Shared
 
 WIDTH, HEADS, SOURCES = 16, 2, 9
 
@@ -98,7 +98,7 @@ def test_targets_taken_a_few_at_a_time_give_what_all_at_once_give(monkeypatch):
         return found, *torch.autograd.grad(found.square().sum(), inputs, retain_graph=True)
 
     whole = run()
-    monkeypatch.setattr(pairs, "CACHED_NUMBERS", 2 * 7 * WIDTH)
+    monkeypatch.setattr(neighbour_attention, "CACHED_NUMBERS", 2 * 7 * WIDTH)
     parts = run()
 
     for part, other in zip(parts, whole, strict=True):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from infgen.config import ModelSettings, TokenSettings
-from infgen.model.batch import collate
+from infgen.model.batching.batch import collate
 from infgen.model.network import Network
 from infgen.tokens.scene_tokens import Presence
 

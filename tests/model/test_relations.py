@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from infgen.model.neighbours import Reach, cell_pose, look_around
 from infgen.model.relations import (
     Rows,
     across,
@@ -16,7 +17,6 @@ from infgen.model.relations import (
     relations,
     within_radius,
 )
-from infgen.model.sight import Reach, cell_pose, look_around
 
 
 def line(*x_m):

@@ -4,13 +4,13 @@ import numpy as np
 
 from infgen.config import ReferenceSettings, ScoreSettings
 from infgen.views.sheets import Measured
-from pipeline.overlay import Overlay
-from pipeline.preset import Arm, Preset
-from pipeline.preset_compared import Compared
-from pipeline.preset_legs import Leg
-from pipeline.preset_run import Ran
-from pipeline.preset_scores import Scored
-from pipeline.score_summary import Tally
+from pipeline.comparison.execution import Ran
+from pipeline.comparison.result import Compared
+from pipeline.comparison.runs import Leg
+from pipeline.comparison.scores import Scored
+from pipeline.settings.overlay import Overlay
+from pipeline.settings.presets import Arm, Preset
+from pipeline.stages.score_summary import Tally
 
 NOTHING = Overlay((), {})
 

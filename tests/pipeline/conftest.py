@@ -13,19 +13,19 @@ from infgen.config import ModelSettings, TokenSettings, TrainSettings
 from infgen.model.network import Network
 from infgen.sources.towns import builtin_records
 from infgen.sources.womd import iter_scenes
-from infgen.tokens.codebook import MotionCodebook, RoadCodebook
 from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
-from pipeline.course import Course
-from pipeline.events import Events
-from pipeline.loader import TokenScenes
-from pipeline.request import Request
-from pipeline.root import Root
-from pipeline.runner import Orders, Result, run
-from pipeline.stage import Unit
-from pipeline.store import write_records
-from pipeline.tokenize import SCHEMA
-from pipeline.weights import save_network, state_of
+from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from pipeline.engine.events import Events
+from pipeline.engine.layout import Root
+from pipeline.engine.runner import Orders, Result, run
+from pipeline.engine.stage import Unit
+from pipeline.settings.request import Request
+from pipeline.stages.tokenize import SCHEMA
+from pipeline.stages.train.loader import TokenScenes
+from pipeline.stages.train.setup import Course
+from pipeline.storage.weights import save_network, state_of
+from pipeline.storage.zarr_store import write_records
 from tests.pipeline.finished import TINY
 
 TOYS = Path(__file__).with_name("toys")

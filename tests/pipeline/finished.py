@@ -1,7 +1,7 @@
 """What stages before those that play leave on disk."""
 
 from infgen.config import ModelSettings
-from pipeline.calibration import Biases, write_found
+from pipeline.stages.calibration import Biases, write_found
 
 TINY = ModelSettings(
     width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4

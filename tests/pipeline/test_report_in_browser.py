@@ -7,7 +7,7 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from tests.pipeline.test_report import finished, write
+from tests.pipeline.stages.report.test_stage import finished, write
 
 playwright = pytest.importorskip(
     "playwright.sync_api", reason="playwright is not installed"

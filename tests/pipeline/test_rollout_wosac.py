@@ -5,17 +5,17 @@ import pytest
 import torch
 
 from infgen.config import IngestSettings, ModelSettings, RolloutSettings, TokenSettings
-from infgen.metrics.submission import read_submission
+from infgen.metrics.wosac.submission import read_submission
 from infgen.model.network import Network
 from infgen.sources.tfrecord import iter_records
 from infgen.sources.womd import decode_scene
-from pipeline import ingest
-from pipeline.export import Order, export
-from pipeline.logs import open_logs
-from pipeline.rollout import STAGE, read_rollouts
-from pipeline.stage import Unit
-from pipeline.weights import save_network, state_of
-from pipeline.wosac import score_files
+from pipeline.commands.export import Order, export
+from pipeline.commands.wosac import score_files
+from pipeline.engine.stage import Unit
+from pipeline.stages import ingest
+from pipeline.stages.rollout import STAGE, read_rollouts
+from pipeline.storage.scene_lookup import open_logs
+from pipeline.storage.weights import save_network, state_of
 from tests.exports.test_wosac import ABOUT
 from tests.metrics.golden import GOLDEN, needs_goldens
 

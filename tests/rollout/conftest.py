@@ -6,9 +6,9 @@ import torch
 
 from infgen.config import ModelSettings, RolloutSettings, TokenSettings
 from infgen.model.network import Network
-from infgen.model.steps import Stepper
-from infgen.rollout.player import Player
-from infgen.rollout.trace import Start
+from infgen.model.stepping import Stepper
+from infgen.rollout.recording import Start
+from infgen.rollout.simulator import Player
 from infgen.tokens.grid import make_grid
 from infgen.tokens.tokenizer import tokenize_scene
 

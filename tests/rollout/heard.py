@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from infgen.model.agents import KINDS
-from infgen.model.batch import Agents, Batch, Details, Entries, collate_roads
-from infgen.model.columns import Column, EntryDetails, EntryQuery, MotionStep
-from infgen.model.newcomers import OUTSIDE
-from infgen.model.outputs import DetailOutputs, EntryOutputs, MotionOutputs
-from infgen.model.steps import Stepper
+from infgen.model.batching.batch import Agents, Batch, Details, Entries, collate_roads
+from infgen.model.batching.insertion_targets import OUTSIDE
+from infgen.model.logits import DetailOutputs, EntryOutputs, MotionOutputs
+from infgen.model.stepping import Stepper
+from infgen.model.token_step import Column, EntryDetails, EntryQuery, MotionStep
 from infgen.rollout.population import settle
+from infgen.rollout.recording import NOBODY
 from infgen.rollout.session import Session
-from infgen.rollout.trace import NOBODY
 from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE, Presence
 
 QUERY_LOGITS = ("add_logit", "cell_logits", "place_m")

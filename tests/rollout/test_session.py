@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from infgen.rollout.clearance import find_hits
-from infgen.rollout.kerbs import Kerbs, find_departures
+from infgen.rollout.recording import collect
+from infgen.rollout.rules.collision import find_hits
+from infgen.rollout.rules.off_road import Kerbs, find_departures
 from infgen.rollout.session import Session
 from infgen.rollout.simulate import simulate
-from infgen.rollout.trace import collect
 from infgen.tokens.scene_tokens import Presence
 
 ALONE = {"insert": False, "remove": False, "max_agents": 6}

@@ -6,11 +6,11 @@ import torch
 
 from infgen.config import ModelSettings, RolloutSettings, TokenSettings
 from infgen.model.network import Network
-from infgen.model.steps import Stepper
-from infgen.rollout.player import Player
+from infgen.model.stepping import Stepper
+from infgen.rollout.recording import collect
 from infgen.rollout.rollout import NEVER
 from infgen.rollout.simulate import simulate
-from infgen.rollout.trace import collect
+from infgen.rollout.simulator import Player
 
 SMALL = ModelSettings(
     width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4

@@ -7,12 +7,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from infgen.geometry import boxes_overlap
-from infgen.metrics.radius import live_within
+from infgen.metrics.long_term.radius import live_within
 from infgen.rollout.population import EGO_ROW
+from infgen.rollout.recording import NOBODY, collect
 from infgen.rollout.rollout import NEVER
 from infgen.rollout.session import Session
 from infgen.rollout.simulate import simulate
-from infgen.rollout.trace import NOBODY, collect
 from infgen.scene import AgentKind
 from infgen.tokens.scene_tokens import Presence
 

@@ -14,7 +14,7 @@ from infgen.scene import (
 )
 from infgen.sources.towns import builtin_records
 from infgen.sources.towns.builtin import BUILTIN, BUILTIN_SEED, NUM_STEPS, builtin_numbers
-from infgen.sources.towns.drawing import draw_scenes
+from infgen.sources.towns.numbering import draw_scenes
 from infgen.sources.womd import iter_scenes
 from infgen.sources.womd_write import encode_scenario
 from tests.sources.test_womd_write import assert_same

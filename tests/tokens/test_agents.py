@@ -7,7 +7,7 @@ from infgen.config import TokenSettings
 from infgen.scene import AgentKind
 from infgen.tokens.agents import decode_tracks, match_agents
 from infgen.tokens.grid import make_grid
-from infgen.tokens.moves import make_move_table
+from infgen.tokens.motion_tokens import make_move_table
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
 from infgen.tokens.tracks import read_paths
 

@@ -6,7 +6,7 @@ import pytest
 from benchmarks.player import busy_film as made_busy_film
 from infgen.sources.towns import builtin_records
 from infgen.sources.womd import iter_scenes
-from infgen.views.showing import Film, make_film
+from infgen.views.scene.view_model import Film, make_film
 from tests.exports.replays import replay, with_newcomer
 
 

@@ -2,7 +2,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from infgen.views.axes import drawing
+from infgen.views.charts.axes import drawing
 from infgen.views.page import STYLE, page, sheet
 
 SVG = "{http://www.w3.org/2000/svg}"

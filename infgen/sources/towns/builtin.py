@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from infgen.sources.towns.drawing import SCENES_PER_TOWN, draw_scenes
+from infgen.sources.towns.numbering import SCENES_PER_TOWN, draw_scenes
 from infgen.sources.womd_write import encode_scenario, write_tfrecord
 
 BUILTIN_SEED = 2

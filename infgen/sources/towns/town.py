@@ -10,26 +10,26 @@ from jaxtyping import Bool, Float64, Int64
 
 from infgen.clock import CLOCK
 from infgen.scene import RoadMap
-from infgen.sources.towns.bodies import Body
-from infgen.sources.towns.boxes import clear_way
-from infgen.sources.towns.demand import Trip, draw_level, draw_trips, write_routes
-from infgen.sources.towns.kerbs import draw_kerbs
-from infgen.sources.towns.layouts import draw_layout
-from infgen.sources.towns.markings import (
+from infgen.sources.towns.streets.boxes import clear_way
+from infgen.sources.towns.streets.layouts import draw_layout
+from infgen.sources.towns.streets.markings import (
     draw_bumps,
     draw_crosswalks,
     draw_lines,
     draw_signs,
 )
-from infgen.sources.towns.motion import Bodies, follow
-from infgen.sources.towns.network import Network, read_network
-from infgen.sources.towns.plain import build_net
-from infgen.sources.towns.plots import draw_plenty
-from infgen.sources.towns.roads import Furniture, draw_map
-from infgen.sources.towns.simulation import play
-from infgen.sources.towns.skeletons import draw_skeleton
-from infgen.sources.towns.streets import Street
-from infgen.sources.towns.surroundings import Surroundings, surround
+from infgen.sources.towns.streets.network import Network, read_network
+from infgen.sources.towns.streets.plain_xml import build_net
+from infgen.sources.towns.streets.plots import draw_plenty
+from infgen.sources.towns.streets.road_edges import draw_kerbs
+from infgen.sources.towns.streets.road_map import Furniture, draw_map
+from infgen.sources.towns.streets.street_types import Street
+from infgen.sources.towns.streets.surroundings import Surroundings, surround
+from infgen.sources.towns.streets.topology import draw_skeleton
+from infgen.sources.towns.traffic.demand import Trip, draw_level, draw_trips, write_routes
+from infgen.sources.towns.traffic.motion import Bodies, follow
+from infgen.sources.towns.traffic.road_users import Body
+from infgen.sources.towns.traffic.simulation import play
 
 WARM_UP_S = 35.0
 """Traffic runs so long before anyone records it; in wide towns as many times longer as they

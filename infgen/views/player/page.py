@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from html import escape
 from importlib.resources import files
 
-from infgen.views.looks import DARK, LIGHT, for_scripts
 from infgen.views.player.payload import pack
-from infgen.views.showing import Film
+from infgen.views.scene.style import DARK, LIGHT, for_scripts
+from infgen.views.scene.view_model import Film
 
 MODULES = (
     "looks",

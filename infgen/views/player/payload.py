@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from infgen.clock import CLOCK
-from infgen.views.drawn_map import DrawnMap, Lights
 from infgen.views.player.columns import PayloadError, pack_columns, unpack_columns
 from infgen.views.player.motion import PER_M, PER_RAD, Runs, from_runs, to_runs
-from infgen.views.showing import Film, Showing
+from infgen.views.scene.drawn_map import DrawnMap, Lights
+from infgen.views.scene.view_model import Film, Showing
 
 VERSION = 1
 

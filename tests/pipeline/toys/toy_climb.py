@@ -4,9 +4,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.folders import write_file
-from pipeline.stage import Stage, Unit
-from pipeline.stopping import Stopped
+from pipeline.engine.atomic import write_file
+from pipeline.engine.signals import Stopped
+from pipeline.engine.stage import Stage, Unit
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.folders import write_json
-from pipeline.stage import Stage, Unit
+from pipeline.engine.atomic import write_json
+from pipeline.engine.stage import Stage, Unit
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from pipeline.folders import write_json
-from pipeline.root import read_json
-from pipeline.stage import Stage, Unit
+from pipeline.engine.atomic import write_json
+from pipeline.engine.layout import read_json
+from pipeline.engine.stage import Stage, Unit
 
 
 @dataclass(frozen=True, slots=True)

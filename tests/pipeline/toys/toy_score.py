@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from pipeline.root import read_json
-from pipeline.stage import Stage
+from pipeline.engine.layout import read_json
+from pipeline.engine.stage import Stage
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,8 +3,8 @@
 import json
 from dataclasses import dataclass
 
-from pipeline.folders import write_json
-from pipeline.stage import Stage, Unit
+from pipeline.engine.atomic import write_json
+from pipeline.engine.stage import Stage, Unit
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from infgen.config import ConfigError
-from pipeline.folders import write_json
-from pipeline.root import Root, read_json
-from pipeline.stage import Source, Stage, Unit
+from pipeline.engine.atomic import write_json
+from pipeline.engine.layout import Root, read_json
+from pipeline.engine.stage import Source, Stage, Unit
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from infgen.sources.towns.network import read_network
+from infgen.sources.towns.streets.network import read_network
 
 needs_sumo = pytest.mark.skipif(find_spec("sumo") is None, reason="needs the extra towns")
 

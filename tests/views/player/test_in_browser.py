@@ -6,9 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
-from infgen.views.moments import moment_at
 from infgen.views.player import player_page
-from infgen.views.showing import make_film
+from infgen.views.scene.interpolation import moment_at
+from infgen.views.scene.view_model import make_film
 from tests.exports.replays import replay, with_newcomer
 
 playwright = pytest.importorskip(

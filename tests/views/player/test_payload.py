@@ -3,7 +3,7 @@ import pytest
 
 from infgen.views.player.columns import PayloadError, pack_columns
 from infgen.views.player.payload import pack, unpack
-from infgen.views.showing import make_film
+from infgen.views.scene.view_model import make_film
 
 
 def test_a_film_comes_back_to_a_centimetre_and_a_hundredth_of_a_radian(film, same):

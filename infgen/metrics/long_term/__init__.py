@@ -1,0 +1,1 @@
+"""The long-term metrics of the InfGen paper."""

@@ -1,0 +1,1 @@
+"""The metric of the Waymo Open Sim Agents Challenge, without TensorFlow."""

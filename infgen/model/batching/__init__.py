@@ -1,0 +1,1 @@
+"""Batches: tokenized scenes as cropped and padded tensors."""

@@ -1,0 +1,339 @@
+"""Tokenized scenes as padded tensors: what the network is trained on.
+
+Dims: scene, agent, token, road, slot (turn of a newcomer within its half second), detail
+(an agent whose entry is described: a newcomer, or one that only plays the part). Agents are
+ordered from near to far by their least distance to the ego; agent 0 is the ego. Tokens come
+before agents, unlike in ``SceneTokens``: what is seen together lies together.
+
+A batch is a function of its records, their draws and the limits: nothing is random here.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor
+
+from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.model.batching.crop import SceneWindow, cut_window, disturb, hide_far, look_away
+from infgen.model.batching.insertion_targets import detail_arrays, entry_arrays, turns_of
+from infgen.model.batching.padding import Arrays, pad
+from infgen.model.tensors import map_tensors
+from infgen.tokens.grid import make_grid
+from infgen.tokens.perturbation import Noise, exchange_roads
+from infgen.tokens.scene_tokens import Presence, SceneTokens
+from infgen.tokens.signals import Lights, remember
+
+T = TypeVar("T")
+
+PICKED_SHARE = 0.15
+"""Share of road tokens that are hidden to be predicted: few, as everyone else does without
+them in the same pass."""
+FORGOTTEN_SHARE = 0.5
+"""Share of scenes in which nobody looks at traffic lights after the history."""
+BARE_RIM_SHARE = 0.5
+"""Share of scenes in which nobody from beyond the rim is there from the beginning, as in a
+rollout after its first seconds."""
+LEFT_TOKENS = 2
+"""Who is not seen for so many half seconds has left: at a log's end one cannot tell."""
+
+
+@dataclass(frozen=True, slots=True)
+class Agents:
+    """All agents of all scenes, as ``SceneTokens`` has them; padding is ABSENT.
+
+    Attributes:
+        kind: ``AgentKind``.
+        size_lwh_m: Boxes.
+        near: Whether the agent has a motion loss.
+        pose: x, y, heading at each token's end.
+        move: Row of the kind's codebook that led here, ``FIRST_MOVE`` or ``NO_MOVE``.
+        label: The move to learn for the same half second. It differs from ``move`` only
+            where agents are led off their ways, and then leads back.
+        presence: ``Presence``.
+        observed: Whether the log shows the agent throughout the token.
+        pattern: Bit i: whether the log itself shows it at step i + 1 of the token.
+        cell: Cell of the ego's grid, or ``NO_CELL``.
+        turn: Of an agent that enters at this token, its turn among those that do; -1 for
+            all others, ``OUTSIDE`` for who enters outside the grid.
+        told: Whether the log goes on for long enough to tell who leaves at this token.
+    """
+
+    kind: Int64[Tensor, "scene agent"]
+    size_lwh_m: Float32[Tensor, "scene agent 3"]
+    near: Bool[Tensor, "scene agent"]
+    pose: Float32[Tensor, "scene token agent 3"]
+    move: Int64[Tensor, "scene token agent"]
+    label: Int64[Tensor, "scene token agent"]
+    presence: Int64[Tensor, "scene token agent"]
+    observed: Bool[Tensor, "scene token agent"]
+    pattern: Int64[Tensor, "scene token agent"]
+    cell: Int64[Tensor, "scene token agent"]
+    turn: Int64[Tensor, "scene token agent"]
+    told: Bool[Tensor, "scene token"]
+
+    @property
+    def visible(self) -> Bool[Tensor, "scene token agent"]:
+        """Whether others can see the agent: it is observed, or just entering."""
+        return self.observed | (self.presence == Presence.ENTERING)
+
+
+@dataclass(frozen=True, slots=True)
+class Roads:
+    """The maps of all scenes.
+
+    Attributes:
+        real: False for padding.
+        pose: First point and heading.
+        token: Row of the map codebook.
+        point_kind: ``PointKind``.
+        line_kind: ``LineKind``.
+        signal: ``SignalClass`` at the end of the history.
+        light: The traffic light of its lane, counted from 1; 0 for none.
+        shown: ``SignalClass`` of those lights at the end of each half second, or
+            ``REMEMBERED`` ones.
+        follows: Whether the road token before it is its predecessor on the same line.
+        picked: Whether it is hidden where road tokens are predicted.
+    """
+
+    real: Bool[Tensor, "scene road"]
+    pose: Float32[Tensor, "scene road 3"]
+    token: Int64[Tensor, "scene road"]
+    point_kind: Int64[Tensor, "scene road"]
+    line_kind: Int64[Tensor, "scene road"]
+    signal: Int64[Tensor, "scene road"]
+    light: Int64[Tensor, "scene road"]
+    shown: Int64[Tensor, "scene light token"]
+    follows: Bool[Tensor, "scene road"]
+    picked: Bool[Tensor, "scene road"]
+
+
+@dataclass(frozen=True, slots=True)
+class Entries:
+    """Who enters when.
+
+    Attributes:
+        asked: Whether newcomers are asked for at this token (never at the first, nor at
+            the last of a log).
+        count: Newcomers within the grid at this token, also those beyond the last slot.
+        agent: The newcomer of each turn, or ``NOBODY``.
+        cell: Its cell; 0 where there is nobody.
+    """
+
+    asked: Bool[Tensor, "scene token"]
+    count: Int64[Tensor, "scene token"]
+    agent: Int64[Tensor, "scene token slot"]
+    cell: Int64[Tensor, "scene token slot"]
+
+
+@dataclass(frozen=True, slots=True)
+class Details:
+    """Agents described at the cell they enter at.
+
+    Attributes:
+        present: False for padding.
+        newcomer: Whether the agent does enter; else it is there already and plays the part.
+        agent: Row of the agent, hidden from its own query.
+        token: When.
+        turn: Newcomers of this turn and later are hidden as well.
+        cell: Where.
+        kind: ``AgentKind``.
+        size_lwh_m: Its box.
+        heading: Heading bin relative to the ego.
+        offset_m: Position less the cell's centre, in the ego's grid frame.
+    """
+
+    present: Bool[Tensor, "scene detail"]
+    newcomer: Bool[Tensor, "scene detail"]
+    agent: Int64[Tensor, "scene detail"]
+    token: Int64[Tensor, "scene detail"]
+    turn: Int64[Tensor, "scene detail"]
+    cell: Int64[Tensor, "scene detail"]
+    kind: Int64[Tensor, "scene detail"]
+    size_lwh_m: Float32[Tensor, "scene detail 3"]
+    heading: Int64[Tensor, "scene detail"]
+    offset_m: Float32[Tensor, "scene detail 2"]
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Several scenes side by side."""
+
+    scenario_ids: tuple[str, ...]
+    agents: Agents
+    roads: Roads
+    entries: Entries
+    details: Details
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """How much of a scene a batch holds.
+
+    Attributes:
+        agents: Agents, nearest to the ego first.
+        roads: Road tokens, nearest to the ego's path first.
+        entries: Newcomers per half second.
+        tokens: Half seconds; of a longer log a part is taken.
+        grid: Settings the scenes were tokenized with.
+    """
+
+    agents: int
+    roads: int
+    entries: int
+    tokens: int
+    grid: TokenSettings
+
+    @classmethod
+    def of(
+        cls, model: ModelSettings, train: TrainSettings, grid: TokenSettings
+    ) -> "Limits":
+        """Take the limits from the settings."""
+        return cls(
+            train.max_agents, train.max_roads, model.max_entries, train.max_tokens, grid
+        )
+
+
+def collate(
+    records: Sequence[SceneTokens], limits: Limits, draw: int, noise: Noise | None = None
+) -> Batch:
+    """Put scenes side by side.
+
+    Args:
+        records: The scenes.
+        limits: How much of each is taken.
+        draw: Which of the many views of a scene to take: it decides the part of a long log,
+            the hidden road tokens, who plays newcomer, and what noise does. Equal draws,
+            equal batches.
+        noise: How tokens are disturbed, to learn from; None for scenes as they are.
+    """
+    scenes = [_scene(record, limits, draw, noise) for record in records]
+    return Batch(
+        scenario_ids=tuple(record.scenario_id for record in records),
+        agents=pad([scene[0] for scene in scenes], Agents),
+        roads=pad([scene[1] for scene in scenes], Roads),
+        entries=pad([scene[2] for scene in scenes], Entries),
+        details=pad([scene[3] for scene in scenes], Details),
+    )
+
+
+def collate_roads(
+    records: Sequence[SceneTokens],
+    max_roads: int,
+    lights: Sequence[Lights | None] | None = None,
+) -> Roads:
+    """Put only the maps of scenes side by side, with nothing hidden.
+
+    Args:
+        records: The scenes.
+        max_roads: Road tokens of each.
+        lights: What the lights of each show, if that is known for longer than the record;
+            afterwards they are remembered as they were last.
+    """
+    maps = []
+    for at, record in enumerate(records):
+        window = cut_window(record, 0, record.num_tokens, record.num_agents, max_roads)
+        token = record.road_token[window.roads]
+        arrays = _roads(window, token, np.zeros(len(token), dtype=bool))
+        known = (lights[at] if lights else None) or Lights(
+            record.signal_line, record.signal_state
+        )
+        tokens = known.shown.shape[1]
+        arrays["light"] = _lights(record.road_line[window.roads], known.line)
+        arrays["shown"] = remember(known.shown, tokens, tokens + 1)
+        maps.append(arrays)
+    return _last_shown(pad(maps, Roads), maps)
+
+
+def to_device(batch: T, device: torch.device) -> T:
+    """Move every tensor of a batch, or of a part of one."""
+    return map_tensors(batch, lambda x: x.to(device))
+
+
+def _scene(
+    record: SceneTokens, limits: Limits, draw: int, noise: Noise | None
+) -> tuple[Arrays, Arrays, Arrays, Arrays]:
+    """Arrays of agents, roads, entries and details of one scene."""
+    random = _keyed(f"{draw}/{record.scenario_id}")
+    chance = _keyed(f"noise/{draw}/{record.scenario_id}")  # Noise moves no other draw.
+    grid = make_grid(limits.grid)
+    spare = max(0, record.num_tokens - limits.tokens)
+    start = int(random.integers(spare + 1))
+    window = cut_window(record, start, limits.tokens, limits.agents, limits.roads)
+    if _keyed(f"rim/{draw}/{record.scenario_id}").random() < BARE_RIM_SHARE:
+        window = hide_far(window, limits.grid, record.now + 1 - start)
+    if noise and noise.moves:
+        window = disturb(window, noise, grid, chance)
+    if _keyed(f"lights/{draw}/{record.scenario_id}").random() < FORGOTTEN_SHARE:
+        window = look_away(window, record.now + 1)
+    turn = turns_of(window)
+    entries = entry_arrays(window, turn, limits.entries)
+    details = detail_arrays(window, entries, grid, random)
+    picked = random.random(len(window.roads)) < PICKED_SHARE
+    token = record.road_token[window.roads]
+    if noise:
+        token = exchange_roads(token, picked, noise, chance)
+    return _agents(window, turn), _roads(window, token, picked), entries, details
+
+
+def _keyed(key: str) -> np.random.Generator:
+    """Random numbers that a key decides."""
+    digest = hashlib.sha256(key.encode()).digest()
+    return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
+
+
+def _agents(window: SceneWindow, turn: np.ndarray) -> Arrays:
+    return {
+        "kind": window.kind,
+        "size_lwh_m": window.size_lwh_m,
+        "near": window.near,
+        "pose": window.pose.swapaxes(0, 1),
+        "move": window.move.T,
+        "label": window.label.T,
+        "presence": window.presence.T,
+        "observed": window.observed.T,
+        "pattern": window.pattern.T,
+        "cell": window.cell.T,
+        "turn": turn.T,
+        "told": np.arange(len(turn.T)) + LEFT_TOKENS < len(turn.T) + window.after,
+    }
+
+
+def _roads(window: SceneWindow, token: np.ndarray, picked: np.ndarray) -> Arrays:
+    record, rows = window.record, window.roads
+    line = record.road_line[rows]
+    follows = np.zeros(len(rows), dtype=bool)
+    follows[1:] = (np.diff(rows) == 1) & (np.diff(line) == 0)
+    return {
+        "real": np.ones(len(rows), dtype=bool),
+        "pose": record.road_pose[rows],
+        "token": token,
+        "point_kind": record.road_point_kind[rows],
+        "line_kind": record.road_line_kind[rows],
+        "signal": record.road_signal[rows],
+        "light": _lights(line, record.signal_line),
+        "shown": window.shown,
+        "follows": follows,
+        "picked": picked,
+    }
+
+
+def _last_shown(roads: Roads, maps: Sequence[Arrays]) -> Roads:
+    """Let what a scene's lights show last go on where another scene's are known longer."""
+    for row, one in enumerate(maps):
+        lights, tokens = one["shown"].shape
+        if lights and tokens:
+            roads.shown[row, :, tokens:] = roads.shown[row, :, tokens - 1, None]
+    return roads
+
+
+def _lights(line: np.ndarray, signal_line: np.ndarray) -> np.ndarray:
+    """Number of the light of each road token's line, from 1; 0 where it has none."""
+    if not len(signal_line):
+        return np.zeros(len(line), dtype=np.int64)
+    at = np.minimum(np.searchsorted(signal_line, line), len(signal_line) - 1)
+    return np.where(signal_line[at] == line, at + 1, 0)

@@ -1,0 +1,231 @@
+"""A part of one tokenized scene: some half seconds, the nearest agents and roads."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int8, Int16, Int64, UInt8
+
+from infgen.config import TokenSettings
+from infgen.tokens.grid import Grid, encode_cell, to_grid
+from infgen.tokens.insertion import entry_key
+from infgen.tokens.perturbation import Noise, lead_astray
+from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, Presence, SceneTokens
+from infgen.tokens.signals import remember
+
+
+@dataclass(frozen=True, slots=True)
+class SceneWindow:
+    """Part of a scene, as if the log began with it.
+
+    Agents are ordered from near to far, the ego first. Who is there at the first token
+    enters at it, as in a log that begins there.
+
+    Attributes:
+        record: The whole scene.
+        after: Half seconds that the log goes on for afterwards.
+        label: The move to learn for each token: ``move`` until agents are led astray.
+        roads: Rows of the record's road tokens that are kept, ascending.
+        shown: ``SignalClass`` of each of the record's lights at each token's end, or what
+            it showed when it was last looked at, ``REMEMBERED``.
+        kind, size_lwh_m, near, pose, move, presence, observed, pattern, cell: As in the
+            record.
+        entry_row: Row of each newcomer whose agent is kept ...
+        entry_token: ... its token, ascending from 0 ...
+        entry_cell: ... and its cell.
+    """
+
+    record: SceneTokens
+    after: int
+    roads: Int64[np.ndarray, " road"]
+    shown: Int8[np.ndarray, "light token"]
+    kind: Int8[np.ndarray, " agent"]
+    size_lwh_m: Float32[np.ndarray, "agent 3"]
+    near: Bool[np.ndarray, " agent"]
+    pose: Float32[np.ndarray, "agent token 3"]
+    move: Int16[np.ndarray, "agent token"]
+    label: Int16[np.ndarray, "agent token"]
+    presence: Int8[np.ndarray, "agent token"]
+    observed: Bool[np.ndarray, "agent token"]
+    pattern: UInt8[np.ndarray, "agent token"]
+    cell: Int16[np.ndarray, "agent token"]
+    entry_row: Int64[np.ndarray, " entry"]
+    entry_token: Int64[np.ndarray, " entry"]
+    entry_cell: Int16[np.ndarray, " entry"]
+
+
+def cut_window(
+    record: SceneTokens, start: int, tokens: int, max_agents: int, max_roads: int
+) -> SceneWindow:
+    """Take ``tokens`` half seconds from ``start`` on, and what is nearest to the ego."""
+    stop = min(start + tokens, record.num_tokens)
+    presence, observed, move = _begin_at(record, start, stop)
+    visible = observed | (presence == Presence.ENTERING)
+    pose, pattern = record.pose[:, start:stop], record.pattern[:, start:stop]
+    rows = _nearest_agents(pose, visible, record.ego)[:max_agents]
+    roads = _nearest_roads(record.road_pose, pose[record.ego], max_roads)
+
+    row_of = np.full(record.num_agents, -1, dtype=np.int64)
+    row_of[rows] = np.arange(len(rows))
+    entry_token = record.entry_token.astype(np.int64) - start
+    kept = (row_of[record.entry_agent] >= 0) & (entry_token >= 0)
+    kept &= entry_token < stop - start
+    return SceneWindow(
+        record=record,
+        after=record.num_tokens - stop,
+        roads=roads,
+        shown=record.signal_state[:, start:stop],
+        kind=record.kind[rows],
+        size_lwh_m=record.size_lwh_m[rows],
+        near=record.near[rows],
+        pose=pose[rows],
+        move=move[rows],
+        label=move[rows],
+        presence=presence[rows],
+        observed=observed[rows],
+        pattern=np.where(presence == Presence.ABSENT, np.uint8(0), pattern)[rows],
+        cell=record.cell[rows, start:stop],
+        entry_row=row_of[record.entry_agent[kept]],
+        entry_token=entry_token[kept],
+        entry_cell=record.entry_cell[kept],
+    )
+
+
+def disturb(
+    window: SceneWindow, noise: Noise, grid: Grid, random: np.random.Generator
+) -> SceneWindow:
+    """Lead agents astray, the ego like all others.
+
+    Who is absent, entering or not observed is where it was. Cells follow the poses, the
+    ego's too; but a newcomer is lost to none for it, and none is won.
+    """
+    strays = lead_astray(
+        window.kind, window.pose, window.move, window.observed, noise, random
+    )
+    cell = encode_cell(to_grid(strays.pose[..., :2], strays.pose[0]), grid)
+    entering = window.presence == Presence.ENTERING
+    kept = entering & ((cell == NO_CELL) | (window.cell == NO_CELL))
+    told = (window.observed | entering) & (strays.off | strays.off[0]) & ~kept
+    cell = np.where(told, cell, window.cell)
+    return replace(
+        window,
+        pose=strays.pose,
+        move=strays.move,
+        label=strays.label,
+        cell=cell,
+        entry_cell=cell[window.entry_row, window.entry_token],
+    )
+
+
+def hide_far(window: SceneWindow, settings: TokenSettings, known: int) -> SceneWindow:
+    """Let who is beyond ``enter_distance_m`` at first not be there before it comes within.
+
+    It then enters, as who comes later does already; who never comes never is.
+
+    Args:
+        window: What is known.
+        settings: The distance (0: nobody is hidden), and the order of newcomers.
+        known: Half seconds of the history.
+    """
+    if not settings.enter_distance_m or known < 1:
+        return window
+    away_m = window.pose[..., :2] - window.pose[0, :, :2]
+    visible = window.observed | (window.presence == Presence.ENTERING)
+    inside = np.hypot(away_m[..., 0], away_m[..., 1]) < settings.enter_distance_m
+    inside &= visible
+    born = visible.argmax(axis=1)
+    # Who is there as the history ends is seen from the half second after it on at latest.
+    far = (born <= known) & ~inside[np.arange(len(inside)), born]
+    far[0] = False
+
+    came = np.zeros_like(inside)
+    came[:, 1:] = np.logical_or.accumulate(inside, axis=1)[:, :-1]
+    presence, observed, move = _enter_late(
+        (window.presence, window.observed, window.move), far, window.observed & came
+    )
+    changed = replace(
+        window,
+        presence=presence,
+        observed=observed,
+        move=move,
+        label=move,
+        pattern=np.where(presence == Presence.ABSENT, np.uint8(0), window.pattern),
+    )
+    return _with_entries(changed, far, settings.entry_order)
+
+
+def look_away(window: SceneWindow, known: int) -> SceneWindow:
+    """Let nobody look at traffic lights after the first ``known`` half seconds."""
+    tokens = window.shown.shape[1]
+    return replace(window, shown=remember(window.shown, min(known, tokens), tokens))
+
+
+def _begin_at(
+    record: SceneTokens, start: int, stop: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Presence, observed and move of the window, everyone entering at its first token.
+
+    Who is not observed then enters when it is next observed. Who leaves at the first token
+    has no second one and is dropped.
+    """
+    presence = record.presence[:, start:stop]
+    observed = record.observed[:, start:stop]
+    move = record.move[:, start:stop]
+    if start == 0:
+        return presence, observed, move
+    before = record.presence[:, start - 1]
+    running = np.isin(before, (Presence.PRESENT, Presence.ENTERING))
+    return _enter_late((presence, observed, move), running, observed)
+
+
+def _enter_late(
+    life: tuple[np.ndarray, np.ndarray, np.ndarray], who: np.ndarray, able: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Presence, observed and move of agents of whom some enter as soon as they are able.
+
+    Who never is, or is to leave then, is not there at all: it would have no second token.
+    """
+    presence, observed, move = (values.copy() for values in life)
+    columns = np.arange(presence.shape[1])
+    first = np.where(able.any(axis=1), able.argmax(axis=1), len(columns))
+    leaves = presence[np.arange(len(first)), first.clip(max=len(columns) - 1)]
+    gone = who & ((first == len(columns)) | (leaves == Presence.LEAVING))
+
+    unseen = who[:, None] & (columns < first[:, None]) | gone[:, None]
+    presence[unseen], observed[unseen] = Presence.ABSENT, False
+    enters = (who & ~gone)[:, None] & (columns == first[:, None])
+    presence[enters], observed[enters], move[enters] = Presence.ENTERING, False, FIRST_MOVE
+    return presence, observed, move
+
+
+def _with_entries(window: SceneWindow, who: np.ndarray, order: str) -> SceneWindow:
+    """List the entries of some agents anew, among those of all others."""
+    row, token = np.nonzero((window.presence == Presence.ENTERING) & who[:, None])
+    kept = ~who[window.entry_row]
+    row = np.concatenate([window.entry_row[kept], row])
+    token = np.concatenate([window.entry_token[kept], token])
+    key = entry_key(window.pose[row, token], window.pose[0, token], order)
+    sorted_ = np.lexsort((key, token))
+    row, token = row[sorted_], token[sorted_]
+    return replace(
+        window, entry_row=row, entry_token=token, entry_cell=window.cell[row, token]
+    )
+
+
+def _nearest_agents(pose: np.ndarray, visible: np.ndarray, ego: int) -> np.ndarray:
+    """Rows of the agents that are there, by least distance to the ego, the ego first."""
+    away_m = pose[..., :2] - pose[ego, :, :2]
+    together = visible & visible[ego]
+    distance_m = np.where(together, np.hypot(away_m[..., 0], away_m[..., 1]), np.inf)
+    distance_m = distance_m.min(axis=1, initial=np.inf)
+    distance_m[ego] = -1.0
+    order = np.argsort(distance_m, kind="stable")
+    return order[visible[order].any(axis=1) | (order == ego)]
+
+
+def _nearest_roads(road_pose: np.ndarray, path: np.ndarray, limit: int) -> np.ndarray:
+    """Rows, ascending, of the road tokens nearest to the ego's path."""
+    if len(road_pose) <= limit:
+        return np.arange(len(road_pose))
+    away_m = road_pose[:, None, :2] - path[:, :2]  # [road, token, 2]
+    distance_m2 = (away_m**2).sum(axis=-1).min(axis=1)
+    return np.sort(np.argsort(distance_m2, kind="stable")[:limit])

@@ -1,0 +1,181 @@
+"""What lies where newcomers may enter: features of cells and of headings themselves.
+
+The paper's heads choose among two thousand cells and 120 headings from one feature of the
+query, which would have to carry the whole street (SPEC 4.6). Here what is around is laid
+onto the cells, or the bins, that it covers, and each of them has a say of its own.
+
+Everything is shared out between the nearest points of a lattice, so features change
+continuously with poses; in float32 also under autocast. Shape letters as in ``layers``; C
+is the width of these features.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from infgen.model.layers import Seen, embedding_mlp, gather
+from infgen.model.neighbours import RoadFeatures, grid_place
+from infgen.model.relations import wrap_angle
+from infgen.tokens.grid import Grid
+from infgen.tokens.scene_tokens import NO_CELL
+
+ROAD_MIDDLE_M = 2.5
+"""From the first point of a road token to about its middle."""
+BIN_REACH = 2
+"""Bins to each side that what lies in a bin speaks to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lying:
+    """Things around queries: roads or agents.
+
+    Attributes:
+        features: Features of all things [M, D].
+        row: Row of each query's things among them [N, K].
+        pose: Their poses [N, K, 3].
+        present: Which of them there are [N, K].
+    """
+
+    features: Tensor
+    row: Tensor
+    pose: Tensor
+    present: Tensor
+
+    @classmethod
+    def roads(cls, roads: RoadFeatures, scene: Tensor) -> "Lying":
+        """All road tokens of the maps [N] of queries, at about their middles."""
+        pose = roads.pose
+        along = torch.stack([pose[..., 2].cos(), pose[..., 2].sin()], dim=-1)
+        middle_m = pose[..., :2] + ROAD_MIDDLE_M * along
+        pose = torch.cat([middle_m, pose[..., 2:]], dim=-1)
+        return cls(roads.features, roads.rows.number[scene], pose[scene], roads.real[scene])
+
+    @classmethod
+    def near(cls, roads: RoadFeatures, seen: Seen) -> "Lying":
+        """The road tokens that queries [N] see, at their first points."""
+        pose = roads.rows.pack(roads.pose)
+        return cls(roads.features, seen.index, pose[seen.index], seen.present)
+
+
+class Ground(nn.Module):
+    """Features of every cell of an ego's grid, from what lies on it and beside it."""
+
+    lattice: Tensor
+    centre_m: Tensor
+
+    def __init__(self, width: int, ground_width: int, grid: Grid) -> None:
+        super().__init__()
+        self.step_m = grid.step_m
+        self.side = len(grid.cell_at)
+        inside = np.flatnonzero(grid.cell_at != NO_CELL)
+        lattice = np.empty(grid.num_cells, dtype=np.int64)
+        lattice[grid.cell_at.flat[inside]] = inside
+        self.register_buffer("lattice", torch.from_numpy(lattice), persistent=False)
+        centre_m = torch.from_numpy(grid.centre_m.copy())
+        self.register_buffer("centre_m", centre_m, persistent=False)
+        self.road = nn.Linear(width, ground_width)
+        self.agent = nn.Linear(width, ground_width)
+        self.turned = nn.Linear(2, ground_width, bias=False)
+        self.place = embedding_mlp(2, ground_width)
+        self.beside = nn.Conv2d(ground_width, ground_width, 3, padding=1, bias=False)
+        self.key = nn.Linear(ground_width, ground_width)
+        self.ask = nn.Linear(width, ground_width)
+
+    def forward(self, ego_pose: Tensor, roads: Lying, agents: Lying) -> Tensor:
+        """Describe the cells around egos [N, 3]: features [N, cell, C]."""
+        laid = self._lay(ego_pose, roads, self.road) + self._lay(
+            ego_pose, agents, self.agent
+        )
+        square = laid.view(len(ego_pose), self.side, self.side, laid.shape[1])
+        spread = self.beside(square.permute(0, 3, 1, 2))
+        cells = spread.flatten(2)[..., self.lattice].mT
+        keys: Tensor = self.key(functional.relu(cells + self.place(self.centre_m)))
+        return keys
+
+    def choose(self, x_NSD: Tensor, cells_NPC: Tensor) -> Tensor:
+        """Say how much queries are for each cell: logits [N, S, cell]."""
+        asked = self.ask(x_NSD) * cells_NPC.shape[-1] ** -0.5
+        logits: Tensor = asked @ cells_NPC.mT
+        return logits
+
+    def _lay(self, ego_pose: Tensor, lying: Lying, project: nn.Linear) -> Tensor:
+        """Share things out between the four lattice points around each: [point, C]."""
+        last = self.side - 1
+        xy_m = grid_place(lying.pose, ego_pose[:, None])
+        at = xy_m / self.step_m + last / 2  # column, row
+        inside = lying.present & (at > 0).all(dim=-1) & (at < last).all(dim=-1)
+        query, thing = inside.nonzero(as_tuple=True)
+        at = at[query, thing]
+        turned_rad = lying.pose[query, thing, 2] - ego_pose[query, 2]
+        features = gather(project(lying.features), lying.row[query, thing])
+        features = functional.relu(features + self.turned(_unit(turned_rad)))
+
+        lower = at.floor().clamp(max=last - 1)
+        share = at - lower
+        column, row = lower.long().unbind(-1)
+        first = (query * self.side + row) * self.side + column
+        laid = share.new_zeros((len(ego_pose) * self.side**2, features.shape[1]))
+        for up in (0, 1):
+            for right in (0, 1):
+                weight = _part(share[:, 0], right) * _part(share[:, 1], up)
+                point = first + up * self.side + right
+                laid = laid.index_add(0, point, features * weight[:, None])
+        return laid
+
+
+class Bearings(nn.Module):
+    """Logits of headings, from the headings of the roads around a query."""
+
+    def __init__(self, width: int, ground_width: int, num_headings: int) -> None:
+        super().__init__()
+        self.num_headings = num_headings
+        self.road = nn.Linear(width, ground_width)
+        self.apart = nn.Linear(2, ground_width)
+        self.asked = nn.Linear(width, ground_width)
+        size = 2 * BIN_REACH + 1
+        self.beside = nn.Conv1d(ground_width, ground_width, size, bias=False)
+        self.say = nn.Conv1d(ground_width, 1, size, bias=False)
+
+    def forward(self, x: Tensor, pose: Tensor, roads: Lying) -> Tensor:
+        """Say how much queries [N, ..., D] at poses [N, 3] are for each heading."""
+        queries = x.flatten(1, -2) if x.dim() > 2 else x[:, None]  # [N, S, D]
+        road = gather(self.road(roads.features), roads.row) + self.apart(
+            grid_place(roads.pose, pose[:, None]) / ROAD_MIDDLE_M
+        )
+        features = functional.relu(road[:, None] + self.asked(queries)[:, :, None])
+        features = features * roads.present[:, None, :, None]  # [N, S, K, C]
+        turned_rad = wrap_angle(roads.pose[..., 2] - pose[:, None, 2])
+        bins = self._shares(turned_rad)  # [N, K, heading]
+        laid = torch.einsum("nskc,nkh->nsch", features, bins).flatten(0, 1)
+        logits = self.say(_ring(functional.relu(self.beside(_ring(laid)))))
+        return logits.view(*x.shape[:-1], self.num_headings)
+
+    def _shares(self, turned_rad: Tensor) -> Tensor:
+        """Share angles out between the middles of the two nearest bins: [..., heading]."""
+        count = self.num_headings
+        at = (turned_rad + math.pi) / (2 * math.pi) * count - 0.5
+        lower = at.floor()
+        share = at - lower
+        bins = torch.arange(count, device=at.device)
+        first = lower.long() % count
+        second = (first + 1) % count
+        return (first[..., None] == bins) * (1 - share[..., None]) + (
+            second[..., None] == bins
+        ) * share[..., None]
+
+
+def _unit(angle_rad: Tensor) -> Tensor:
+    return torch.stack([angle_rad.cos(), angle_rad.sin()], dim=-1)
+
+
+def _part(share: Tensor, upper: int) -> Tensor:
+    return share if upper else 1 - share
+
+
+def _ring(values: Tensor) -> Tensor:
+    """Continue bins around the full turn, as far as a convolution reaches."""
+    return functional.pad(values, (BIN_REACH, BIN_REACH), mode="circular")

@@ -1,0 +1,202 @@
+"""Newcomers: whether one enters, in which cell, and who it is.
+
+Shape letters as in ``layers``; S are the turns of newcomers within one half second.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from infgen.config import ModelSettings
+from infgen.model.agents import KINDS
+from infgen.model.cell_features import Bearings, Ground, Lying
+from infgen.model.layers import Attention, Seen, embedding_mlp, mlp
+from infgen.model.logits import DetailOutputs, EntryOutputs
+from infgen.model.neighbours import Reach
+from infgen.model.relations import Rows, relation_embedding
+from infgen.tokens.grid import Grid
+
+OFFSET_REACH_STEPS = 2 / 3
+"""Offsets lie within so many grid steps of a cell's centre (2 m for 3 m cells)."""
+
+
+class QueryBlock(nn.Module):
+    """One look at the roads and at the agents around a query."""
+
+    def __init__(self, settings: ModelSettings) -> None:
+        super().__init__()
+        width, heads, dropout = settings.width, settings.heads, settings.dropout
+        self.roads = Attention(width, heads, dropout, bipartite=True)
+        self.agents = Attention(width, heads, dropout, bipartite=True)
+
+    def forward(self, x: Tensor, roads: Seen, agents: Seen) -> Tensor:
+        """Update queries [N, D], or [N, S, D]."""
+        updated: Tensor = self.agents(self.roads(x, roads), agents)
+        return updated
+
+
+class CellStack(nn.Module):
+    """Ask, from the ego's pose, whether one more agent enters and where (SPEC 4.6).
+
+    Slots differ only by which newcomers they see: as neighbours, and in the occupancy,
+    which is one pooled embedding of all occupied cells (not one token per cell).
+    """
+
+    def __init__(self, settings: ModelSettings, grid: Grid) -> None:
+        super().__init__()
+        width, bands = settings.width, settings.fourier_bands
+        self.settings = settings
+        self.num_cells = grid.num_cells
+        self.radius_m = grid.radius_m
+        self.query = nn.Embedding(1, width)
+        self.occupancy = mlp(grid.num_cells, width, width)
+        self.roads_relation = relation_embedding(settings.query_radius_m, bands, width)
+        self.agents_relation = relation_embedding(settings.query_radius_m, bands, width)
+        self.blocks = nn.ModuleList(
+            QueryBlock(settings) for _ in range(settings.scene_blocks)
+        )
+        self.add = mlp(width, width, 1)
+        by_cell = settings.cell_token
+        self.cell = mlp(width, width, grid.num_cells) if by_cell else None
+        self.place = None if by_cell else mlp(width, width, 2)
+        features = settings.ground_width if by_cell else 0
+        self.ground = Ground(width, features, grid) if features else None
+
+    def roads_reach(self) -> Reach:
+        """How the query sees roads."""
+        s = self.settings
+        return Reach.of(s.query_radius_m, s.query_map_neighbours, self.roads_relation)
+
+    def agents_reach(self, agents: int) -> Reach:
+        """How the query sees agents: all of them within its radius."""
+        return Reach.of(self.settings.query_radius_m, agents, self.agents_relation)
+
+    def forward(self, occupied: Tensor, roads: Seen, agents: Seen) -> Tensor:
+        """Answer queries: features [N, S, D].
+
+        Args:
+            occupied: 1 where a slot sees an agent in a cell, else 0 [N, S, cell].
+            roads: Road tokens around the ego, the same for all slots.
+            agents: Agents around the ego; ``present`` differs by slot.
+        """
+        x = self.query.weight[0] + self.occupancy(occupied)
+        for block in self.blocks:
+            x = block(x, roads, agents)
+        return x
+
+    def answer(self, rows: Rows, x: Tensor, ground: Tensor | None) -> EntryOutputs:
+        """Say of every row, by its updated features, whether an agent enters and where.
+
+        Args:
+            rows: What the features are of.
+            x: The features [N, S, D].
+            ground: Features of the cells, if they are told from them [N, cell, C]. The more
+                cells somebody might come from, the likelier somebody comes: it adds what
+                they sum up to.
+        """
+        add, cell = self.add(x)[..., 0], None if self.cell is None else self.cell(x)
+        if self.ground is not None and cell is not None and ground is not None:
+            cell = cell + self.ground.choose(x, ground)
+            add = add + cell.float().logsumexp(dim=-1) - math.log(self.num_cells)
+        return EntryOutputs(
+            rows,
+            add,
+            cell,
+            None if self.place is None else self.radius_m * torch.tanh(self.place(x)),
+            self.radius_m,
+        )
+
+    def occupied(self, cell: Tensor, seen: Tensor) -> Tensor:
+        """Mark the cells [..., cell] that hold an agent that is seen.
+
+        Args:
+            cell: Cell of each agent [..., agent]; negative for none.
+            seen: Whether it is seen [..., agent].
+        """
+        held = torch.where(seen & (cell >= 0), cell, self.num_cells)
+        marks = torch.zeros((*held.shape[:-1], self.num_cells + 1), device=cell.device)
+        return marks.scatter(-1, held, 1.0)[..., :-1]
+
+
+class DetailStack(nn.Module):
+    """Ask, from the centre of a cell, who enters there and how it stands (SPEC 4.7).
+
+    Where places are regressed, it is asked from the place itself.
+    """
+
+    centre_m: Tensor
+
+    def __init__(self, settings: ModelSettings, grid: Grid) -> None:
+        super().__init__()
+        width, bands = settings.width, settings.fourier_bands
+        self.settings = settings
+        self.reach_m = OFFSET_REACH_STEPS * grid.step_m
+        centre_m = torch.from_numpy(grid.centre_m.copy())
+        self.register_buffer("centre_m", centre_m, persistent=False)
+        self.query = nn.Embedding(1, width)
+        self.cells = embedding_mlp(2, width)
+        self.roads_relation = relation_embedding(settings.heading_radius_m, bands, width)
+        self.agents_relation = relation_embedding(settings.heading_radius_m, bands, width)
+        self.blocks = nn.ModuleList(
+            QueryBlock(settings) for _ in range(settings.scene_blocks)
+        )
+        self.kind = mlp(width, width, len(KINDS))
+        self.given_kind = nn.Embedding(len(KINDS), width)
+        self.size = mlp(width, width, 3)
+        by_bin = settings.heading_token
+        self.heading = mlp(width, width, grid.num_headings) if by_bin else None
+        self.turn = None if by_bin else mlp(width, width, 1)
+        self.offset = mlp(width, width, 2) if settings.cell_token else None
+        features = settings.ground_width if by_bin else 0
+        self.bearings = Bearings(width, features, grid.num_headings) if features else None
+
+    def roads_reach(self) -> Reach:
+        """How the query sees roads."""
+        s = self.settings
+        return Reach.of(s.heading_radius_m, s.heading_map_neighbours, self.roads_relation)
+
+    def agents_reach(self) -> Reach:
+        """How the query sees agents."""
+        s = self.settings
+        return Reach.of(
+            s.heading_radius_m, s.heading_agent_neighbours, self.agents_relation
+        )
+
+    def forward(self, cell: Tensor, roads: Seen, agents: Seen) -> Tensor:
+        """Describe the cells [N]: features [N, D]."""
+        x: Tensor = self.query.weight[0] + self.cells(self.centre_m[cell])
+        for block in self.blocks:
+            x = block(x, roads, agents)
+        return x
+
+    def asked_at(self, cell: Tensor, offset_m: Tensor) -> Tensor:
+        """Where in the ego's grid frame a known newcomer is asked for [N, 2]."""
+        centre_m = self.centre_m[cell]
+        return centre_m if self.offset is not None else centre_m + offset_m
+
+    def answer(
+        self, rows: Rows, x: Tensor, kind: Tensor, pose: Tensor, roads: Lying
+    ) -> DetailOutputs:
+        """Say who enters, and how it stands once its kind is known.
+
+        Args:
+            rows: What the features are of.
+            x: Updated features [N, ..., D].
+            kind: ``AgentKind`` of each.
+            pose: Where it was asked [N, 3] ...
+            roads: ... and the road tokens seen from there.
+        """
+        given = x + self.given_kind(kind)
+        turn, offset = self.turn, self.offset
+        heading = None if self.heading is None else self.heading(given)
+        if self.bearings is not None and heading is not None:
+            heading = heading + self.bearings(given, pose, roads)
+        return DetailOutputs(
+            rows,
+            self.kind(x),
+            self.size(given),
+            heading,
+            None if turn is None else math.pi * torch.tanh(turn(given)[..., 0]),
+            None if offset is None else self.reach_m * torch.tanh(offset(given)),
+        )

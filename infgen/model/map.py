@@ -1,0 +1,129 @@
+"""The map as features: encoded once per scene, and predicted piece by piece."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from infgen.config import ModelSettings
+from infgen.model.batching.batch import Roads
+from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
+from infgen.model.map_grid import RoadGrid
+from infgen.model.neighbours import Around, Lamps, Reach, RoadFeatures
+from infgen.model.relations import Rows, relation_embedding
+from infgen.model.signal_features import StopLines
+from infgen.tokens.map import LineKind, PointKind
+from infgen.tokens.scene_tokens import SignalClass
+from infgen.tokens.signals import REMEMBERED
+from infgen.tokens.vocabulary import RoadCodebook
+
+
+@dataclass(frozen=True, slots=True)
+class RoadSight:
+    """Who sees whom on the maps: the rows, and the neighbours of each."""
+
+    rows: Rows
+    around: Around
+    grid: RoadGrid
+
+    def covered(self, roads: Roads) -> "RoadSight":
+        """Let nobody see a hidden token, not even its place: it would be given away."""
+        kept = ~self.rows.pack(roads.picked)
+        present = self.around.present & kept[self.around.index]
+        return replace(self, around=replace(self.around, present=present))
+
+
+class RoadEncoder(nn.Module):
+    """Embed road tokens and let them see their neighbours (SPEC 4.3)."""
+
+    curve_m: Tensor
+
+    def __init__(self, settings: ModelSettings, codebook: RoadCodebook) -> None:
+        super().__init__()
+        width = settings.width
+        self.radius_m = settings.map_map_radius_m
+        self.step_lights = settings.step_lights
+        self.stop_lines = settings.light_ahead_m > 0
+        self.neighbours = settings.map_map_neighbours
+        curve_m = torch.from_numpy(codebook.curve_m.copy())
+        self.register_buffer("curve_m", curve_m, persistent=False)
+        self.curve = embedding_mlp(codebook.curve_m[0].size, width)
+        self.point_kind = nn.Embedding(len(PointKind), width)
+        self.line_kind = nn.Embedding(len(LineKind), width)
+        looks = len(SignalClass) + (REMEMBERED if self.step_lights else 0)
+        self.signal = nn.Embedding(looks, width)
+        self.relation = relation_embedding(self.radius_m, settings.fourier_bands, width)
+        self.blocks = nn.ModuleList(
+            Attention(width, settings.heads, settings.dropout, bipartite=False)
+            for _ in range(settings.map_blocks)
+        )
+        self.next_token = mlp(width, width, codebook.num_roads)
+
+    def look(self, roads: Roads) -> RoadSight:
+        """Find who sees whom on the maps."""
+        rows, grid = Rows.where(roads.real), RoadGrid.of(roads.pose, roads.real)
+        reach = Reach.of(self.radius_m, self.neighbours, self.relation)
+        pose, count = rows.pack(roads.pose), roads.real.shape[1]
+        scene = rows.at // max(1, count)
+        found = grid.nearest(
+            pose[:, :2], scene, reach.radius_m, reach.count, itself=rows.at % max(1, count)
+        )
+        place, present = found.index[0], found.present[0]
+        around = Around(
+            index=rows.number[scene[:, None], place],
+            relation=reach.describe(pose, roads.pose[scene[:, None], place]),
+            present=present,
+            place=place,
+        )
+        return RoadSight(rows, around, grid)
+
+    def forward(self, roads: Roads, sight: RoadSight) -> RoadFeatures:
+        """Encode every road token."""
+        around = sight.around
+        x = self._embed(roads, sight.rows)
+        for block in self.blocks:
+            x = block(x, around.seen(normed(x)))
+        rows, features, lamps = sight.rows, normed(x), None
+        if self.step_lights:
+            looks, lamps = self._lamps(roads, rows, x)
+            features = torch.cat([features, looks])
+        lines = StopLines.of(roads) if self.stop_lines else None
+        return RoadFeatures(
+            rows, features, roads.pose, roads.real, sight.grid, lamps, lines
+        )
+
+    def predict_hidden(self, roads: Roads, covered: RoadFeatures) -> tuple[Tensor, Tensor]:
+        """Predict hidden road tokens from their predecessors, which did not see them.
+
+        A token is predicted if it is hidden and its predecessor is not.
+
+        Args:
+            roads: The maps.
+            covered: Features of a pass in which hidden tokens were not seen.
+
+        Returns:
+            Logits [prediction, token] and the true tokens [prediction].
+        """
+        wanted = roads.real & roads.picked & roads.follows
+        wanted[:, 1:] &= ~roads.picked[:, :-1]
+        before = covered.rows.number.roll(1, dims=1)[wanted]
+        return self.next_token(covered.features[before]), roads.token[wanted]
+
+    def _embed(self, roads: Roads, rows: Rows) -> Tensor:
+        """What each road token is, by itself [row, D]."""
+        shapes = self.curve(self.curve_m.flatten(1))  # [token, D]
+        embedded: Tensor = gather(shapes, rows.pack(roads.token))
+        embedded = embedded + self.point_kind(rows.pack(roads.point_kind))
+        embedded = embedded + self.line_kind(rows.pack(roads.line_kind))
+        if self.step_lights:
+            return embedded
+        return embedded + self.signal(rows.pack(roads.signal))
+
+    def _lamps(self, roads: Roads, rows: Rows, x: Tensor) -> tuple[Tensor, Lamps]:
+        """Say what road tokens with a light look like under each class of it."""
+        lit = rows.pack(roads.light).nonzero()[:, 0]
+        looks = normed(x[lit, None] + self.signal.weight)  # [lit, class, D]
+        first = torch.zeros_like(rows.at)
+        behind = torch.arange(len(lit), device=x.device) * looks.shape[1]
+        first[lit] = len(x) + behind
+        return looks.flatten(0, 1), Lamps(first, roads.light, roads.shown)

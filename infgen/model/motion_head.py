@@ -1,0 +1,75 @@
+"""Which move an agent makes next, told from where each move leads.
+
+The paper gives each of two thousand moves a logit of its own (SPEC 4.5), each learned
+alone: what is seen of one says nothing about the next one, ten centimetres to its left.
+Here every move has a feature that follows from the pose where it ends, so moves that lead
+to nearly the same place are told alike, and few scenes teach all of them.
+"""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int64
+from torch import Tensor, nn
+
+from infgen.model.layers import mlp
+from infgen.tokens.vocabulary import MotionCodebook
+
+LONGEST_WAVE_M = 64.0
+"""Longer than any move. Each wave is half as long as the one before it ..."""
+WAVES = 9
+"""... down to a quarter of a metre."""
+TURN_WAVES = 6
+"""Waves of the heading, of which each turns twice as fast as the one before it."""
+UNIT_M = 10.0
+"""Metres are told in tens, to be of the size of the waves."""
+
+
+class MoveHead(nn.Module):
+    """Logits of every kind's moves, from their shapes.
+
+    Shape letters as in ``layers``; C is the width of the moves' features.
+    """
+
+    waves: Tensor
+
+    def __init__(self, width: int, move_width: int, codebook: MotionCodebook) -> None:
+        super().__init__()
+        waves = torch.from_numpy(_waves(codebook.end_pose))
+        self.register_buffer("waves", waves, persistent=False)
+        self.shape = nn.Sequential(
+            nn.Linear(waves.shape[-1], 2 * move_width),
+            nn.ReLU(),
+            nn.Linear(2 * move_width, move_width),
+        )
+        self.wanted = mlp(width, width, move_width)
+        self.usual = nn.Parameter(torch.zeros(waves.shape[:2]))
+
+    def table(self) -> Tensor:
+        """Features of all kinds' moves [3, move, C]: they depend on no scene."""
+        shapes: Tensor = self.shape(self.waves)
+        return shapes
+
+    def forward(self, x_ND: Tensor, kind: Int64[Tensor, " row"], shapes: Tensor) -> Tensor:
+        """Logits [N, move] of agents of some kinds, by their features and ``table``."""
+        wanted = self.wanted(x_ND)
+        rows = [(kind == each).nonzero()[:, 0] for each in range(len(shapes))]
+        parts = [
+            torch.addmm(usual.to(wanted.dtype), wanted[row], shape.T)
+            for row, shape, usual in zip(rows, shapes, self.usual, strict=True)
+        ]
+        return torch.cat(parts)[torch.cat(rows).argsort()]
+
+
+def _waves(
+    end_pose: Float32[np.ndarray, "3 move 3"],
+) -> Float32[np.ndarray, "3 move wave"]:
+    """Describe where moves end, from coarse to fine."""
+    per_m = 2 * math.pi / LONGEST_WAVE_M * 2.0 ** np.arange(WAVES)
+    phase = [end_pose[..., axis, None] * per_m for axis in (0, 1)]
+    phase.append(end_pose[..., 2, None] * 2.0 ** np.arange(TURN_WAVES))
+    plain = end_pose / np.array([UNIT_M, UNIT_M, 1.0])
+    turns = np.concatenate(phase, axis=-1)
+    told = np.concatenate([plain, np.cos(turns), np.sin(turns)], axis=-1)
+    return told.astype(np.float32)

@@ -1,0 +1,163 @@
+"""The nearest move and where it leads, on tensors: ``tokens.moves`` for any device.
+
+Distances are float64 throughout, so neither autocast nor a GPU's short-cuts in matrix
+products touch them.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float32, Float64, Int64
+from torch import Tensor
+
+from infgen.tokens.motion_tokens import make_move_table
+from infgen.tokens.vocabulary import MotionCodebook
+
+_ROWS_AT_ONCE = 1024
+"""Keeps the table of gaps (rows x moves) within 16 MiB."""
+
+
+@dataclass(frozen=True, slots=True)
+class MoveEnds:
+    """Where the moves of a codebook end. Fields as in ``tokens.moves.MoveTable``.
+
+    Attributes:
+        pose: In the frame of each move's start.
+        size_lw_m: Box that moves of each kind are compared by.
+        reach_m: Half the diagonal of that box.
+        weights: Of the squared distance of two spreads.
+        corners_m: Corners of the box at each end: x of the four, then y.
+    """
+
+    pose: Float32[Tensor, "3 move 3"]
+    size_lw_m: Float64[Tensor, "3 2"]
+    reach_m: Float64[Tensor, " 3"]
+    weights: Float64[Tensor, "3 5 move"]
+    corners_m: Float64[Tensor, "3 move 8"]
+
+    @classmethod
+    def of(cls, codebook: MotionCodebook, device: torch.device) -> "MoveEnds":
+        """Lay a codebook out on a device."""
+        table = make_move_table(codebook)
+        pose = torch.from_numpy(codebook.end_pose.copy()).to(device)
+        reach_m = torch.from_numpy(table.reach_m).to(device).double()
+        spread = _spread(pose.double(), reach_m[:, None])
+        square = spread.square().sum(dim=-1, keepdim=True)
+        return cls(
+            pose=pose,
+            size_lw_m=torch.from_numpy(codebook.size_lw_m).to(device).double(),
+            reach_m=reach_m,
+            weights=torch.cat([-2 * spread, square], dim=-1).transpose(1, 2),
+            corners_m=torch.from_numpy(table.corners_m).to(device),
+        )
+
+
+def nearest(
+    wanted: Float32[Tensor, "row 3"], kind: Int64[Tensor, " row"], ends: MoveEnds
+) -> Int64[Tensor, " row"]:
+    """Find the move of all that ends nearest to each pose wanted (in its start's frame).
+
+    The same as ``tokens.moves.nearest_moves``: of equally near moves the first.
+    """
+    move = torch.empty_like(kind)
+    for number in range(len(ends.pose)):
+        for rows in torch.split((kind == number).nonzero()[:, 0], _ROWS_AT_ONCE):
+            move[rows] = _nearest(wanted[rows].double(), number, ends)
+    return move
+
+
+def nearest_of(
+    wanted: Float32[Tensor, "row 3"],
+    kind: Int64[Tensor, " row"],
+    choice: Int64[Tensor, "row choice"],
+    ends: MoveEnds,
+) -> Int64[Tensor, " row"]:
+    """Find the move of some that ends nearest to each pose wanted.
+
+    Args:
+        wanted: Where to, in the frame of each move's start.
+        kind: ``AgentKind`` of each row.
+        choice: The moves to choose from; of equally near ones the first.
+        ends: Where moves end.
+    """
+    aim_m = _corners(wanted.double(), ends.size_lw_m[kind])
+    gap_m = _mean_gap(ends.corners_m[kind[:, None], choice], aim_m[:, None])
+    return choice.gather(1, gap_m.argmin(dim=1, keepdim=True))[:, 0]
+
+
+def to_local(
+    pose: Float32[Tensor, "*row 3"], frame: Float32[Tensor, "*row 3"]
+) -> Float32[Tensor, "*row 3"]:
+    """Express world poses in the frame of other poses. Inverse of ``to_world``."""
+    away_m = pose[..., :2] - frame[..., :2]
+    turn_rad = wrap_angle(pose[..., 2] - frame[..., 2])
+    return torch.cat([_rotate(away_m, -frame[..., 2]), turn_rad[..., None]], dim=-1)
+
+
+def to_world(
+    pose: Float32[Tensor, "*row 3"], frame: Float32[Tensor, "*row 3"]
+) -> Float32[Tensor, "*row 3"]:
+    """Bring poses given in the frame of other poses to the world."""
+    xy_m = _rotate(pose[..., :2], frame[..., 2]) + frame[..., :2]
+    heading_rad = wrap_angle(pose[..., 2] + frame[..., 2])
+    return torch.cat([xy_m, heading_rad[..., None]], dim=-1)
+
+
+def wrap_angle(angle_rad: Tensor) -> Tensor:
+    """Bring angles to [-pi, pi)."""
+    wrapped = torch.remainder(angle_rad + torch.pi, 2 * torch.pi) - torch.pi
+    # Rounding may lift an angle just below -pi to exactly +pi.
+    return torch.where(wrapped >= torch.pi, -torch.pi, wrapped)
+
+
+def _nearest(wanted: Tensor, number: int, ends: MoveEnds) -> Tensor:
+    """Return the nearest move of one kind to each pose wanted (float64)."""
+    aim_m = _corners(wanted, ends.size_lw_m[number])
+    row, move = _candidates(wanted, aim_m, number, ends)
+    gap_m = _mean_gap(ends.corners_m[number, move], aim_m[row])
+    far_m = gap_m.new_full((len(wanted),), torch.inf)
+    least_m = far_m.scatter_reduce(0, row, gap_m, "amin")
+    best = torch.where(gap_m == least_m[row], move, ends.pose.shape[1])
+    last = row.new_full((len(wanted),), ends.pose.shape[1])
+    return last.scatter_reduce(0, row, best, "amin")
+
+
+def _candidates(
+    wanted: Tensor, aim_m: Tensor, number: int, ends: MoveEnds
+) -> tuple[Tensor, Tensor]:
+    """Return rows and moves among which each row's nearest move surely is."""
+    spread = _spread(wanted, ends.reach_m[number])
+    square = spread.square().sum(dim=-1, keepdim=True)
+    weights = ends.weights[number]
+    gap = spread @ weights[:4] + weights[4] + square  # [row, move]
+    guess_m = _mean_gap(ends.corners_m[number, gap.argmin(dim=1)], aim_m)
+    # The nearest move is no farther than the guess, its spread at most 1.42 times.
+    most = 2 * guess_m.square() + 1e-9 * (1 + square[:, 0])  # With room for rounding.
+    row, move = (gap <= most[:, None]).nonzero(as_tuple=True)
+    return row, move
+
+
+def _mean_gap(one_m: Tensor, other_m: Tensor) -> Tensor:
+    """Return the mean distance of four corners; arrays are [..., 8]: all x, then all y."""
+    away_m = (one_m - other_m).square()
+    return (away_m[..., :4] + away_m[..., 4:]).sqrt().sum(dim=-1) / 4
+
+
+def _corners(pose: Tensor, size_lw_m: Tensor) -> Tensor:
+    """Return the corners [row, 8] of boxes: x of all four, then y of all four."""
+    signs = pose.new_tensor([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
+    corners_m = _rotate(size_lw_m[..., None, :] * signs, pose[:, None, 2])
+    return (corners_m + pose[:, None, :2]).transpose(1, 2).flatten(1)
+
+
+def _spread(pose: Tensor, reach_m: Tensor) -> Tensor:
+    heading = pose[..., 2]
+    turned_m = reach_m * heading.cos(), reach_m * heading.sin()
+    return torch.stack([pose[..., 0], pose[..., 1], *turned_m], dim=-1)
+
+
+def _rotate(xy_m: Tensor, angle_rad: Tensor) -> Tensor:
+    """Turn points counter-clockwise about the origin."""
+    cos, sin = angle_rad.cos(), angle_rad.sin()
+    x_m, y_m = xy_m.unbind(-1)
+    return torch.stack([cos * x_m - sin * y_m, sin * x_m + cos * y_m], dim=-1)

@@ -1,0 +1,231 @@
+"""What agents and queries see of roads and of each other, as ``layers.Seen``.
+
+Shared by training (all tokens at once) and simulation (one token of many rollouts), so that
+both see the same. Dims: group (a scene, a rollout, or one token of it), target, source.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor
+
+from infgen.model.layers import Seen
+from infgen.model.map_grid import RoadGrid
+from infgen.model.neighbour_attention import Shared
+from infgen.model.relation_tables import RelationEmbedding
+from infgen.model.relations import Rows, across, nearest, relations
+from infgen.model.signal_features import StopLines
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """How far targets see, how many, and how what they see is embedded.
+
+    Attributes:
+        radius_m: Radius.
+        count: Nearest sources that are seen.
+        relation: Embedding of how sources stand to targets.
+        table: Its table.
+        ahead_m: How far ahead of a target the point is that they are nearest to.
+        across: Whether relations end in ``relations.across``.
+    """
+
+    radius_m: float
+    count: int
+    relation: RelationEmbedding
+    table: Tensor
+    ahead_m: float
+    across: bool
+
+    @classmethod
+    def of(
+        cls,
+        radius_m: float,
+        count: int,
+        relation: RelationEmbedding,
+        *,
+        ahead_m: float = 0.0,
+        across: bool = False,
+    ) -> "Reach":
+        """Evaluate the relation's table for one pass."""
+        return cls(radius_m, count, relation, relation.table(), ahead_m, across)
+
+    def centre_m(self, pose: Float32[Tensor, "*target 3"]) -> Float32[Tensor, "*target 2"]:
+        """Where targets look for sources."""
+        if not self.ahead_m:
+            return pose[..., :2]
+        heading_rad = pose[..., 2]
+        ahead = torch.stack([heading_rad.cos(), heading_rad.sin()], dim=-1)
+        return pose[..., :2] + self.ahead_m * ahead
+
+    def describe(
+        self,
+        target_pose: Float32[Tensor, "target 3"],
+        source_pose: Float32[Tensor, "target neighbour 3"],
+    ) -> Shared:
+        """Normed features of how sources stand to their targets."""
+        described = relations(target_pose, source_pose)
+        if self.across:
+            described = torch.cat([described, across(target_pose, source_pose)], dim=-1)
+        return Shared.of(self.relation.look_up(described, self.table))
+
+
+@dataclass(frozen=True, slots=True)
+class Around:
+    """Neighbours of each row, not yet with features.
+
+    Attributes:
+        index: Rows of the neighbours [N, K].
+        relation: Normed features of how they stand to it [N, K, D].
+        present: Which of them there are [N, K].
+        place: Position of each neighbour among its group's sources [N, K].
+    """
+
+    index: Tensor
+    relation: Shared
+    present: Tensor
+    place: Tensor
+
+    def seen(self, features: Tensor) -> Seen:
+        """Join with the features of all rows [row, D]."""
+        return Seen(features, self.index, self.relation, self.present)
+
+
+@dataclass(frozen=True, slots=True)
+class RoadFeatures:
+    """Encoded maps, one after the other.
+
+    Attributes:
+        rows: Which places of the padded maps they are.
+        features: Normed features [row, D].
+        pose: Poses of the padded maps [scene, road, 3].
+        real: Which places of the padded maps hold a road token [scene, road].
+        grid: The same tokens by where they are.
+        lamps: What those with a traffic light look like, if that is seen as it changes.
+        lines: Where lights stop traffic, if agents are told of those ahead.
+    """
+
+    rows: Rows
+    features: Tensor
+    pose: Tensor
+    real: Tensor
+    grid: RoadGrid
+    lamps: "Lamps | None"
+    lines: StopLines | None
+
+    def at(self, scene: Tensor, place: Tensor, token: Tensor | None) -> Tensor:
+        """Rows [N, K] of the features of places [N, K] of maps [N], at half seconds [N]."""
+        row = self.rows.number[scene[:, None], place]
+        if self.lamps is None or token is None:
+            return row
+        return self.lamps.lit(row, scene, place, token)
+
+
+@dataclass(frozen=True, slots=True)
+class Lamps:
+    """Road tokens as they look under each class of light: rows behind those of the maps.
+
+    Attributes:
+        first: Row of the first class of each road token's looks [row].
+        light: Its light, counted from 1; 0 for none [scene, road].
+        shown: ``SignalClass`` of those by the half second, ``REMEMBERED`` or not; the last
+            one lasts [scene, light, token].
+    """
+
+    first: Tensor
+    light: Tensor
+    shown: Tensor
+
+    def lit(self, row: Tensor, scene: Tensor, place: Tensor, token: Tensor) -> Tensor:
+        """Rows of road tokens under their lights at half seconds [N]; others as given."""
+        if not self.shown.numel():
+            return row
+        scene = scene[:, None]
+        light, token = self.light[scene, place], token.clamp(max=self.shown.shape[2] - 1)
+        shown = self.shown[scene, (light - 1).clamp(min=0), token[:, None]]
+        return torch.where(light > 0, self.first[row] + shown, row)
+
+
+def look_around(
+    reach: Reach,
+    targets: Rows,
+    target_pose: Float32[Tensor, "group target 3"],
+    source_pose: Float32[Tensor, "group source 3"],
+    source_row: Int64[Tensor, "group source"],
+    allowed: Bool[Tensor, " group #target source"],
+) -> Around:
+    """Find what every target row sees of its group's sources.
+
+    Args:
+        reach: How far and how many.
+        targets: Which places of [group, target] are rows.
+        target_pose: Poses of targets.
+        source_pose: Poses of sources.
+        source_row: Row of each source in the features it will be joined with.
+        allowed: Which sources each target may see.
+    """
+    found = nearest(
+        reach.centre_m(target_pose),
+        source_pose[..., :2],
+        allowed,
+        reach.radius_m,
+        reach.count,
+    )
+    place, present = targets.pack(found.index), targets.pack(found.present)
+    group = (targets.at // found.index.shape[1])[:, None]
+    return Around(
+        index=source_row[group, place],
+        relation=reach.describe(targets.pack(target_pose), source_pose[group, place]),
+        present=present,
+        place=place,
+    )
+
+
+def see_roads(
+    reach: Reach,
+    targets: Rows,
+    target_pose: Float32[Tensor, "group target 3"],
+    roads: RoadFeatures,
+    scene: Int64[Tensor, " group"],
+    token: Int64[Tensor, " row"] | None = None,
+) -> Seen:
+    """Show every target row the road tokens around it.
+
+    Args:
+        reach: How far and how many.
+        targets: Which places of [group, target] are rows.
+        target_pose: Poses of targets.
+        roads: All maps.
+        scene: Each group's map.
+        token: Half second of each row: it sees the lights of then. Without, it sees none.
+    """
+    pose, on = targets.pack(target_pose), scene[targets.at // target_pose.shape[1]]
+    found = roads.grid.nearest(reach.centre_m(pose), on, reach.radius_m, reach.count)
+    place, present = found.index[0], found.present[0]
+    return Seen(
+        roads.features,
+        roads.at(on, place, token),
+        reach.describe(pose, roads.pose[on[:, None], place]),
+        present,
+    )
+
+
+def cell_pose(
+    ego_pose: Float32[Tensor, "*row 3"], centre_m: Float32[Tensor, "*row 2"]
+) -> Float32[Tensor, "*row 3"]:
+    """Poses at the centres of cells (ego's grid frame), facing as the ego does."""
+    turn_rad = ego_pose[..., 2] - math.pi / 2
+    cos, sin = turn_rad.cos(), turn_rad.sin()
+    x_m = cos * centre_m[..., 0] - sin * centre_m[..., 1] + ego_pose[..., 0]
+    y_m = sin * centre_m[..., 0] + cos * centre_m[..., 1] + ego_pose[..., 1]
+    return torch.stack([x_m, y_m, ego_pose[..., 2]], dim=-1)
+
+
+def grid_place(pose: Tensor, ego_pose: Tensor) -> Float32[Tensor, "*row 2"]:
+    """Where poses [..., 3] are in the ego's grid frame. Inverse of ``cell_pose``."""
+    turn_rad = math.pi / 2 - ego_pose[..., 2]
+    cos, sin = turn_rad.cos(), turn_rad.sin()
+    x_m, y_m = (pose - ego_pose)[..., :2].unbind(-1)
+    return torch.stack([cos * x_m - sin * y_m, sin * x_m + cos * y_m], dim=-1)

@@ -1,0 +1,183 @@
+"""Relations as features, read from tables instead of computed pair by pair.
+
+Shape letters as in ``layers``: N pairs (or targets), K neighbours of a target, D width, F
+scalars, P nodes of all tables.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
+
+from infgen.model import neighbour_attention
+from infgen.model.layers import FourierEmbedding
+
+NORM_EPS = 1e-5
+"""What norms add to a variance, as torch's do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Range of a scalar that a table covers; values beyond are taken as its ends.
+
+    Attributes:
+        first: Where the first node is.
+        last: Where the last node is.
+        nodes: Number of nodes, evenly spaced.
+        closed: Whether the two ends mean the same, as for angles of -pi and pi: rounding
+            must not tell them apart.
+    """
+
+    first: float
+    last: float
+    nodes: int
+    closed: bool = False
+
+
+class RelationEmbedding(FourierEmbedding):
+    """A Fourier embedding of relations, read from tables instead of computed per pair.
+
+    Every scalar's function is evaluated at evenly spaced nodes and is linear between them:
+    a few thousand evaluations instead of one per pair of neighbours. Training and
+    simulation use the same tables, so there is no difference between the two.
+    """
+
+    def __init__(self, spans: Sequence[Span], bands: int, width: int) -> None:
+        super().__init__(len(spans), bands, width)
+        self.spans = tuple(spans)
+
+    def table(self) -> Tensor:
+        """Evaluate all scalars at their nodes: [P, D], one scalar after the other.
+
+        In float32 also under autocast, as ``look_up``: geometry needs its digits.
+        """
+        with torch.autocast(self.frequency.weight.device.type, enabled=False):
+            return torch.cat([self._nodes(i, span) for i, span in enumerate(self.spans)])
+
+    def _nodes(self, number: int, span: Span) -> Tensor:
+        device = self.frequency.weight.device
+        at = torch.linspace(span.first, span.last, span.nodes, device=device)
+        values = self.scalar(number, at)
+        if not span.closed:
+            return values
+        middle = (values[:1] + values[-1:]) / 2
+        return torch.cat([middle, values[1:-1], middle])
+
+    def look_up(self, values: Tensor, table_PD: Tensor) -> Tensor:
+        """Embed relations [N, K, F] by a table: normed features [N, K, D]."""
+        norm, _, linear = self.out
+        weights = (table_PD, norm.weight, norm.bias, linear.weight, linear.bias)
+        with torch.autocast(values.device.type, enabled=False):
+            places = self._places(values.flatten(0, -2))
+            found = _LookUp.apply(*places, *weights)  # type: ignore[no-untyped-call]
+        embedded: Tensor = found.view(*values.shape[:-1], table_PD.shape[1])
+        return embedded
+
+    def _places(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Say between which nodes relations [N, F] lie: nodes and their shares [N, 2 F]."""
+        first = values.new_tensor([span.first for span in self.spans])
+        gaps = values.new_tensor([span.nodes - 1 for span in self.spans])
+        length = values.new_tensor([span.last - span.first for span in self.spans])
+        position = ((values - first) * (gaps / length)).clamp(min=0).minimum(gaps)
+        lower = position.floor().minimum(gaps - 1)
+        share = position - lower
+
+        starts = torch.tensor([0, *(span.nodes for span in self.spans[:-1])])
+        node = lower.long() + starts.cumsum(0).to(values.device)
+        return torch.cat([node, node + 1], dim=-1), torch.cat([1 - share, share], dim=-1)
+
+
+class _LookUp(torch.autograd.Function):
+    """Weighted rows of a table, then norm, ReLU, linear layer and norm: [N, D].
+
+    On a CPU some relations at a time, so that what lies between the two stays in its cache;
+    in the backward pass it is made again up to the linear layer. Only the result is kept.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        nodes: Tensor,
+        shares: Tensor,
+        table_PD: Tensor,
+        gain: Tensor,
+        shift: Tensor,
+        weight: Tensor,
+        bias: Tensor,
+    ) -> Tensor:
+        found = table_PD.new_empty((len(nodes), len(weight)))
+        scale = table_PD.new_empty((len(nodes), 1))
+        for part in _parts(nodes, table_PD):
+            summed = _weighted_rows(table_PD, nodes[part], shares[part])
+            hidden = functional.layer_norm(summed, gain.shape, gain, shift).relu_()
+            raw = functional.linear(hidden, weight, bias)
+            found[part], _, scale[part] = torch.native_layer_norm(
+                raw, gain.shape, None, None, NORM_EPS
+            )
+        ctx.save_for_backward(nodes, shares, table_PD, gain, shift, weight, found, scale)
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, pull: Tensor) -> tuple[Tensor | None, ...]:
+        nodes, shares, table_PD, gain, shift, weight, found, scale = ctx.saved_tensors
+        table, gains, shifts, weights, biases = (
+            torch.zeros_like(like) for like in (table_PD, gain, shift, weight, shift)
+        )
+        for part in _parts(nodes, table_PD):
+            summed = _weighted_rows(table_PD, nodes[part], shares[part])
+            normal, mean, spread = torch.native_layer_norm(
+                summed, gain.shape, gain, shift, NORM_EPS
+            )
+            hidden = normal.relu()
+            to_raw = _through_norm(pull[part], found[part]).mul_(scale[part])
+            weights.addmm_(to_raw.T, hidden)
+            biases += to_raw.sum(dim=0)
+            to_normal = (to_raw @ weight).mul_(hidden > 0)
+            to_summed, to_gain, to_shift = torch.ops.aten.native_layer_norm_backward(
+                to_normal, summed, gain.shape, mean, spread, gain, shift, [True] * 3
+            )
+            gains += to_gain
+            shifts += to_shift
+            table += _back_to_rows(to_summed, nodes[part], shares[part], len(table))
+        return None, None, table, gains, shifts, weights, biases
+
+
+def _parts(nodes: Tensor, table_PD: Tensor) -> list[slice]:
+    """Cut relations into parts: on a CPU as many as its cache holds features of."""
+    count = len(nodes)
+    few = max(1, count)
+    if nodes.device.type == "cpu":
+        few = max(1, neighbour_attention.CACHED_NUMBERS // table_PD.shape[1])
+    return [slice(start, min(start + few, count)) for start in range(0, count, few)]
+
+
+def _weighted_rows(table_PD: Tensor, nodes: Tensor, shares: Tensor) -> Tensor:
+    return functional.embedding_bag(nodes, table_PD, mode="sum", per_sample_weights=shares)
+
+
+def _back_to_rows(pull: Tensor, nodes: Tensor, shares: Tensor, rows: int) -> Tensor:
+    """Pull gradients [N, D] of weighted rows back to the table [rows, D].
+
+    The same sum the other way round: every row of the table collects those it was part of.
+    """
+    ordered, order = nodes.flatten().sort(stable=True)
+    ends = torch.arange(rows, device=nodes.device)
+    return functional.embedding_bag(
+        order // nodes.shape[1],
+        pull,
+        torch.searchsorted(ordered, ends),
+        mode="sum",
+        per_sample_weights=shares.flatten()[order],
+    )
+
+
+def _through_norm(pull: Tensor, normal: Tensor) -> Tensor:
+    """Pull a gradient through a norm without gain, but for the scale it divided by."""
+    mean = pull.mean(dim=-1, keepdim=True)
+    along = (pull * normal).mean(dim=-1, keepdim=True)
+    return (pull - mean).addcmul_(normal, along, value=-1)

@@ -1,0 +1,117 @@
+"""One half second of many rollouts: what the network is shown, and what it says of it.
+
+Dims as in ``steps``. What a network has no head for is None in its answers.
+"""
+
+from dataclasses import dataclass, fields
+
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor
+
+from infgen.model.logits import MotionOutputs
+from infgen.tokens.scene_tokens import Presence
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """All agents of all rollouts at the end of one half second.
+
+    Attributes:
+        kind: ``AgentKind``.
+        size_lwh_m: Boxes.
+        pose: Quantised x, y, heading (world frame of the scene).
+        move: Move that led here, ``FIRST_MOVE`` where entering, else ``NO_MOVE``.
+        presence: ``Presence``. LEAVING is the last column of an agent.
+        observed: False where absent, unseen or entering (as ``SceneTokens.observed``).
+        cell: Cell of the ego's grid that holds the agent, or ``NO_CELL``.
+    """
+
+    kind: Int64[Tensor, "rollout row"]
+    size_lwh_m: Float32[Tensor, "rollout row 3"]
+    pose: Float32[Tensor, "rollout row 3"]
+    move: Int64[Tensor, "rollout row"]
+    presence: Int64[Tensor, "rollout row"]
+    observed: Bool[Tensor, "rollout row"]
+    cell: Int64[Tensor, "rollout row"]
+
+    @property
+    def visible(self) -> Bool[Tensor, "rollout row"]:
+        """Who can be seen: who is observed, or just entering."""
+        return self.observed | (self.presence == Presence.ENTERING)
+
+    def take(self, rollouts: Int64[Tensor, " kept"]) -> "Column":
+        """Go on with some rollouts only."""
+        return Column(*(getattr(self, each.name)[rollouts] for each in fields(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class MotionStep:
+    """What follows a column.
+
+    Attributes:
+        packed: Of the visible rows, one after the other; below, rows that are not visible
+            hold zeros.
+    """
+
+    packed: MotionOutputs
+
+    @property
+    def move_logits(self) -> Float32[Tensor, "rollout row move"]:
+        """Next move, by the row's own kind's codebook."""
+        return self.packed.rows.spread(self.packed.move_logits)
+
+    @property
+    def leave_logit(self) -> Float32[Tensor, "rollout row"] | None:
+        """Log-odds that the next token is the agent's last (LEAVING)."""
+        logit = self.packed.leave_logit
+        return None if logit is None else self.packed.rows.spread(logit)
+
+    @property
+    def pattern_logits(self) -> Float32[Tensor, "rollout row pattern"] | None:
+        """When within the next token a log would show the agent."""
+        logits = self.packed.pattern_logits
+        return None if logits is None else self.packed.rows.spread(logits)
+
+
+@dataclass(frozen=True, slots=True)
+class EntryQuery:
+    """Whether one more agent enters at this column, and where.
+
+    Attributes:
+        add_logit: Log-odds of ADD against BEGIN MOTION.
+        cell_logits: Cell of the ego's grid, given ADD ...
+        place_m: ... or the place itself, in the ego's grid frame.
+    """
+
+    add_logit: Float32[Tensor, " rollout"]
+    cell_logits: Float32[Tensor, "rollout cell"] | None
+    place_m: Float32[Tensor, "rollout 2"] | None
+
+    def take(self, rollouts: Int64[Tensor, " kept"]) -> "EntryQuery":
+        """Go on with some rollouts only."""
+        cell, place = self.cell_logits, self.place_m
+        return EntryQuery(
+            self.add_logit[rollouts],
+            None if cell is None else cell[rollouts],
+            None if place is None else place[rollouts],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class EntryDetails:
+    """Who enters at a place: sample a kind, then take that kind's row of the others.
+
+    Attributes:
+        kind_logits: ``AgentKind`` given the cell.
+        size_lwh_m: Box, given the kind.
+        heading_logits: Heading bin relative to the ego, given the kind ...
+        turned_rad: ... or the heading itself, relative to the ego.
+        offset_m: Position less the cell's centre, in the ego's grid frame, given the kind;
+            None where the place was known already.
+    """
+
+    kind_logits: Float32[Tensor, "rollout kind"]
+    size_lwh_m: Float32[Tensor, "rollout kind 3"]
+    heading_logits: Float32[Tensor, "rollout kind heading"] | None
+    turned_rad: Float32[Tensor, "rollout kind"] | None
+    offset_m: Float32[Tensor, "rollout kind 2"] | None

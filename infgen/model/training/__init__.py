@@ -1,0 +1,1 @@
+"""Learning: the loss terms, their weights, closed-loop fine-tuning and diagnostics."""

@@ -1,0 +1,158 @@
+"""Scenes as the network itself plays them, to learn from: closed-loop fine-tuning.
+
+CatK (SPEC 7.1): at every half second each agent takes, of the moves that the network finds
+most likely, the one that ends nearest to where the log says the agent is. So the scene
+stays near the log, and all that is seen of it is the network's own doing. What is to be
+learned is the move of all that leads nearest to the log from where the agent has come to.
+
+Where the log says an agent is means its quantised pose, as batches hold it.
+"""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from infgen.model.batching.batch import Agents, Batch, Details, Entries
+from infgen.model.batching.insertion_targets import describe
+from infgen.model.nearest_tokens import MoveEnds, nearest, nearest_of, to_local, to_world
+from infgen.model.network import EGO, Network
+from infgen.model.stepping import Stepper
+from infgen.model.token_step import Column
+from infgen.tokens.grid import Grid, encode_cell, to_grid
+from infgen.tokens.scene_tokens import NO_CELL, Presence
+
+
+@torch.no_grad()
+def close_loop(network: Network, batch: Batch, top: int) -> Batch:
+    """Play a batch from its first half second on, close to the log.
+
+    Who enters, leaves or is unseen when and where is the log's: newcomers enter at their
+    true poses, and who was unseen goes on from its true pose. Cells, headings and offsets
+    that are told relative to the ego are told anew, as it is played like all others.
+
+    Args:
+        network: What plays; its mode (training or not) is kept.
+        batch: Scenes as logged, without noise, on the network's device.
+        top: Most likely moves that each is chosen from.
+
+    Returns:
+        The batch to learn from, with other poses, moves, labels and cells.
+
+    Raises:
+        ValueError: if there is nothing to choose from.
+    """
+    if top < 1:
+        raise ValueError(
+            f"no move is among the {top} most likely moves; expected 1 or more"
+        )
+    learning = network.training
+    try:
+        agents, off = _play(network, batch, top)
+    finally:
+        network.train(learning)
+    return replace(
+        batch,
+        agents=agents,
+        entries=_tell_entries(batch.entries, agents),
+        details=_tell_details(batch.details, agents, off, network.grid),
+    )
+
+
+def _play(network: Network, batch: Batch, top: int) -> tuple[Agents, Tensor]:
+    """Play all agents; also tell where [scene, token, agent] one is not as logged."""
+    logged, stepper, grid = batch.agents, Stepper(network), network.grid
+    device = logged.pose.device
+    codebook = network.motion_codebook()
+    ends, top = MoveEnds.of(codebook, device), min(top, codebook.num_moves)
+    scenes, tokens, rows = logged.move.shape
+    memory = stepper.begin(batch.roads, torch.arange(scenes, device=device), rows)
+    off = torch.zeros_like(logged.observed)
+    played = replace(
+        logged,
+        pose=logged.pose.clone(),
+        move=logged.move.clone(),
+        label=logged.label.clone(),
+        cell=logged.cell.clone(),
+    )
+    for token in range(1, tokens):
+        said = stepper.motion_step(memory, _column(played, token - 1))
+        _move(played, logged, off, token, said.move_logits, top, ends)
+        played.cell[:, token] = _cells(played, logged, off, token, grid)
+    return played, off
+
+
+def _move(
+    played: Agents,
+    logged: Agents,
+    off: Tensor,
+    token: int,
+    logits: Tensor,
+    top: int,
+    ends: MoveEnds,
+) -> None:
+    """Write the next move of all who are seen now and then, and where it leads."""
+    who = logged.observed[:, token] & logged.visible[:, token - 1]  # [scene, agent]
+    before, true = played.pose[:, token - 1][who], logged.pose[:, token][who]
+    kind = logged.kind[who]
+    wanted = to_local(true, before)
+    likely = logits[who].topk(top).indices.sort().values
+    taken = nearest_of(wanted, kind, likely, ends)
+
+    # Who is as logged and moves as logged stays so to the last bit.
+    strays = off[:, token - 1][who] | (taken != logged.move[:, token][who])
+    led = to_world(ends.pose[kind, taken], before)
+    off[:, token][who] = strays
+    played.move[:, token][who] = taken
+    played.label[:, token][who] = nearest(wanted, kind, ends)
+    played.pose[:, token][who] = torch.where(strays[:, None], led, true)
+
+
+def _column(agents: Agents, token: int) -> Column:
+    return Column(
+        kind=agents.kind,
+        size_lwh_m=agents.size_lwh_m,
+        pose=agents.pose[:, token],
+        move=agents.move[:, token],
+        presence=agents.presence[:, token],
+        observed=agents.observed[:, token],
+        cell=agents.cell[:, token],
+    )
+
+
+def _cells(played: Agents, logged: Agents, off: Tensor, token: int, grid: Grid) -> Tensor:
+    """Cells [scene, agent] of the played ego's grid; a newcomer's is never lost."""
+    pose, old = played.pose[:, token].numpy(force=True), logged.cell[:, token]
+    found = encode_cell(to_grid(pose[..., :2], pose[:, EGO, None]), grid)
+    new = torch.from_numpy(found).to(old)
+    entering = logged.presence[:, token] == Presence.ENTERING
+    lost = entering & ((old == NO_CELL) | (new == NO_CELL))
+    told = logged.visible[:, token] & (off[:, token] | off[:, token, EGO, None])
+    return torch.where(told & ~lost, new, old)
+
+
+def _tell_entries(entries: Entries, agents: Agents) -> Entries:
+    cell = agents.cell.gather(2, entries.agent.clamp(min=0))
+    return replace(entries, cell=torch.where(entries.agent >= 0, cell, entries.cell))
+
+
+def _tell_details(details: Details, agents: Agents, off: Tensor, grid: Grid) -> Details:
+    """Describe the agents that are not to the ego as they were."""
+    scene = torch.arange(len(off), device=off.device)[:, None]
+    token, agent = details.token, details.agent.clamp(min=0)
+    changed = off[scene, token, agent] | off[scene, token, EGO]
+    changed &= details.present
+    new = agents.cell[scene, token, agent]
+    cell = torch.where(changed & (new != NO_CELL), new, details.cell)
+    pose, ego_pose = agents.pose[scene, token, agent], agents.pose[scene, token, EGO]
+    told = describe(
+        pose.numpy(force=True), ego_pose.numpy(force=True), cell.numpy(force=True), grid
+    )
+    heading = torch.from_numpy(told[0]).to(cell)
+    offset_m = torch.from_numpy(told[1]).to(pose)
+    return replace(
+        details,
+        cell=cell,
+        heading=torch.where(changed, heading, details.heading),
+        offset_m=torch.where(changed[..., None], offset_m, details.offset_m),
+    )

@@ -1,0 +1,66 @@
+"""What is told of a network besides its losses: perplexity, and how far to trust it."""
+
+import torch
+from jaxtyping import Bool, Float32, Float64
+from torch import Tensor
+from torch.nn import functional
+
+from infgen.model.batching.batch import Batch
+from infgen.model.logits import Outputs
+from infgen.model.training.losses import motion_mask, stay_mask
+from infgen.tokens.scene_tokens import Presence
+
+BIN_EDGES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
+"""Bins of predicted probabilities, fine where agents leave: once in some twenty tokens."""
+
+
+@torch.no_grad()
+def move_surprise(outputs: Outputs, batch: Batch) -> Float32[Tensor, "2"]:
+    """Sum the negative log-likelihoods of the next moves, and count them.
+
+    Without label smoothing and weights: the exponential of their mean is the perplexity.
+    """
+    rows, agents = outputs.motion.rows, batch.agents
+    mask = rows.pack(motion_mask(agents))
+    target = rows.pack(agents.label.roll(-1, dims=1))[mask]
+    each = functional.cross_entropy(
+        outputs.motion.move_logits[mask], target, reduction="none"
+    )
+    return torch.stack([each.sum(), mask.sum().to(each.dtype)])
+
+
+@torch.no_grad()
+def decisions(outputs: Outputs, batch: Batch) -> dict[str, tuple[Tensor, Tensor]]:
+    """Gather the decisions to leave and to add: probability, and whether it happened.
+
+    Returns:
+        Both [decision] by the name of the loss term, of those the network has a head for.
+    """
+    found = {}
+    rows, leave_logit = outputs.motion.rows, outputs.motion.leave_logit
+    if leave_logit is not None:
+        mask = rows.pack(stay_mask(batch.agents))
+        leaves = rows.pack(batch.agents.presence.roll(-1, dims=1) == Presence.LEAVING)
+        found["stay"] = (leave_logit[mask].sigmoid(), leaves[mask])
+    if outputs.entries is not None:
+        asked, add_logit = outputs.entries.rows, outputs.entries.add_logit
+        agent = asked.pack(batch.entries.agent)
+        slot = torch.arange(agent.shape[1], device=agent.device)
+        decided = slot <= asked.pack(batch.entries.count)[:, None]
+        found["add"] = (add_logit[decided].sigmoid(), (agent >= 0)[decided])
+    return found
+
+
+def reliability(
+    probability: Float32[Tensor, " decision"], happened: Bool[Tensor, " decision"]
+) -> Float64[Tensor, "3 bin"]:
+    """Sort decisions into ``BIN_EDGES`` by their probability.
+
+    Returns:
+        Per bin: how many there are, the sum of their probabilities, how many happened.
+    """
+    edges = torch.tensor(BIN_EDGES[1:-1], device=probability.device)
+    at = torch.bucketize(probability, edges, right=True)
+    found = torch.zeros((3, len(BIN_EDGES) - 1), dtype=torch.float64, device=at.device)
+    each = torch.stack([torch.ones_like(probability), probability, happened.float()])
+    return found.index_add_(1, at, each.double())

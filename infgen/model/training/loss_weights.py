@@ -1,0 +1,65 @@
+"""How much of a batch is supervised: the weights that each term of the loss divides by.
+
+A function of the batch alone. So a step that is cut into parts, and spread over processes,
+can divide every part by the weights of the whole before any of it is computed.
+"""
+
+import torch
+from torch import Tensor
+
+from infgen.config import TrainSettings
+from infgen.model.batching.batch import Batch, Roads
+from infgen.model.training.losses import motion_mask, pattern_mask, stay_mask
+from infgen.tokens.scene_tokens import Presence
+
+TERMS = (
+    *("motion", "stay", "pattern"),
+    *("add", "cell", "place"),
+    *("kind", "size", "heading", "turn", "offset"),
+    "map",
+)
+"""Every term that a network may have, in this order."""
+
+
+def supervised(batch: Batch, settings: TrainSettings) -> Tensor:
+    """Sum the weights of every term [term] over a batch, as ``losses`` does.
+
+    Terms that the network has no head for are counted all the same.
+    """
+    details, entries = batch.details, batch.entries
+    newcomers = (entries.agent >= 0).sum()
+    described = details.present.sum()
+    real = (details.present & details.newcomer).sum()
+    weight = {
+        "motion": _motion(batch, settings),
+        "stay": stay_mask(batch.agents).sum(),
+        "pattern": pattern_mask(batch.agents).sum(),
+        "add": _decided(batch),
+        **dict.fromkeys(("cell", "place"), newcomers),
+        **dict.fromkeys(("kind", "size"), real),
+        **dict.fromkeys(("heading", "turn", "offset"), described),
+        "map": _hidden(batch.roads).sum(),
+    }
+    return torch.stack([weight[name].float() for name in TERMS])
+
+
+def _motion(batch: Batch, settings: TrainSettings) -> Tensor:
+    """Moves, a newcomer's first one counting more; at token 0 nobody comes in."""
+    mask = motion_mask(batch.agents)
+    first = batch.agents.presence == Presence.ENTERING
+    first[:, 0] = False
+    return mask.sum() + (settings.first_move_weight - 1) * (mask & first).sum()
+
+
+def _decided(batch: Batch) -> Tensor:
+    """Decisions between ADD and BEGIN MOTION: one per newcomer, and one after the last."""
+    entries = batch.entries
+    slots = entries.agent.shape[2]
+    return torch.where(entries.asked, (entries.count + 1).clamp(max=slots), 0).sum()
+
+
+def _hidden(roads: Roads) -> Tensor:
+    """Which road tokens are predicted [scene, road]: hidden ones after one that is not."""
+    wanted = roads.real & roads.picked & roads.follows
+    wanted[:, 1:] &= ~roads.picked[:, :-1]
+    return wanted

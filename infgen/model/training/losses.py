@@ -1,0 +1,273 @@
+"""What the network is trained for: one masked mean per kind of token (SPEC 5).
+
+Control tokens (stay or leave, add or begin) carry no class weights: their probabilities are
+to be sampled from, so they must be calibrated. Each is supervised once per decision.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from infgen.config import TrainSettings
+from infgen.model.batching.batch import Agents, Batch
+from infgen.model.logits import (
+    DetailOutputs,
+    EntryOutputs,
+    MotionOutputs,
+    Outputs,
+    RoadOutputs,
+)
+from infgen.model.neighbours import grid_place
+from infgen.model.network import EGO
+from infgen.model.relations import Rows, wrap_angle
+from infgen.tokens.scene_tokens import Presence
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One term of the loss, as sums, so that terms of several batches add up.
+
+    Attributes:
+        loss: Weighted sum over the supervised tokens.
+        weight: Sum of their weights.
+        count: How many there are.
+        right: How many are predicted exactly; for control tokens the sum of the predicted
+            probabilities of the event ...
+        event: ... and how often it happened; 0 for others.
+    """
+
+    loss: Tensor
+    weight: Tensor
+    count: Tensor
+    right: Tensor
+    event: Tensor
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean loss; 0 where nothing is supervised."""
+        return self.loss / self.weight.clamp(min=1e-6)
+
+    def detach(self) -> "Term":
+        """Drop the graph."""
+        return Term(
+            self.loss.detach(), self.weight, self.count, self.right.detach(), self.event
+        )
+
+    def __add__(self, other: "Term") -> "Term":
+        return Term(
+            self.loss + other.loss,
+            self.weight + other.weight,
+            self.count + other.count,
+            self.right + other.right,
+            self.event + other.event,
+        )
+
+
+Terms = dict[str, Term]
+CONTROLS = ("stay", "add")
+"""Terms whose token is a yes or no."""
+MEASURED = ("size", "offset", "place", "turn")
+"""Terms that are distances: nothing is right or wrong."""
+
+
+def losses(outputs: Outputs, batch: Batch, settings: TrainSettings) -> Terms:
+    """Compute every term, by name; none of what the network has no head for."""
+    smoothing, motion = settings.label_smoothing, outputs.motion
+    terms = {"motion": _motion(motion, batch.agents, settings)}
+    if motion.leave_logit is not None:
+        terms["stay"] = _stay(motion.rows, motion.leave_logit, batch.agents)
+    if motion.pattern_logits is not None:
+        terms["pattern"] = _pattern(motion.rows, motion.pattern_logits, batch.agents)
+    if outputs.entries is not None:
+        terms |= _entries(outputs.entries, batch, smoothing)
+    if outputs.details is not None:
+        terms |= _details(outputs.details, batch)
+    if outputs.roads is not None:
+        terms["map"] = _roads(outputs.roads, smoothing)
+    return terms
+
+
+def total(terms: Mapping[str, Term], settings: TrainSettings) -> Tensor:
+    """Sum the terms' means, weighted as ``<name>_weight`` says."""
+    weighted = [getattr(settings, f"{name}_weight") * t.mean for name, t in terms.items()]
+    return torch.stack(weighted).sum()
+
+
+def figures(terms: Mapping[str, Term]) -> dict[str, float]:
+    """Terms as numbers: loss and count, and accuracy, or for control tokens rates."""
+    found: dict[str, float] = {}
+    for name, term in terms.items():
+        count = max(1.0, float(term.count))
+        found[name] = float(term.mean.detach())
+        found[f"{name}_count"] = float(term.count)
+        if name in CONTROLS:
+            found[f"{name}_predicted"] = float(term.right.detach()) / count
+            found[f"{name}_logged"] = float(term.event) / count
+        elif name not in MEASURED:
+            found[f"{name}_accuracy"] = float(term.right.detach()) / count
+    return found
+
+
+def motion_mask(agents: Agents) -> Tensor:
+    """Tell which tokens [scene, token, agent] have a supervised next move (SPEC 3.5).
+
+    The next move must be known. A newcomer's first one is always supervised. Later ones ask
+    for the token before and the one itself to be observed, so that nothing is learned at
+    the edges of a gap; entering counts as observed for the token that follows it.
+    """
+    entering = agents.presence == Presence.ENTERING
+    there = agents.observed
+    known = _next(agents.label, -1) >= 0
+    mask = known & _next(there, False)
+    mask &= entering | (there & _before(there | entering))
+    return mask & agents.near[:, None]
+
+
+def stay_mask(agents: Agents) -> Tensor:
+    """Tell which tokens [scene, token, agent] decide between staying and leaving.
+
+    All from entering to the last but one at which the agent is seen. Not the ego: it never
+    leaves. Nor at a log's end, where who is lost for a moment does not come back.
+    """
+    mask = pattern_mask(agents) & _next(agents.told, False)[..., None]
+    mask[:, :, EGO] = False
+    return mask
+
+
+def pattern_mask(agents: Agents) -> Tensor:
+    """Tell which tokens [scene, token, agent] the agent goes on living after."""
+    following = _next(agents.presence, int(Presence.ABSENT))
+    goes_on = (following == Presence.PRESENT) | (following == Presence.LEAVING)
+    return agents.visible & (agents.presence != Presence.LEAVING) & goes_on
+
+
+def _next(values: Tensor, last: int | bool) -> Tensor:
+    """Shift values by one token, so that each stands where it is predicted from."""
+    return torch.cat([values[:, 1:], torch.full_like(values[:, :1], last)], dim=1)
+
+
+def _before(values: Tensor) -> Tensor:
+    return torch.cat([torch.zeros_like(values[:, :1]), values[:, :-1]], dim=1)
+
+
+def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> Term:
+    """Next move of every agent; a newcomer's first one counts more."""
+    rows = outputs.rows
+    mask = rows.pack(motion_mask(agents))
+    weight = torch.ones(agents.move.shape, device=mask.device)
+    entering = agents.presence[:, 1:] == Presence.ENTERING
+    weight[:, 1:][entering] = settings.first_move_weight  # At token 0 nobody comes in.
+    target = rows.pack(_next(agents.label, -1))
+    return _choice(
+        outputs.move_logits[mask],
+        target[mask],
+        settings.label_smoothing,
+        rows.pack(weight)[mask],
+    )
+
+
+def _stay(rows: Rows, leave_logit: Tensor, agents: Agents) -> Term:
+    mask = rows.pack(stay_mask(agents))
+    following = rows.pack(_next(agents.presence, int(Presence.ABSENT)))
+    return _event(leave_logit[mask], following[mask] == Presence.LEAVING)
+
+
+def _pattern(rows: Rows, pattern_logits: Tensor, agents: Agents) -> Term:
+    mask = rows.pack(pattern_mask(agents))
+    target = rows.pack(_next(agents.pattern, 0))
+    return _choice(pattern_logits[mask], target[mask], 0.0)
+
+
+def _entries(outputs: EntryOutputs, batch: Batch, smoothing: float) -> Terms:
+    """ADD for every newcomer and BEGIN MOTION once after them; cells of newcomers."""
+    entries = batch.entries
+    count = outputs.rows.pack(entries.count)[:, None]
+    slot = torch.arange(entries.agent.shape[2], device=count.device)
+    decided = slot <= count
+    comes = outputs.rows.pack(entries.agent) >= 0
+    terms = {"add": _event(outputs.add_logit[decided], comes[decided])}
+    if outputs.cell_logits is not None:
+        cell = outputs.rows.pack(entries.cell)
+        terms["cell"] = _choice(outputs.cell_logits[comes], cell[comes], smoothing)
+    if outputs.place_m is not None:
+        gap_m = outputs.place_m - _places(outputs.rows, batch)
+        terms["place"] = _distance(gap_m[comes] / outputs.radius_m)
+    return terms
+
+
+def _places(rows: Rows, batch: Batch) -> Tensor:
+    """Where newcomers are in the ego's grid frame [row, slot, 2]; anything for nobody."""
+    pose = rows.pack(batch.agents.pose)  # [row, agent, 3]
+    agent = rows.pack(batch.entries.agent).clamp(min=0)
+    entry_pose = pose.gather(1, agent[..., None].expand(-1, -1, 3))
+    return grid_place(entry_pose, pose[:, EGO, None])
+
+
+def _details(outputs: DetailOutputs, batch: Batch) -> Terms:
+    """Kind and size of newcomers; heading and offset also of those who play the part."""
+    details, pack = batch.details, outputs.rows.pack
+    real = pack(details.newcomer)
+    size_log_m = pack(details.size_lwh_m).clamp(min=0.05).log()
+    terms = {
+        "kind": _choice(outputs.kind_logits[real], pack(details.kind)[real], 0.0),
+        "size": _distance((outputs.size_log_m - size_log_m)[real]),
+    }
+    if outputs.heading_logits is not None:
+        terms["heading"] = _choice(outputs.heading_logits, pack(details.heading), 0.0)
+    if outputs.turned_rad is not None:
+        gap_rad = wrap_angle(outputs.turned_rad - _turns(outputs.rows, batch))
+        terms["turn"] = _distance(gap_rad[:, None] / math.pi)
+    if outputs.offset_m is not None:
+        terms["offset"] = _distance(outputs.offset_m - pack(details.offset_m))
+    return terms
+
+
+def _turns(rows: Rows, batch: Batch) -> Tensor:
+    """Headings of the agents described, relative to the ego [row]."""
+    details, heading_rad = batch.details, batch.agents.pose[..., 2]
+    scene, token = rows.at // details.present.shape[1], rows.pack(details.token)
+    own_rad = heading_rad[scene, token, rows.pack(details.agent)]
+    return own_rad - heading_rad[scene, token, EGO]
+
+
+def _roads(outputs: RoadOutputs, smoothing: float) -> Term:
+    return _choice(outputs.logits, outputs.token, smoothing)
+
+
+def _choice(
+    logits: Tensor, target: Tensor, smoothing: float, weight: Tensor | None = None
+) -> Term:
+    """Cross-entropy of [row, choice] logits."""
+    each = functional.cross_entropy(
+        logits, target, reduction="none", label_smoothing=smoothing
+    )
+    weight = torch.ones_like(each) if weight is None else weight
+    right = (logits.argmax(dim=-1) == target).sum() if len(logits) else each.sum()
+    return Term((each * weight).sum(), weight.sum(), _count(each), right, _none(each))
+
+
+def _event(logit: Tensor, happens: Tensor) -> Term:
+    """Binary cross-entropy of [row] log-odds."""
+    each = functional.binary_cross_entropy_with_logits(
+        logit, happens.to(logit.dtype), reduction="none"
+    )
+    predicted = torch.sigmoid(logit).sum()
+    return Term(each.sum(), _count(each), _count(each), predicted, happens.sum())
+
+
+def _distance(gap: Tensor) -> Term:
+    """Mean square of gaps [row, number]."""
+    each = gap.square().mean(dim=-1)
+    return Term(each.sum(), _count(each), _count(each), _none(each), _none(each))
+
+
+def _count(each: Tensor) -> Tensor:
+    return each.new_tensor(float(len(each)))
+
+
+def _none(each: Tensor) -> Tensor:
+    return each.new_zeros(())

@@ -1,0 +1,111 @@
+"""Where a newcomer may stand: in nobody's way, and a vehicle near a lane.
+
+In somebody's way is whoever stands where its box is, or will be in half a second if it goes
+on as in the last one. Pedestrians may stand on pedestrians: groups walk closer than boxes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+
+from infgen.geometry import boxes_overlap, to_world
+from infgen.rollout.population import EGO_ROW, Newcomers, Population, entry_pose
+from infgen.scene import AgentKind
+from infgen.tokens.map import LineKind
+from infgen.tokens.scene_tokens import Presence, SceneTokens
+from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+
+NOWHERE_M = np.float32(1e9)
+"""Where padding of the lanes lies."""
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """Lanes of the maps that a batch of rollouts plays on, as straight pieces.
+
+    Attributes:
+        start_m: First point of each piece.
+        along_m: From there to its last point.
+        scene: Map of each rollout.
+        lane_m: Farthest from a lane that a vehicle may enter, on a map that has lanes.
+        end_pose: Where each kind's moves end.
+    """
+
+    start_m: Float32[np.ndarray, "scene lane 2"]
+    along_m: Float32[np.ndarray, "scene lane 2"]
+    scene: Int64[np.ndarray, " rollout"]
+    lane_m: float
+    end_pose: Float32[np.ndarray, "3 move 3"]
+
+    def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "Room":
+        """Go on with some rollouts only."""
+        return replace(self, scene=self.scene[rollouts])
+
+    def allows(
+        self, population: Population, newcomers: Newcomers
+    ) -> Bool[np.ndarray, " rollout"]:
+        """Tell which newcomers may stand where they are to enter."""
+        pose = entry_pose(population.pose[:, EGO_ROW], newcomers)
+        on_foot = newcomers.kind == AgentKind.PEDESTRIAN
+        passed = on_foot[:, None] & (population.kind == AgentKind.PEDESTRIAN)
+        in_the_way = np.zeros(len(pose), dtype=bool)
+        for everyone in (population.pose, self._soon(population)):
+            on_somebody = boxes_overlap(
+                pose[:, None],
+                newcomers.size_lwh_m[:, None, :2],
+                everyone,
+                population.size_lwh_m[..., :2],
+            )
+            on_somebody &= (population.presence != Presence.ABSENT) & ~passed
+            in_the_way |= on_somebody.any(axis=1)
+        laneless = (self.start_m == NOWHERE_M).all(axis=(1, 2))[self.scene]
+        by_a_lane = self.lane_distance_m(pose[:, :2]) <= self.lane_m
+        by_a_lane |= laneless | (newcomers.kind != AgentKind.VEHICLE)
+        return by_a_lane & ~in_the_way
+
+    def _soon(self, population: Population) -> Float32[np.ndarray, "rollout row 3"]:
+        """Where everybody is in half a second who moves as in the last; others stand."""
+        moves = population.move >= 0
+        move = np.where(moves, population.move, 0)
+        step = self.end_pose[population.kind, move] * moves[..., None]
+        return to_world(step, population.pose)
+
+    def lane_distance_m(
+        self, xy_m: Float32[np.ndarray, "rollout 2"]
+    ) -> Float32[np.ndarray, " rollout"]:
+        """Distance of a point of every rollout to the nearest lane of its map."""
+        start_m, along_m = self.start_m[self.scene], self.along_m[self.scene]
+        away_m = xy_m[:, None] - start_m  # [rollout, lane, 2]
+        length2 = np.maximum((along_m**2).sum(axis=-1), np.float32(1e-6))
+        share = np.clip((away_m * along_m).sum(axis=-1) / length2, 0, 1)
+        gap_m = np.linalg.norm(away_m - share[..., None] * along_m, axis=-1)
+        return gap_m.min(axis=1, initial=np.inf)
+
+
+def make_room(
+    maps: Sequence[SceneTokens],
+    books: tuple[MotionCodebook, RoadCodebook],
+    scene: Int64[np.ndarray, " rollout"],
+    lane_m: float,
+) -> Room:
+    """Lay out the lanes of some maps; ``scene`` is the map of each rollout."""
+    moves, roads = books
+    lanes = [_lanes(tokens, roads) for tokens in maps]
+    shape = (len(maps), max(len(start_m) for start_m, _ in lanes), 2)
+    start_m = np.full(shape, NOWHERE_M)
+    along_m = np.zeros(shape, dtype=np.float32)
+    for at, (first_m, step_m) in enumerate(lanes):
+        start_m[at, : len(first_m)] = first_m
+        along_m[at, : len(first_m)] = step_m
+    return Room(start_m, along_m, scene, lane_m, moves.end_pose)
+
+
+def _lanes(tokens: SceneTokens, roads: RoadCodebook) -> tuple[np.ndarray, np.ndarray]:
+    """First points of a map's lane tokens, and the way to their last points."""
+    rows = tokens.road_line_kind == LineKind.LANE
+    end_m = roads.curve_m[tokens.road_token[rows], -1]
+    end = np.pad(end_m, ((0, 0), (0, 1)))
+    pose = tokens.road_pose[rows]
+    return pose[:, :2], to_world(end, pose)[:, :2] - pose[:, :2]

@@ -1,0 +1,1 @@
+"""Optional rules over the choices of the network: collision, off-road, stalls, density."""

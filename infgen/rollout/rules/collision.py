@@ -1,0 +1,81 @@
+"""Who would run into somebody soon, if everybody goes on as in this half second."""
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+
+from infgen.geometry import boxes_overlap, to_local, to_world
+from infgen.rollout.population import Population
+from infgen.scene import AgentKind
+from infgen.tokens.vocabulary import MotionCodebook
+
+LOOKED_AT = (3, 5)
+"""Steps of a half second at which boxes are compared: its middle and its end."""
+ON_THE_WAY_M = 3.0
+"""Boxes this far apart at the end may have met before."""
+
+
+def repeat(
+    before: Population,
+    move: Int64[np.ndarray, "rollout row"],
+    codebook: MotionCodebook,
+    times: int,
+) -> Float32[np.ndarray, "rollout row looked 3"]:
+    """Where everyone is to be if its move is made several times, at ``LOOKED_AT``."""
+    steps = codebook.path[before.kind, move][:, :, LOOKED_AT]  # [rollout, row, looked, 3]
+    pose, found = before.pose, []
+    for _ in range(times):
+        found.append(to_world(steps, pose[:, :, None]))
+        pose = found[-1][:, :, -1]
+    return np.concatenate(found, axis=2).astype(np.float32)
+
+
+def find_hits(
+    before: Population,
+    there: Bool[np.ndarray, "rollout row"],
+    ways: Float32[np.ndarray, "rollout row looked 3"],
+) -> Bool[np.ndarray, "rollout row"]:
+    """Tell who runs into somebody that was ahead of it and that it did not touch yet.
+
+    Pedestrians may walk through each other: groups are closer together than their boxes.
+
+    Args:
+        before: Everyone at the beginning of the half second.
+        there: Who is still there in it.
+        ways: Where everyone is to be, one moment after the other.
+    """
+    hits = np.zeros(there.shape, dtype=bool)
+    rollout, one, two = _near(before, there, ways)
+    if not len(rollout):
+        return hits
+    size_lw_m = before.size_lwh_m[..., :2]
+    sizes_m = size_lw_m[rollout, one], size_lw_m[rollout, two]
+    starts = before.pose[rollout, one], before.pose[rollout, two]
+    meet = boxes_overlap(
+        ways[rollout, one],
+        sizes_m[0][:, None],
+        ways[rollout, two],
+        sizes_m[1][:, None],
+    ).any(axis=1)
+    meet &= ~boxes_overlap(starts[0], sizes_m[0], starts[1], sizes_m[1])
+    for who, start, other in ((one, *starts), (two, *starts[::-1])):
+        ahead = to_local(other, start)[:, 0] > 0
+        hits[rollout[meet & ahead], who[meet & ahead]] = True
+    return hits
+
+
+def _near(
+    before: Population, there: np.ndarray, ways: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs whose boxes may meet: rollout and both rows."""
+    reach_m = np.linalg.norm(before.size_lwh_m[..., :2], axis=-1) / 2  # [rollout, row]
+    near = np.zeros((*there.shape, there.shape[1]), dtype=bool)
+    for xy_m in np.moveaxis(ways[..., 1::2, :2], 2, 0):  # at the ends of half seconds
+        gap_m = np.linalg.norm(xy_m[:, :, None] - xy_m[:, None], axis=-1)
+        near |= gap_m < reach_m[:, :, None] + reach_m[:, None] + ON_THE_WAY_M
+    near &= there[:, :, None] & there[:, None]
+    on_foot = before.kind == AgentKind.PEDESTRIAN
+    near &= ~(on_foot[:, :, None] & on_foot[:, None])
+    rows = there.shape[1]
+    near &= np.triu(np.ones((rows, rows), dtype=bool), 1)
+    rollout, one, two = np.nonzero(near)
+    return rollout, one, two

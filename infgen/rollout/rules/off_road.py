@@ -1,0 +1,146 @@
+"""Who would drive off the road soon, if everybody goes on as in this half second."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+
+from infgen.geometry import box_corners, squares_of
+from infgen.rollout.population import Population
+from infgen.scene import AgentKind, FeatureKind, Scene
+from infgen.spatial.nearest import nearest_by_cells
+from infgen.spatial.road_edges import RoadEdges, edges_of, project, signed_distance_m
+
+POINT_M = 0.5
+"""Distances are worked out at points this far apart, and interpolated."""
+TILE = 32
+"""Points along a side of a tile; its distances are worked out when somebody gets there."""
+LANE_M = 1.2
+"""This near to a lane's middle is road, whatever edge is near: that of a bridge, maybe."""
+OFF_M = 1.0
+"""Who is farther off the road than this is meant to be there, and may go where it likes."""
+SLACK_M = 0.05
+"""Farther off the road by no more than this is as far as before."""
+
+
+Lanes = tuple[Float32[np.ndarray, "piece 3"], Float32[np.ndarray, "piece 3"]]
+"""Pieces of lanes, flat: first points, and the ways to their last points."""
+
+
+class Kerbs:
+    """How far off the road the places of one map are, all of it flat."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Look at nothing yet."""
+        self._edges = edges_of(scene, flat=True)
+        self._lanes = lane_pieces(scene)
+        self._row: dict[int, int] = {}
+        self._off_m = np.zeros((0, TILE + 1, TILE + 1), dtype=np.float32)
+
+    def off_m(self, xy_m: Float32[np.ndarray, "point 2"]) -> Float32[np.ndarray, " point"]:
+        """Distance of points to the edge of the road; positive off it.
+
+        Points by a lane are on the road, and so is everything on a map without edges.
+        """
+        if self._edges is None or not len(xy_m):
+            return np.full(len(xy_m), -np.inf, dtype=np.float32)
+        at = np.floor(xy_m / POINT_M).astype(np.int64)
+        x, y = (at % TILE).T
+        u, v = (xy_m / POINT_M - at).astype(np.float32).T
+        tile = self._tiles(xy_m, at - at % TILE, self._edges)
+        off_m = self._off_m
+        near_m = off_m[tile, x, y] * (1 - u) + off_m[tile, x + 1, y] * u
+        far_m = off_m[tile, x, y + 1] * (1 - u) + off_m[tile, x + 1, y + 1] * u
+        return near_m * (1 - v) + far_m * v
+
+    def _tiles(
+        self,
+        xy_m: Float32[np.ndarray, "point 2"],
+        corner: Int64[np.ndarray, "point 2"],
+        edges: RoadEdges,
+    ) -> Int64[np.ndarray, " point"]:
+        """Row of the tile that each point is in; ``corner`` is the tile's first point."""
+        number, first, which = np.unique(
+            squares_of(xy_m, POINT_M * TILE), return_index=True, return_inverse=True
+        )
+        tiles = number.tolist()
+        new = [at for at, tile in enumerate(tiles) if tile not in self._row]
+        if new:
+            self._row |= {tiles[at]: len(self._row) + i for i, at in enumerate(new)}
+            looked_at = self._survey(corner[first[new]], edges)
+            self._off_m = np.concatenate([self._off_m, looked_at])
+        return np.array([self._row[tile] for tile in tiles], dtype=np.int64)[which]
+
+    def _survey(
+        self, corner: Int64[np.ndarray, "tile 2"], edges: RoadEdges
+    ) -> Float32[np.ndarray, "tile side side"]:
+        """Work out the distances of tiles, to the first points of the next."""
+        steps = np.arange(TILE + 1)
+        place = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1)
+        at = corner[:, None, None] + place
+        points_m = np.zeros((at[..., 0].size, 3), dtype=np.float32)
+        points_m[:, :2] = at.reshape(-1, 2) * np.float32(POINT_M)
+        off_m = signed_distance_m(points_m, edges)
+        off = np.flatnonzero(off_m > 0)
+        lane_m = lanes_distance_m(points_m[off], *self._lanes) - np.float32(LANE_M)
+        off_m[off] = np.minimum(off_m[off], lane_m)
+        return off_m.reshape(at.shape[:-1])
+
+
+def lane_pieces(scene: Scene) -> Lanes:
+    """Take all pieces of lanes of a map."""
+    road_map = scene.road_map
+    flat_m = road_map.xyz_m * np.array([1, 1, 0], dtype=np.float32)
+    feature = np.repeat(np.arange(road_map.num_features), np.diff(road_map.point_offsets))
+    lane = road_map.feature_kind[feature[:-1]] == FeatureKind.LANE
+    (row,) = np.nonzero(lane & (feature[:-1] == feature[1:]))
+    return flat_m[row], flat_m[row + 1] - flat_m[row]
+
+
+def lanes_distance_m(
+    points_m: Float32[np.ndarray, "point 3"],
+    start_m: Float32[np.ndarray, "piece 3"],
+    along_m: Float32[np.ndarray, "piece 3"],
+) -> Float32[np.ndarray, " point"]:
+    """Distance of points to the nearest piece; infinite if there is none."""
+    if not len(start_m):
+        return np.full(len(points_m), np.inf, dtype=np.float32)
+    nearest = nearest_by_cells(points_m, start_m, along_m)
+    along_m, away_m = along_m[nearest, :2], (points_m - start_m[nearest])[:, :2]
+    share = np.clip(project(away_m, along_m), 0, 1)
+    return np.linalg.norm(away_m - share[:, None] * along_m, axis=1).astype(np.float32)
+
+
+def find_departures(
+    before: Population,
+    which: Bool[np.ndarray, "rollout row"],
+    ways: Float32[np.ndarray, "rollout row looked 3"],
+    moments: Int64[np.ndarray, "rollout row"],
+    kerbs: Sequence[Kerbs],
+    scene: Int64[np.ndarray, " rollout"],
+) -> Bool[np.ndarray, "rollout row"]:
+    """Tell which vehicles leave the road, or go farther off it.
+
+    Args:
+        before: Everyone at the beginning of the half second.
+        which: Who is asked about.
+        ways: Where everyone is to be, one moment after the other.
+        moments: How many of these count for each.
+        kerbs: Of each map.
+        scene: Map of each rollout.
+    """
+    departs = np.zeros(which.shape, dtype=bool)
+    vehicle = which & (before.kind == AgentKind.VEHICLE)
+    poses = np.concatenate([before.pose[:, :, None], ways], axis=2)
+    for at, edge in enumerate(kerbs):
+        rollout, row = np.nonzero(vehicle & (scene == at)[:, None])
+        counts = np.arange(poses.shape[2]) <= moments[rollout, row, None]  # now, and then
+        who, moment = np.nonzero(counts)
+        size_lw_m = before.size_lwh_m[rollout[who], row[who], :2]
+        corners_m = box_corners(poses[rollout[who], row[who], moment], size_lw_m)
+        off_m = np.full((*counts.shape, 4), -np.inf, dtype=np.float32)
+        off_m[counts] = edge.off_m(corners_m.reshape(-1, 2)).reshape(-1, 4)
+        now_m, then_m = off_m[:, 0].max(axis=1), off_m[:, 1:].max(axis=(1, 2))
+        farther = then_m > np.maximum(now_m, 0) + np.float32(SLACK_M)
+        departs[rollout, row] = farther & (now_m < OFF_M)
+    return departs

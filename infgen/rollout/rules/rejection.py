@@ -1,0 +1,126 @@
+"""Whose move leads where it should not: into somebody, or off the road."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+
+from infgen.clock import CLOCK
+from infgen.rollout.population import Population
+from infgen.rollout.recording import Start, number_maps
+from infgen.rollout.rules.collision import LOOKED_AT, find_hits, repeat
+from infgen.rollout.rules.off_road import Kerbs, find_departures
+from infgen.tokens.scene_tokens import Presence
+from infgen.tokens.vocabulary import MotionCodebook
+
+CLEAR_AHEAD = 3
+"""Half seconds that everybody is taken to go on alike where it is asked who meets whom."""
+ROAD_AHEAD = (2, 5)
+"""The same where it is asked who leaves the road: at least, as cars that turn do not turn
+for long, and at most. Between these it is as far as a car needs to stop ..."""
+BRAKES_MPS2 = 4.0
+"""... if it brakes so."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lookout:
+    """Looks ahead for a batch of rollouts.
+
+    Attributes:
+        codebook: Moves.
+        kerbs: Of each map; none if nobody is kept on the road.
+        scene: Map of each rollout.
+    """
+
+    codebook: MotionCodebook
+    kerbs: Sequence[Kerbs]
+    scene: Int64[np.ndarray, " rollout"]
+
+    def go_wrong(
+        self,
+        before: Population,
+        move: Int64[np.ndarray, "rollout row"],
+        drawn: Bool[np.ndarray, "rollout row"],
+        *,
+        road: bool,
+    ) -> tuple[Bool[np.ndarray, "rollout row"], Bool[np.ndarray, "rollout row"]]:
+        """Tell whose move leads into somebody, and whose off the road. Who stands may.
+
+        Args:
+            before: Everyone at the beginning of the half second.
+            move: Everyone's move.
+            drawn: Whose was drawn since it was last asked: nobody else leaves the road,
+                and nobody runs into anybody in rollouts that have none.
+            road: Whether to ask who leaves the road.
+        """
+        hits, departs = np.zeros_like(drawn), np.zeros_like(drawn)
+        some = np.flatnonzero(drawn.any(axis=1))
+        if not len(some):
+            return hits, departs
+        # A few rollouts draw for long, and most rows are free: pairs of rows are dear.
+        few = before.take(some).without_free_rows()
+        rows = few.life.shape[1]
+        hits[some, :rows], departs[some, :rows] = self._go_wrong(
+            few, move[some, :rows], drawn[some, :rows], self.scene[some], road=road
+        )
+        return hits, departs
+
+    def _go_wrong(
+        self,
+        before: Population,
+        move: Int64[np.ndarray, "rollout row"],
+        drawn: Bool[np.ndarray, "rollout row"],
+        scene: Int64[np.ndarray, " rollout"],
+        *,
+        road: bool,
+    ) -> tuple[Bool[np.ndarray, "rollout row"], Bool[np.ndarray, "rollout row"]]:
+        there = (before.presence != Presence.ABSENT) & (before.presence != Presence.LEAVING)
+        moving = there & ~self.codebook.standing[before.kind, move]
+        road = road and bool(self.kerbs)
+        times = max(CLEAR_AHEAD, *ROAD_AHEAD) if road else CLEAR_AHEAD
+        ways = repeat(before, move, self.codebook, times)
+        soon = ways[:, :, : CLEAR_AHEAD * len(LOOKED_AT)]
+        hits = find_hits(before, there, soon) & moving
+        if not road:
+            return hits, np.zeros_like(hits)
+        moments = len(LOOKED_AT) * self._road_ahead(before, move)
+        asked = moving & drawn
+        return hits, find_departures(before, asked, ways, moments, self.kerbs, scene)
+
+    def is_slower(
+        self,
+        before: Population,
+        move: Int64[np.ndarray, "rollout row"],
+        other: Int64[np.ndarray, "rollout row"],
+    ) -> Bool[np.ndarray, "rollout row"]:
+        """Tell whose move is shorter than another."""
+        return self._way_m(before, move) < self._way_m(before, other)
+
+    def is_fast(
+        self, before: Population, move: Int64[np.ndarray, "rollout row"]
+    ) -> Bool[np.ndarray, "rollout row"]:
+        """Tell who cannot stop in the time that everybody looks ahead for the road."""
+        return self._road_ahead(before, move) > ROAD_AHEAD[0]
+
+    def _way_m(
+        self, before: Population, move: Int64[np.ndarray, "rollout row"]
+    ) -> Float32[np.ndarray, "rollout row"]:
+        way_m: np.ndarray = self.codebook.end_pose[before.kind, move, :2]
+        return np.linalg.norm(way_m, axis=-1)
+
+    def _road_ahead(
+        self, before: Population, move: Int64[np.ndarray, "rollout row"]
+    ) -> Int64[np.ndarray, "rollout row"]:
+        """Half seconds of each one's move that it takes as far as it needs to stop."""
+        stops_s = self._way_m(before, move) / CLOCK.token_s / (2 * BRAKES_MPS2)
+        return np.ceil(stops_s / CLOCK.token_s).clip(*ROAD_AHEAD).astype(np.int64)
+
+
+def look_out(
+    starts: Sequence[Start], codebook: MotionCodebook, *, stay_on_road: bool
+) -> Lookout:
+    """Look out for rollouts; those of one scene share its map."""
+    maps, scene = number_maps(starts)
+    kerbs = [Kerbs(start.scene) for start in maps] if stay_on_road else []
+    return Lookout(codebook, kerbs, scene)

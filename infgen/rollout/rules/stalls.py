@@ -1,0 +1,127 @@
+"""Who has stood in a lane for longer than anybody does whom nothing keeps there.
+
+The network looks back a few seconds. Who has stood all of them might be parked, for all it
+can tell, and hardly sets off again; in logs nobody stops for nothing, so it never learned
+better. One car that does so in a rollout stands for good, and everybody behind it.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int64
+
+from infgen.geometry import wrap_angle
+from infgen.model.signal_features import StopLines
+from infgen.rollout.population import Population
+from infgen.rollout.recording import NOBODY
+from infgen.rollout.rules.off_road import lane_pieces, lanes_distance_m
+from infgen.scene import AgentKind, Scene
+from infgen.tokens.scene_tokens import Presence, SignalClass
+
+AWAY_M = 1.0
+"""Who has got no farther has stood, however it trembled."""
+IN_LANE_M = 2.0
+"""Nobody parks so near to the middle of a lane ..."""
+ALONG_RAD = math.radians(30)
+"""... that leads where the car does."""
+WAITS_M = 15.0
+"""A light is waited for from so far away."""
+RED = (SignalClass.STOP, SignalClass.CAUTION)
+
+
+class Patience:
+    """Remembers since when everybody in a batch of rollouts has stood where it is."""
+
+    def __init__(
+        self,
+        maps: Sequence[Scene],
+        scene: Int64[np.ndarray, " rollout"],
+        lines: StopLines,
+        tokens: int,
+    ) -> None:
+        """Nobody has stood yet.
+
+        Args:
+            maps: Scenes whose maps are played on.
+            scene: Which of them each rollout plays.
+            lines: Stop lines of those maps.
+            tokens: Half seconds that are long enough.
+        """
+        self._scene, self._lines, self._tokens = scene, lines, tokens
+        self._lanes = [lane_pieces(one) for one in maps]
+        self._life = np.zeros((len(scene), 0), dtype=np.int32)
+        self._from_m = np.zeros((*self._life.shape, 2), dtype=np.float32)
+        self._since = np.zeros(self._life.shape, dtype=np.int64)
+        self._in_lane = np.zeros(self._life.shape, dtype=bool)
+
+    def stalled(self, everyone: Population, token: int) -> Bool[np.ndarray, "rollout row"]:
+        """Tell which vehicles have stood in a lane for too long; to be asked every token.
+
+        Who waits for a light has not.
+
+        Args:
+            everyone: At the end of half second ``token``.
+            token: That half second.
+        """
+        self._remember(everyone, token)
+        stood = token - self._since
+        vehicle = (everyone.kind == AgentKind.VEHICLE) & (everyone.life != NOBODY)
+        vehicle &= everyone.presence != Presence.LEAVING
+        new = vehicle & (stood == self._tokens)
+        self._in_lane[new] = self._are_in_lane(everyone.pose[new], np.nonzero(new)[0])
+        stalled = vehicle & (stood >= self._tokens) & self._in_lane
+        stalled[stalled] = ~self._wait(
+            everyone.pose[stalled], np.nonzero(stalled)[0], token
+        )
+        return stalled
+
+    def _remember(self, everyone: Population, token: int) -> None:
+        """Begin anew with those who have moved on, or are others than before."""
+        xy_m = everyone.pose[..., :2]
+        if self._life.shape != everyone.life.shape:
+            self._life = np.full_like(everyone.life, NOBODY)
+            self._from_m = np.zeros_like(xy_m)
+            self._since = np.zeros(everyone.life.shape, dtype=np.int64)
+            self._in_lane = np.zeros(everyone.life.shape, dtype=bool)
+        stays = (everyone.life == self._life) & (everyone.life != NOBODY)
+        stays &= np.linalg.norm(xy_m - self._from_m, axis=-1) < AWAY_M
+        self._life = everyone.life.copy()
+        self._from_m = np.where(stays[..., None], self._from_m, xy_m)
+        self._since = np.where(stays, self._since, token)
+        self._in_lane &= stays
+
+    def _are_in_lane(
+        self, pose: Float32[np.ndarray, "agent 3"], rollout: Int64[np.ndarray, " agent"]
+    ) -> Bool[np.ndarray, " agent"]:
+        """Tell who stands in a lane that leads its way."""
+        found = np.zeros(len(pose), dtype=bool)
+        for at, (start_m, along_m) in enumerate(self._lanes):
+            way_rad = np.arctan2(along_m[:, 1], along_m[:, 0])
+            reach_m = np.linalg.norm(along_m, axis=1) + IN_LANE_M
+            for row in np.flatnonzero(self._scene[rollout] == at):
+                turned_rad = np.abs(wrap_angle(way_rad - pose[row, 2]))
+                near = np.abs(start_m[:, :2] - pose[row, :2]).max(axis=1) < reach_m
+                own = near & (turned_rad < ALONG_RAD)
+                xyz_m = np.append(pose[row, :2], np.float32(0))[None]
+                gap_m = lanes_distance_m(xyz_m, start_m[own], along_m[own])
+                found[row] = gap_m[0] < IN_LANE_M
+        return found
+
+    def _wait(
+        self,
+        pose: Float32[np.ndarray, "agent 3"],
+        rollout: Int64[np.ndarray, " agent"],
+        token: int,
+    ) -> Bool[np.ndarray, " agent"]:
+        """Tell whose light is not green, or was not when it was last seen."""
+        device = self._lines.pose.device
+        scene = torch.from_numpy(self._scene[rollout]).to(device)
+        shown = self._lines.shown_ahead(
+            torch.from_numpy(pose).to(device),
+            scene,
+            torch.full_like(scene, token),
+            WAITS_M,
+        )
+        return shown[:, list(RED)].any(dim=1).cpu().numpy()

@@ -1,0 +1,88 @@
+"""What plays rollouts: a network, the words it speaks, and how its choices are sampled."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from infgen.config import RolloutSettings, TokenSettings
+from infgen.model.stepping import Stepper
+from infgen.model.token_step import Column
+from infgen.rollout.population import Population
+from infgen.rollout.random_streams import Purpose, Stream, uniforms
+from infgen.tokens.grid import Grid, make_grid
+from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+
+
+@dataclass(frozen=True, slots=True)
+class Player:
+    """What plays: a network, the words it speaks, and how its choices are sampled.
+
+    Attributes:
+        stepper: The network, ready to be played.
+        codebook: Its moves.
+        roads: Its road tokens.
+        tokens: How histories are tokenized for it.
+        settings: Length, sampling and caps.
+        device: Where the network is.
+    """
+
+    stepper: Stepper
+    codebook: MotionCodebook
+    roads: RoadCodebook
+    tokens: TokenSettings
+    settings: RolloutSettings
+    device: torch.device
+
+    @property
+    def grid(self) -> Grid:
+        """Cells and headings that newcomers are placed in."""
+        return make_grid(self.tokens)
+
+    @property
+    def inserts(self) -> bool:
+        """Whether agents enter: they may, and the network can tell who."""
+        return self.settings.inserts and self.stepper.life_cycle
+
+    @property
+    def plays(self) -> str:
+        """What these weights and settings play, in words."""
+        removes = self.stepper.leaves or self.settings.leave_radius_m > 0
+        words = [
+            word
+            for word, done in (
+                ("entries", self.inserts),
+                ("exits", removes and self.settings.removes),
+            )
+            if done
+        ]
+        return ", ".join(["motion", *words]) if words else "motion only"
+
+    def tensor(self, values: np.ndarray) -> Tensor:
+        """Bring an array to the network's device."""
+        return torch.from_numpy(values).to(self.device)
+
+    def luck(
+        self,
+        streams: Sequence[Stream],
+        token: int,
+        purpose: Purpose,
+        count: int,
+        turn: int = 0,
+    ) -> Tensor:
+        """Draw [rollout, count] uniform numbers on the network's device."""
+        return self.tensor(uniforms(streams, token, purpose, count, turn))
+
+    def column(self, population: Population) -> Column:
+        """Show a population to the network."""
+        return Column(
+            kind=self.tensor(population.kind).long(),
+            size_lwh_m=self.tensor(population.size_lwh_m),
+            pose=self.tensor(population.pose),
+            move=self.tensor(population.move).long(),
+            presence=self.tensor(population.presence).long(),
+            observed=self.tensor(population.observed),
+            cell=self.tensor(population.cells(self.grid)).long(),
+        )

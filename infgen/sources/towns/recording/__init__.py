@@ -1,0 +1,1 @@
+"""What the recording car of a town sees, as a scene."""

@@ -1,0 +1,1 @@
+"""The streets of a town: topology, network, road map and surroundings."""

@@ -1,0 +1,1 @@
+"""The traffic of a town: demand, simulation and smooth motion."""

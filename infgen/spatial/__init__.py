@@ -1,0 +1,1 @@
+"""Spatial look-up: nearest segments and road edges."""

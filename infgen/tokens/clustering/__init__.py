@@ -1,0 +1,1 @@
+"""Clustering: logged motion and map lines to the two vocabularies."""

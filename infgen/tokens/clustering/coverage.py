@@ -1,0 +1,180 @@
+"""How well two codebooks write scenes they were not made from, and what they hold.
+
+Moves are matched as tokens are, rolling forward, so the error is that of the tokens.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int8, Int64
+
+from infgen.clock import CLOCK
+from infgen.config import TokenSettings, VocabSettings
+from infgen.scene import AgentKind
+from infgen.tokens.agents import match_agents
+from infgen.tokens.clustering.kdisks import Items, Space, gap_m
+from infgen.tokens.clustering.motion_samples import NUM_KINDS
+from infgen.tokens.clustering.physical_limits import limits_of, within
+from infgen.tokens.clustering.vocabularies import MoveSpace, Origin, RoadSpace
+from infgen.tokens.grid import make_grid
+from infgen.tokens.map import match_curves
+from infgen.tokens.motion_tokens import make_move_table
+from infgen.tokens.tracks import Paths
+from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+
+MOVING_M = 0.05
+"""A move whose end is nearer than this to its start does not count as moving."""
+STRAIGHT_DEG = 0.1
+"""What turns less is counted neither as left nor as right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """Every observed token of some scenes, matched.
+
+    Attributes:
+        kind: ``AgentKind`` of the agent.
+        move: The move chosen.
+        error_m: From the centre where the chain of moves is to the logged centre.
+    """
+
+    kind: Int8[np.ndarray, " match"]
+    move: Int64[np.ndarray, " match"]
+    error_m: Float64[np.ndarray, " match"]
+
+
+def match_paths(paths: Iterable[Paths], codebook: MotionCodebook) -> Matches:
+    """Match the agents of scenes as the tokenizer does."""
+    settings = TokenSettings()
+    table, grid = make_move_table(codebook), make_grid(settings)
+    kinds, moves, errors_m = [np.empty(0, np.int8)], [np.empty(0, int)], [np.empty(0)]
+    for scene in paths:
+        agents = match_agents(scene, table, grid, settings.entry_order)[0]
+        away_m = agents.pose[..., :2].astype(np.float64) - scene.pose[:, 1:, :2]
+        row, token = np.nonzero(agents.observed)
+        kinds.append(agents.kind[row])
+        moves.append(agents.move[row, token].astype(int))
+        errors_m.append(np.hypot(*away_m[row, token].T))
+    return Matches(np.concatenate(kinds), np.concatenate(moves), np.concatenate(errors_m))
+
+
+def describe_moves(
+    codebook: MotionCodebook,
+    origin: Int8[np.ndarray, "3 move"],
+    held_out: Matches,
+    familiar: Matches,
+    settings: VocabSettings,
+) -> dict[str, Any]:
+    """Say of each kind what its moves are and how well they write held-out scenes.
+
+    Args:
+        codebook: The moves.
+        origin: ``Origin`` of each.
+        held_out: Matches of scenes the codebook was not made from.
+        familiar: Matches of scenes it was made from; they count only as use.
+        settings: What the codebook was made with.
+    """
+    return {
+        AgentKind(kind).name.lower(): {
+            **_origins(origin[kind]),
+            **_use(kind, codebook.num_moves, held_out, familiar),
+            "held_out_error_m": _spread(held_out.error_m[held_out.kind == kind]),
+            "held_out_error_moving_m": _spread(_moving_error(codebook, held_out, kind)),
+            **_describe_shapes(
+                MoveSpace(kind, limits_of(settings)),
+                codebook.path[kind],
+                np.array([1, -1, -1], dtype=np.float32),
+            ),
+            **_describe_motion(codebook.path[kind], kind, settings),
+        }
+        for kind in range(NUM_KINDS)
+    }
+
+
+def describe_roads(
+    codebook: RoadCodebook,
+    origin: Int8[np.ndarray, " road"],
+    held_out_m: Float32[np.ndarray, "unknown 11 2"],
+    familiar_m: Float32[np.ndarray, "known 11 2"],
+) -> dict[str, Any]:
+    """Say what the shapes of map pieces are and how well they fit held-out ones."""
+    space = RoadSpace()
+    chosen = match_curves(held_out_m, codebook)
+    used = np.union1d(chosen, match_curves(familiar_m, codebook))
+    away_m = space.points_m(held_out_m) - space.points_m(codebook.curve_m[chosen])
+    steps_m = np.diff(codebook.curve_m.astype(np.float64), axis=1)
+    heading_rad = np.arctan2(steps_m[..., 1], steps_m[..., 0])
+    turn_deg = np.degrees(np.unwrap(heading_rad, axis=1)[:, -1])
+    return {
+        **_origins(origin),
+        "dead": codebook.num_roads - len(used),
+        "held_out_pieces": len(held_out_m),
+        "held_out_error_m": _spread(np.linalg.norm(away_m, axis=-1).mean(axis=-1)),
+        **_describe_shapes(space, codebook.curve_m, np.array([1, -1], dtype=np.float32)),
+        "length_m": _range(np.linalg.norm(steps_m, axis=-1).sum(axis=-1)),
+        **_turns(turn_deg),
+    }
+
+
+def _origins(origin: np.ndarray) -> dict[str, int]:
+    names = {Origin.LOGGED: "real", Origin.MIRRORED: "mirrored", Origin.MADE: "made"}
+    return {name: int((origin == value).sum()) for value, name in names.items()}
+
+
+def _use(kind: int, num_moves: int, held_out: Matches, familiar: Matches) -> dict[str, int]:
+    parts = [matches.move[matches.kind == kind] for matches in (held_out, familiar)]
+    used = len(np.unique(np.concatenate(parts)))
+    return {"dead": num_moves - used, "held_out_tokens": len(parts[0])}
+
+
+def _moving_error(codebook: MotionCodebook, matches: Matches, kind: int) -> np.ndarray:
+    end_m = np.hypot(*codebook.end_pose[kind, :, :2].T)
+    moving = (matches.kind == kind) & (end_m[matches.move] > MOVING_M)
+    return matches.error_m[moving]
+
+
+def _describe_shapes(space: Space, items: Items, mirror: np.ndarray) -> dict[str, Any]:
+    """Say how close rows are to each other, and to the mirror images of others."""
+    points_m, mirrored_m = space.points_m(items), space.points_m(items * mirror)
+    gaps_m = np.array([np.partition(gap_m(points_m, one), 1)[1] for one in points_m])
+    mirror_m = np.array([gap_m(points_m, one).min() for one in mirrored_m])
+    return {"nearest_gap_m": _range(gaps_m), "mirror_gap_m": _range(mirror_m)}
+
+
+def _describe_motion(
+    path: np.ndarray, kind: int, settings: VocabSettings
+) -> dict[str, Any]:
+    end = path[:, -1].astype(np.float64)
+    speed_mps = np.hypot(end[:, 0], end[:, 1]) * np.sign(end[:, 0]) / CLOCK.token_s
+    beyond = ~within(path, kind, limits_of(settings))
+    return {
+        "speed_mps": _range(speed_mps),
+        **_turns(np.degrees(end[:, 2])),
+        "beyond_limits": int(beyond.sum()),
+    }
+
+
+def _turns(turn_deg: np.ndarray) -> dict[str, Any]:
+    """Say how far rows turn, and how many turn to either side."""
+    return {
+        "turn_deg": _range(turn_deg),
+        "left": int((turn_deg > STRAIGHT_DEG).sum()),
+        "right": int((turn_deg < -STRAIGHT_DEG).sum()),
+    }
+
+
+def _spread(values: np.ndarray) -> dict[str, float] | None:
+    """Return mean, median and worst cases; None where there is nothing to measure."""
+    if len(values) == 0:
+        return None
+    p50, p99 = np.percentile(values, [50, 99])
+    figures = {"mean": values.mean(), "p50": p50, "p99": p99, "max": values.max()}
+    return {name: round(float(value), 5) for name, value in figures.items()}
+
+
+def _range(values: np.ndarray) -> dict[str, float]:
+    low, p50, high = np.percentile(values, [0, 50, 100])
+    figures = {"min": low, "p50": p50, "max": high}
+    return {name: round(float(value), 4) for name, value in figures.items()}

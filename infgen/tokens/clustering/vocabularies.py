@@ -1,0 +1,255 @@
+"""From samples of logs to the two codebooks.
+
+Logged items fill a codebook first. Where they do not suffice, their mirror images follow,
+then shapes made by rule, at last ever finer differences. ``Origin`` tells which is which.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int8
+
+from infgen.config import VocabSettings
+from infgen.geometry import box_corners
+from infgen.tokens.clustering.kdisks import Items, Space, gap_m, lay_disks
+from infgen.tokens.clustering.made_map_samples import line_arcs
+from infgen.tokens.clustering.made_motion_samples import fan
+from infgen.tokens.clustering.motion_samples import NUM_KINDS, Segments
+from infgen.tokens.clustering.physical_limits import MotionLimits, limits_of, within
+from infgen.tokens.vocabulary import BOX_LW_M, ROAD_SAMPLES, MotionCodebook, RoadCodebook
+
+ANCHOR_M = 0.5
+"""Where logs show no move within this distance of a possible one, one is made."""
+ANCHOR_SHARE = 1 / 8
+"""Of a codebook, at most, goes to such moves before logged ones have had their turn."""
+RARE_SHARE = 1 / 4
+"""Of a codebook is kept for what common moves or shapes leave uncovered ..."""
+RARE_MOVES, RARE_ROADS = 2.0, 3.0
+"""... by disks so many times the tolerance. Better cover all roughly than most finely."""
+COARSEST = 8
+"""Made shapes are laid coarsely first (so many tolerances apart), then ever finer."""
+
+LEAST_ROAD_TOLERANCE_M, MOST_ROAD_TOLERANCE_M = 0.01, 0.64
+_BISECTIONS = 8
+
+
+class Origin(IntEnum):
+    """Where a row of a codebook comes from."""
+
+    LOGGED = 0
+    MIRRORED = 1
+    MADE = 2
+
+
+@dataclass(frozen=True, slots=True)
+class MoveSpace:
+    """Moves of one kind: as far apart as the corners of its box at their ends."""
+
+    kind: int
+    limits: MotionLimits
+
+    def points_m(self, items: Items) -> Float64[np.ndarray, "move 4 2"]:
+        """Return the box corners at the ends of moves."""
+        return box_corners(items[:, -1].astype(np.float64), BOX_LW_M[self.kind])
+
+    def mean(self, items: Items) -> Float32[np.ndarray, "6 3"]:
+        """Return the mean of moves; of headings the direction of the mean vector."""
+        xy_m = items[..., :2].mean(axis=0, dtype=np.float64)
+        heading = items[..., 2].astype(np.float64)
+        heading = np.arctan2(np.sin(heading).mean(axis=0), np.cos(heading).mean(axis=0))
+        return np.column_stack([xy_m, heading]).astype(np.float32)
+
+    def allowed(self, items: Items) -> Bool[np.ndarray, " move"]:
+        """Tell which moves keep to the limits."""
+        return within(items, self.kind, self.limits)
+
+
+@dataclass(frozen=True, slots=True)
+class RoadSpace:
+    """Pieces of map lines: as far apart as their middle and last points."""
+
+    def points_m(self, items: Items) -> Float64[np.ndarray, "road 2 2"]:
+        """Return the points that pieces are matched by, but for the first."""
+        return items[:, list(ROAD_SAMPLES[1:])].astype(np.float64)
+
+    def mean(self, items: Items) -> Float32[np.ndarray, "11 2"]:
+        """Return the mean of pieces. As theirs do, its first interval lies along +x."""
+        return items.mean(axis=0, dtype=np.float64).astype(np.float32)
+
+    def allowed(self, items: Items) -> Bool[np.ndarray, " road"]:
+        """Allow every piece."""
+        return np.ones(len(items), dtype=bool)
+
+
+@dataclass(slots=True)
+class _Shelf:
+    """A codebook while it is filled."""
+
+    space: Space
+    count: int
+    rows: Items
+    origin: list[Origin] = field(default_factory=list)
+
+    @property
+    def room(self) -> int:
+        """How many rows are still free."""
+        return self.count - len(self.rows)
+
+    def lay(
+        self,
+        items: Items,
+        order: np.ndarray | None,
+        tolerance_m: float,
+        *,
+        origin: Origin,
+        spare: int = 0,
+    ) -> None:
+        """Lay disks on items until only ``spare`` rows are free. No order: as they come."""
+        laid = lay_disks(
+            self.space,
+            items,
+            np.arange(len(items)) if order is None else order,
+            tolerance_m,
+            max(0, self.room - spare),
+            self.rows,
+            average=order is not None,
+        )
+        self.rows = np.concatenate([self.rows, laid])
+        self.origin += [origin] * len(laid)
+
+    def cover(
+        self,
+        logged: Items,
+        order: np.ndarray,
+        tolerance_m: float,
+        rare: float,
+        spare: int = 0,
+    ) -> None:
+        """Cover logged items: the common finely, the rare at ``rare`` times as roughly."""
+        kept = spare + int((self.room - spare) * RARE_SHARE)
+        for radius_m, left in ((tolerance_m, kept), (tolerance_m * rare, spare)):
+            self.lay(logged, order, radius_m, origin=Origin.LOGGED, spare=left)
+
+    def fill(
+        self,
+        logged: Items,
+        order: np.ndarray,
+        tolerance_m: float,
+        mirrored: Items,
+        made: Callable[[float], Items],
+    ) -> None:
+        """Fill all rows: what logs still give, mirror images, shapes made by rule.
+
+        If all that is not enough, then the same again at ever less tolerance.
+        """
+        self.lay(logged, order, tolerance_m, origin=Origin.LOGGED)
+        self.lay(mirrored, order[: len(mirrored)], tolerance_m, origin=Origin.MIRRORED)
+        apart_m = tolerance_m * COARSEST
+        while self.room:
+            self.lay(made(apart_m / 2), None, apart_m, origin=Origin.MADE)
+            apart_m /= 2
+            if apart_m < tolerance_m:
+                self.lay(logged, order, apart_m, origin=Origin.LOGGED)
+                self.lay(mirrored, order[: len(mirrored)], apart_m, origin=Origin.MIRRORED)
+
+
+def cluster_moves(
+    segments: Segments, settings: VocabSettings
+) -> tuple[MotionCodebook, Int8[np.ndarray, "3 move"]]:
+    """Make the motion codebook from segments of logs (which may be none).
+
+    Returns:
+        The codebook, and the ``Origin`` of its moves.
+    """
+    kinds = [
+        _cluster_kind(segments.of_kind(kind), kind, settings) for kind in range(NUM_KINDS)
+    ]
+    origin = np.array([shelf.origin for shelf in kinds], dtype=np.int8)
+    path = np.stack([shelf.rows for shelf in kinds])
+    return MotionCodebook(BOX_LW_M, path, origin == Origin.LOGGED), origin
+
+
+def cluster_roads(
+    curve_m: Float32[np.ndarray, "piece 11 2"], settings: VocabSettings
+) -> tuple[RoadCodebook, Int8[np.ndarray, " road"], float]:
+    """Make the map codebook from pieces of lines (which may be none).
+
+    Returns:
+        The codebook, the ``Origin`` of its shapes, and the tolerance it was made with.
+    """
+    logged, space = _distinct(curve_m), RoadSpace()
+    order = np.random.default_rng(settings.seed).permutation(len(logged))
+    tolerance_m = settings.road_tolerance_m
+    if tolerance_m == 0:
+        tolerance_m = _road_tolerance(space, logged, order, settings.num_roads)
+    shelf = _Shelf(space, settings.num_roads, logged[:0])
+    shelf.cover(logged, order, tolerance_m, RARE_ROADS)
+    mirrored = logged * np.array([1, -1], np.float32) if settings.mirror else logged[:0]
+    shelf.fill(logged, order, tolerance_m, mirrored, line_arcs)
+    origin = np.array(shelf.origin, dtype=np.int8)
+    return RoadCodebook(shelf.rows, origin == Origin.LOGGED), origin, tolerance_m
+
+
+def _cluster_kind(
+    path: Float32[np.ndarray, "segment 6 3"], kind: int, settings: VocabSettings
+) -> _Shelf:
+    """Fill one kind's codebook; its first row stands still."""
+    limits = limits_of(settings)
+    space, logged = MoveSpace(kind, limits), _distinct(path)
+    order = np.random.default_rng((settings.seed, kind)).permutation(len(logged))
+    mirrored = logged * np.array([1, -1, -1], np.float32)
+    mirrored = mirrored if settings.mirror else mirrored[:0]
+
+    still = np.zeros((1, *path.shape[1:]), np.float32)
+    shelf = _Shelf(space, settings.num_moves, still, [Origin.MADE])
+    anchors = _anchors(space, logged, int(settings.num_moves * ANCHOR_SHARE))
+    tolerance_m = settings.tolerance_m
+    shelf.cover(logged, order, tolerance_m, RARE_MOVES, spare=len(anchors))
+    shelf.lay(anchors, None, tolerance_m, origin=Origin.MADE)
+    shelf.fill(
+        logged, order, tolerance_m, mirrored, lambda apart_m: fan(kind, limits, apart_m)
+    )
+    return shelf
+
+
+def _anchors(space: MoveSpace, logged: Items, most: int) -> Items:
+    """Make the most ordinary of the moves that logs show nothing like."""
+    made = fan(space.kind, space.limits, ANCHOR_M / 4)
+    still = np.zeros((1, *made.shape[1:]), np.float32)
+    order = np.arange(len(made))
+    sparse = lay_disks(space, made, order, ANCHOR_M, len(made), still, average=False)
+    logged_m = space.points_m(logged)
+    lonely = [
+        not (gap_m(logged_m, point_m) <= ANCHOR_M).any()
+        for point_m in space.points_m(sparse)
+    ]
+    return sparse[np.array(lonely, dtype=bool)][:most]
+
+
+def _road_tolerance(
+    space: RoadSpace, logged: Items, order: np.ndarray, count: int
+) -> float:
+    """Search the least tolerance at which so many disks cover all pieces."""
+    low_m, high_m = LEAST_ROAD_TOLERANCE_M, MOST_ROAD_TOLERANCE_M
+
+    def suffices(tolerance_m: float) -> bool:
+        shelf = _Shelf(space, count + 1, logged[:0])
+        shelf.cover(logged, order, tolerance_m, RARE_ROADS)
+        return shelf.room > 0
+
+    if suffices(low_m):
+        return low_m
+    for _ in range(_BISECTIONS):
+        middle_m = (low_m * high_m) ** 0.5
+        low_m, high_m = (low_m, middle_m) if suffices(middle_m) else (middle_m, high_m)
+    return high_m
+
+
+def _distinct(items: Items) -> Items:
+    """Drop items that equal an earlier one to the millimetre."""
+    if len(items) == 0:
+        return items
+    flat = np.round(items.reshape(len(items), -1) * 1000).astype(np.int32)
+    return items[np.sort(np.unique(flat, axis=0, return_index=True)[1])]

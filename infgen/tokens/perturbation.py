@@ -1,0 +1,210 @@
+"""Noise on tokens to learn from, and the moves that lead back (SPEC 2.3, 1.3).
+
+Who only ever sees logs never sees what its own small errors lead to. So agents are led off
+their ways a little: at each half second an agent takes not the move that ends nearest to
+where it should be, but one of the few nearest, and goes on from where that leads. What is
+to be learned is always the nearest, from where the agent has come to. As every draw is near
+to the true pose, errors never add up: agents stray as far as a few neighbouring moves are
+apart. Who stands is left alone: it would learn to tremble, and that nobody who has begun to
+move goes on.
+
+Small errors that last do add up: who turns into a road a few degrees off is metres beside
+it two seconds later. So some drivers drift: for seconds they are led beside their ways,
+facing where that leads them, and learn how to get back.
+
+Where an agent should be is its quantised pose, which is all that tokens keep of the log. It
+is within centimetres of the log's own.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int8, Int16
+
+from infgen.config import TrainSettings
+from infgen.tokens.motion_tokens import (
+    MoveTable,
+    advance,
+    make_move_table,
+    nearest_few,
+    nearest_moves,
+)
+from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+
+FARTHEST_M = 1.0
+"""No draw leads farther from where an agent should be: where moves are rare, the second
+nearest may end metres away ..."""
+FARTHEST_SHARE = 1 / 8
+"""... nor farther than this share of the agent's way in the half second."""
+
+DRIFT_KEPT = 0.8
+"""Share of how far aside a drifting agent is that is left half a second later."""
+DRIFT_M, DRIFT_SHARE = 0.9, 0.15
+"""Typically it is so far aside, or less: this share of its way in half a second ..."""
+DRIFT_MOST = 2.0
+"""... and never more than so many times as far."""
+DRIFT_LEAST_WAY_M = 0.75
+"""Who goes less does not drift."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Noise:
+    """How tokens are disturbed.
+
+    Attributes:
+        table: The moves.
+        moves: How many moves each is drawn from, all equally likely; 0 for none disturbed.
+        share: Of the moves that are drawn; the others are the nearest.
+        drift: Share of the agents that drift while they are on the move.
+        near_roads: For each map shape those that it is drawn from, itself the first.
+    """
+
+    table: MoveTable
+    moves: int
+    share: float
+    drift: float
+    near_roads: Int16[np.ndarray, "road near"]
+
+
+class Strays(NamedTuple):
+    """Agents off their ways: fields [agent, token] as in ``SceneTokens``.
+
+    Attributes:
+        move: The moves taken ...
+        pose: ... where they lead ...
+        label: ... and the moves that would have led nearest to where agents should be.
+        off: Where an agent is not where it should be.
+    """
+
+    move: np.ndarray
+    pose: np.ndarray
+    label: np.ndarray
+    off: np.ndarray
+
+
+def make_noise(
+    settings: TrainSettings, motion: MotionCodebook, roads: RoadCodebook
+) -> Noise | None:
+    """Make the noise that settings ask for; None if they ask for none.
+
+    In a codebook that has fewer tokens, draws are from all of them.
+    """
+    if not (settings.noise_moves or settings.noise_drift or settings.noise_roads):
+        return None
+    moves = min(settings.noise_moves, motion.num_moves)
+    return Noise(
+        table=make_move_table(motion),
+        moves=max(moves, 1) if settings.noise_drift else moves,
+        share=settings.noise_share,
+        drift=settings.noise_drift,
+        near_roads=_near_roads(roads, max(1, settings.noise_roads)),
+    )
+
+
+def lead_astray(
+    kind: Int8[np.ndarray, " agent"],
+    pose: Float32[np.ndarray, "agent token 3"],
+    move: Int16[np.ndarray, "agent token"],
+    moving: Bool[np.ndarray, "agent token"],
+    noise: Noise,
+    random: np.random.Generator,
+) -> Strays:
+    """Walk agents anew along moves that are drawn.
+
+    Args:
+        kind: ``AgentKind``.
+        pose: Where each agent should be at each token's end.
+        move: What led it there.
+        moving: Tokens at which it goes by moves that may be drawn, none of them the first.
+            At all others it is where it should be, and starts from there.
+        noise: How to draw.
+        random: Source of the draws.
+    """
+    turn = random.integers(noise.moves, size=moving.shape)
+    turn[random.random(moving.shape) >= noise.share] = 0
+    strays = Strays(move.copy(), pose.copy(), move.copy(), np.zeros_like(moving))
+    pushes = _pushes(moving.shape, noise.drift, random)
+    aside_m = np.zeros(len(kind))
+    for token in range(1, moving.shape[1]):
+        rows = np.flatnonzero(moving[:, token])
+        before, wanted = strays.pose[rows, token - 1], pose[rows, token]
+        way_m = np.hypot(*(wanted - pose[rows, token - 1])[:, :2].T)
+        was_m, aside_m = aside_m, np.zeros(len(kind))
+        aside_m[rows] = _drifted(was_m[rows], way_m, pushes[rows, token])
+        led = _led_aside(wanted, way_m, was_m[rows], aside_m[rows])
+
+        few = nearest_few(led, before, kind[rows], noise.table, noise.moves)
+        nearest, taken = few[:, 0].copy(), few[np.arange(len(rows)), turn[rows, token]]
+        ends = advance(before, kind[rows], taken, noise.table.codebook)
+        away_m = np.hypot(*(ends - led)[:, :2].T)
+        far = np.flatnonzero(away_m > np.minimum(FARTHEST_M, FARTHEST_SHARE * way_m))
+        taken[far] = nearest[far]
+        ends[far] = advance(before[far], kind[rows[far]], taken[far], noise.table.codebook)
+        back = np.flatnonzero(aside_m[rows])  # To these, the nearest is on the drift.
+        nearest[back] = nearest_moves(
+            wanted[back], before[back], kind[rows[back]], noise.table
+        )
+
+        # Who is where it should be and takes the move it took stays so to the last bit.
+        off = strays.off[rows, token - 1] | (taken != move[rows, token])
+        strays.label[rows, token], strays.move[rows, token] = nearest, taken
+        strays.pose[rows, token] = np.where(off[:, None], ends, wanted)
+        strays.off[rows, token] = off
+    return strays
+
+
+def _pushes(
+    shape: tuple[int, ...], drift: float, random: np.random.Generator
+) -> Float64[np.ndarray, "agent token"]:
+    """Draw what leads agents aside at each token: nothing, for those that do not drift."""
+    if not drift:
+        return np.zeros(shape)
+    drifts = random.random(shape[0]) < drift
+    return drifts[:, None] * random.normal(size=shape)
+
+
+def _drifted(
+    aside_m: Float64[np.ndarray, " row"],
+    way_m: Float[np.ndarray, " row"],
+    push: Float64[np.ndarray, " row"],
+) -> Float64[np.ndarray, " row"]:
+    """Say how far to the left of their ways agents are led next."""
+    spread_m = np.minimum(DRIFT_M, DRIFT_SHARE * way_m) * (way_m >= DRIFT_LEAST_WAY_M)
+    fresh_m = math.sqrt(1 - DRIFT_KEPT**2) * spread_m * push
+    most_m = DRIFT_MOST * spread_m
+    return np.clip(DRIFT_KEPT * aside_m + fresh_m, -most_m, most_m)
+
+
+def _led_aside(
+    wanted: Float32[np.ndarray, "row 3"],
+    way_m: Float[np.ndarray, " row"],
+    was_m: Float64[np.ndarray, " row"],
+    aside_m: Float64[np.ndarray, " row"],
+) -> Float32[np.ndarray, "row 3"]:
+    """Shift poses to the left, and turn them to where the shift leads."""
+    led = wanted.copy()
+    led[:, 0] -= aside_m * np.sin(wanted[:, 2])
+    led[:, 1] += aside_m * np.cos(wanted[:, 2])
+    led[:, 2] += np.where(aside_m, np.arctan2(aside_m - was_m, way_m), 0.0)
+    return led
+
+
+def exchange_roads(
+    token: Int16[np.ndarray, " road"],
+    fixed: Bool[np.ndarray, " road"],
+    noise: Noise,
+    random: np.random.Generator,
+) -> Int16[np.ndarray, " road"]:
+    """Draw each road token's shape from those near to it, but for the ``fixed``."""
+    turn = random.integers(noise.near_roads.shape[1], size=token.shape)
+    return np.where(fixed, token, noise.near_roads[token, turn])
+
+
+def _near_roads(codebook: RoadCodebook, count: int) -> Int16[np.ndarray, "road near"]:
+    """Return for each shape the nearest, as pieces are matched, itself the first."""
+    points_m = codebook.sample_m.reshape(codebook.num_roads, -1)
+    square_m2 = ((points_m[:, None] - points_m) ** 2).sum(axis=-1)
+    np.fill_diagonal(square_m2, -1.0)
+    return np.argsort(square_m2, axis=1, kind="stable")[:, :count].astype(np.int16)

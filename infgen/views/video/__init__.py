@@ -1,0 +1,1 @@
+"""Videos, animated images and figure strips."""

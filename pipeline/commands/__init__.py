@@ -1,0 +1,1 @@
+"""Commands that make no stage, and what commands print."""

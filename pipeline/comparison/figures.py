@@ -1,0 +1,109 @@
+"""The figures of a comparison: how all methods change along their rollouts."""
+
+import numpy as np
+from jaxtyping import Float64
+
+from infgen.clock import CLOCK
+from infgen.views.charts.comparison import comparison_chart
+from infgen.views.charts.figures import Series
+from infgen.views.sheets import Sheet
+from pipeline.comparison.claims import PROTOCOLS
+from pipeline.comparison.result import LONG, Compared
+from pipeline.comparison.scores import Scored, middle_s
+from pipeline.comparison.statistics import mean_curve
+from pipeline.stages.report.tables import BUCKETS
+
+X_LABEL = "middle of the window, s after now"
+LOGS = "the logs"
+_TRAFFIC = (
+    ("agents/near", "Agents near the ego", "agents", 1.0),
+    ("corrected/entry_rate", "Entries within 75 m", "per half second", CLOCK.token_s),
+    ("corrected/exit_rate", "Exits within 75 m", "per half second", CLOCK.token_s),
+)
+
+
+def figures(found: Compared) -> list[str]:
+    """Draw the count errors, the traffic, and each bucket's score, window by window."""
+    ace = f"ace/{found.preset.count_error}_near"
+    drawn = [_chart(found, ace, "Agent count error (ACE)", "agents", logs=False)]
+    drawn += [
+        _chart(found, name, title, unit, factor=factor)
+        for name, title, unit, factor in _TRAFFIC
+    ]
+    drawn += [
+        _chart(found, f"{protocol}/{name}", f"{label} ({protocol})", "likelihood")
+        for protocol in PROTOCOLS
+        for name, label in {"composite": "composite", **BUCKETS}.items()
+    ]
+    return [drawing for drawing in drawn if drawing]
+
+
+def curve_sheet(found: Compared) -> Sheet:
+    """All that the figures show, as numbers: a row per method, metric and window."""
+    names = [f"ace/{found.preset.count_error}_near", *[name for name, *_ in _TRAFFIC]]
+    names += [f"{each}/{name}" for each in PROTOCOLS for name in ("composite", *BUCKETS)]
+    rows: list[list[str | float | None]] = []
+    for name in names:
+        lines = _lines(found, name)
+        logged = _logged(found, name)
+        for line in [*lines, *([] if logged is None else [logged])]:
+            for x, y in zip(line.x.tolist(), line.y.tolist(), strict=True):
+                rows.append([line.name, name, x, None if np.isnan(y) else y])
+    columns = ["method", "metric", "middle of the window, s", "mean"]
+    return Sheet("curves", "Curves", columns, rows)
+
+
+def _chart(
+    found: Compared,
+    name: str,
+    title: str,
+    unit: str,
+    *,
+    factor: float = 1.0,
+    logs: bool = True,
+) -> str:
+    lines = [_scaled(line, factor) for line in _lines(found, name)]
+    if not lines:
+        return ""
+    logged = _logged(found, name) if logs else None
+    return comparison_chart(
+        lines,
+        None if logged is None else _scaled(logged, factor),
+        title=f"{title} by window",
+        x_label=X_LABEL,
+        y_label=unit,
+    )
+
+
+def _lines(found: Compared, name: str) -> list[Series]:
+    """One line per arm and long play: the mean over its seeds."""
+    lines = []
+    for arm in found.arms:
+        plays = found.runs(arm, LONG)
+        for play, runs in plays.items():
+            curves = [curve for one in runs if (curve := _curve(one, name)) is not None]
+            if curves:
+                mean = mean_curve(curves)
+                label = arm.label if len(plays) == 1 else f"{arm.label}, {play}"
+                lines.append(Series(label, middle_s(runs[0].measures, len(mean)), mean))
+    return lines
+
+
+def _logged(found: Compared, name: str) -> Series | None:
+    """The same of the logs that were continued; None without any."""
+    curve = found.logs.curves().get(name)
+    if curve is None or np.isnan(curve.value).all():
+        return None
+    return Series(LOGS, middle_s(found.scored[0].measures, len(curve.value)), curve.value)
+
+
+def _curve(one: Scored, name: str) -> Float64[np.ndarray, " window"] | None:
+    """Mean over one run's rollouts; None where no window has a value."""
+    curve = one.tally.curves().get(name)
+    if curve is None or np.isnan(curve.value).all():
+        return None
+    return curve.value
+
+
+def _scaled(line: Series, factor: float) -> Series:
+    return Series(line.name, line.x, line.y * factor)

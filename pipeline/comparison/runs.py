@@ -1,0 +1,195 @@
+"""The runs that a preset is made of: every arm with every seed, and all its plays.
+
+Runs share what they have in common: their stages have keys, so records are read once, and
+weights are trained once for all plays of an arm.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from infgen.config import ConfigError
+from pipeline.engine.atomic import write_json
+from pipeline.engine.layout import Root
+from pipeline.engine.plan import Plan, make_plan, needed
+from pipeline.settings.overlay import Overlay, Value, lay, read_words
+from pipeline.settings.presets import Arm, Preset
+from pipeline.settings.request import Request, recall, ref
+from pipeline.settings.stages_file import DEFAULT_FILE, SOURCES, StagesFile
+
+TRAIN, ROLLOUT, SCORE, REPORT = "train", "rollout", "score", "report"
+PRESET = "preset"
+PAGE, SHOWN = "comparison.html", "tables.json"
+"""What a comparison shows: a page, and ``{name: {"title", "columns", "rows"}}``."""
+_SEEDED = (TRAIN, ROLLOUT)
+_NO_SEED = "the seeds of a preset are numbered from 0: --seeds says how many"
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """One arm with one seed, and one of its plays.
+
+    Attributes:
+        preset: Name of the preset.
+        arm: The arm.
+        seed: Of its training and of its rollouts.
+        play: Name of the play; empty where only what is before it is wanted.
+    """
+
+    preset: str
+    arm: Arm
+    seed: int
+    play: str = ""
+
+    @property
+    def name(self) -> str:
+        """Its name in the root's memory; fit for a file."""
+        parts = (PRESET, self.preset, self.arm.name, str(self.seed), self.play)
+        return ".".join(part for part in parts if part)
+
+    @property
+    def words(self) -> str:
+        """What it is, in words."""
+        parts = (self.arm.name, f"seed {self.seed}", self.play)
+        return ", ".join(part for part in parts if part)
+
+    @property
+    def settings(self) -> Overlay:
+        """What the arm and its play set."""
+        return self.arm.plays[self.play] if self.play else self.arm.settings
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What is asked of a preset: how all its runs are planned.
+
+    Attributes:
+        root: Where they are made.
+        path: The ``stages.yaml``.
+        file: The same, read.
+        preset: The comparison.
+        profile: What the command lays over every arm; None for none.
+        overrides: The same, as ``section.key=value`` words.
+        records: Source files; empty to use those that the file or a profile names.
+        targets: Stages to make.
+    """
+
+    root: Root
+    path: Path
+    file: StagesFile
+    preset: Preset
+    profile: str | None
+    overrides: tuple[str, ...]
+    records: tuple[str, ...]
+    targets: tuple[str, ...]
+
+    def with_records(self, records: Sequence[str]) -> "Comparison":
+        """Replace the source files."""
+        return replace(self, records=tuple(records))
+
+    def plan(self, leg: Leg, start: str | None = None) -> Plan:
+        """Plan one run.
+
+        Args:
+            leg: Which.
+            start: Key of the weights that it goes on from.
+
+        Raises:
+            ConfigError: for settings that cannot be, or source files that are not there.
+        """
+        chosen = self._chosen(leg, start)
+        return make_plan(self.root, self.file.stages, chosen, self._targets(leg))
+
+    def sketch(self, leg: Leg) -> Plan:
+        """Plan one run as if there were no records; its keys are only good to compare.
+
+        Raises:
+            ConfigError: for settings that cannot be.
+        """
+        stages = {
+            name: replace(entry, deps=tuple(dep for dep in entry.deps if dep != SOURCES))
+            for name, entry in self.file.stages.items()
+        }
+        return make_plan(self.root, stages, self._chosen(leg, None), self._targets(leg))
+
+    def request(self, leg: Leg, start: str | None = None) -> Request:
+        """Write one run as if it had been asked for by itself."""
+        over = lay(self._over(leg, start))
+        return Request(
+            root=self.root,
+            file=self.path,
+            profile=self._profile(leg),
+            records=self.records or over.sources,
+            overrides=over.words,
+        )
+
+    @property
+    def stages(self) -> list[str]:
+        """Stages that its runs make, each after those it reads."""
+        return needed(self.file.stages, self._last)
+
+    def remember(self, keys: Mapping[str, str]) -> None:
+        """Let the root know what was asked, for a command that does not name it."""
+        name = f"{PRESET}.{self.preset.name}"
+        about = {
+            "records": self.records,
+            "file": None if self.path == DEFAULT_FILE else str(self.path),
+            "keys": {**recall(self.root, name).get("keys", {}), **keys},
+        }
+        path = ref(self.root, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, about)
+
+    @property
+    def _last(self) -> list[str]:
+        """The targets; what a report would show is for the comparison to show."""
+        return [SCORE if target == REPORT else target for target in self.targets]
+
+    def _targets(self, leg: Leg) -> list[str]:
+        weights_only = not leg.play and ROLLOUT in self.stages
+        return [TRAIN] if weights_only else self._last
+
+    def _chosen(self, leg: Leg, start: str | None) -> Overlay:
+        over = self._over(leg, start)
+        chosen = self.file.choose(self._profile(leg), between=over)
+        return chosen.with_sources(self.records) if self.records else chosen
+
+    def _profile(self, leg: Leg) -> str | None:
+        return ",".join([*self.preset.profile, *leg.arm.profile]) or None
+
+    def _over(self, leg: Leg, start: str | None) -> list[Overlay]:
+        """What is laid over the profiles, from the bottom up."""
+        own: dict[str, dict[str, Value]] = {
+            section: {"seed": Value(leg.seed, f"--seeds: {section}")} for section in _SEEDED
+        }
+        if start is not None:
+            own[TRAIN]["start"] = Value(start, f"weights of arm {leg.arm.start}: {TRAIN}")
+        words = read_words(self.overrides, self.file.sections)
+        for section in _SEEDED:
+            if "seed" in words.values.get(section, {}):
+                raise ConfigError(f"-s {section}.seed: {_NO_SEED}")
+        return [leg.settings, *self.file.laid(self.profile), words, Overlay((), own)]
+
+
+def legs_of(comparison: Comparison, arms: Sequence[Arm], seeds: int) -> list[Leg]:
+    """List all runs, in an order in which each finds the weights that it goes on from.
+
+    Every seed is done with before the next one: there is something to look at early.
+
+    Args:
+        comparison: How they are planned.
+        arms: Arms that are compared; those that they go on from are trained too.
+        seeds: How many.
+    """
+    plays = ROLLOUT in comparison.stages
+    starts = comparison.preset.starts_of(arms)
+    found = []
+    for seed in range(seeds):
+        for arm in comparison.preset.arms.values():
+            if arm in starts or (arm in arms and not plays):
+                found.append(Leg(comparison.preset.name, arm, seed))
+            elif arm in arms:
+                found += [
+                    Leg(comparison.preset.name, arm, seed, play) for play in arm.plays
+                ]
+    return found

@@ -1,0 +1,1 @@
+"""The engine: keys, plans, manifests, locks, atomic writes and resumable runs of stages."""

@@ -1,0 +1,153 @@
+"""Finding and removing what no remembered request needs any more."""
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.engine.atomic import PARTIAL, TRASH, StoreError, remove_folder
+from pipeline.engine.layout import KEY_DIGITS, MANIFEST, Root, read_json
+from pipeline.engine.locks import locked
+from pipeline.engine.manifest import read_manifest
+from pipeline.settings.lined_yaml import Lined, inner, load
+from pipeline.settings.stages_file import DEFAULT_FILE
+from pipeline.storage.initial_weights import START
+
+PARTIAL_AGE_S = 24 * 3600.0
+WEIGHTS_STAGE = "train"
+
+
+@dataclass(frozen=True, slots=True)
+class Garbage:
+    """A folder that nothing needs.
+
+    Attributes:
+        path: Where it is.
+        bytes: What it takes.
+        why: What it is.
+    """
+
+    path: Path
+    bytes: int
+    why: str
+
+
+def find_garbage(root: Root) -> list[Garbage]:
+    """List what the latest stages of every profile, and their units, do not need.
+
+    Units of an unfinished stage are kept: the next run goes on from them.
+    """
+    found = []
+    for stage in root.stages():
+        kept = _kept(root, stage)
+        for folder in _folders(root, stage):
+            if folder.name.endswith(PARTIAL):
+                if folder.name.startswith(TRASH) or _age_s(folder) > PARTIAL_AGE_S:
+                    found.append(Garbage(folder, _bytes(folder), "left by a killed run"))
+            elif folder.name not in kept:
+                what = "unit" if folder.parent.name == "units" else "stage"
+                found.append(Garbage(folder, _bytes(folder), f"{what} of {stage}"))
+    return found
+
+
+def sweep(root: Root) -> list[Garbage]:
+    """Remove the garbage while holding the locks of all stages.
+
+    Raises:
+        LockedError: if a run is making one of them.
+    """
+    with ExitStack() as stack:
+        for stage in root.stages():
+            stack.enter_context(locked(root.lock(stage)))
+        found = find_garbage(root)
+        for garbage in found:
+            remove_folder(garbage.path)
+    return found
+
+
+def _kept(root: Root, stage: str) -> set[str]:
+    """Names of folders that are needed, of the stage itself and of its units."""
+    folders = {key[:KEY_DIGITS] for key in _remembered(root, stage)}
+    pointed = root.pointed(stage)
+    if pointed is not None:
+        folders.add(pointed.name)
+    if stage == WEIGHTS_STAGE:
+        folders |= _started_from(root)
+    units = set()
+    for folder in folders:
+        if (root.stage(stage) / folder / MANIFEST).is_file():
+            manifest = read_manifest(root.stage(stage) / folder)
+            units |= {unit["key"][:KEY_DIGITS] for unit in manifest["units"]}
+    return folders | units | _under_way(root, stage)
+
+
+def _remembered(root: Root, stage: str) -> Iterator[str]:
+    for request in _requests(root):
+        key = request.get("keys", {}).get(stage)
+        if key is not None:
+            yield key
+
+
+def _requests(root: Root) -> list[dict[str, Any]]:
+    return [read_json(path) for path in sorted(root.refs.glob("*.json"))]
+
+
+def _started_from(root: Root) -> set[str]:
+    """Names of the folders of weights that remembered requests go on from."""
+    stage = root.stage(WEIGHTS_STAGE)
+    found = set()
+    for named in _starts(root):
+        key = named[:KEY_DIGITS]
+        found |= {path.name for path in stage.glob("*") if path.name.startswith(key)}
+        place = Path(named).resolve()
+        if place.is_relative_to(stage.resolve()):
+            found.add(place.name)
+    return found
+
+
+def _starts(root: Root) -> set[str]:
+    """All that remembered requests, and the files they are of, name as a start."""
+    requests, found = _requests(root), set()
+    for word in (word for request in requests for word in request.get("overrides", ())):
+        setting, _, value = word.partition("=")
+        if setting.endswith(f".{START}"):
+            found.add(value)
+    for path in {Path(request.get("file") or DEFAULT_FILE) for request in requests}:
+        file = load(path) if path.is_file() else Lined(path.name)
+        for part in ("params", "profiles"):
+            found |= set(_starts_in(inner(file, part)))
+    return found - {""}
+
+
+def _starts_in(settings: Mapping[str, Any]) -> Iterator[str]:
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _starts_in(value)
+        elif name == START:
+            yield str(value)
+
+
+def _under_way(root: Root, stage: str) -> set[str]:
+    try:
+        attempt = read_json(root.attempt(stage))
+    except StoreError:
+        return set()
+    return {key[:KEY_DIGITS] for key in attempt["units"].values()}
+
+
+def _folders(root: Root, stage: str) -> Iterator[Path]:
+    for parent in (root.stage(stage), root.units(stage)):
+        for path in sorted(parent.glob("*")):
+            if path.is_dir() and path != root.units(stage):
+                yield path
+
+
+def _bytes(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def _age_s(folder: Path) -> float:
+    newest = max(path.stat().st_mtime for path in (folder, *folder.rglob("*")))
+    return time.time() - newest

@@ -1,0 +1,181 @@
+"""Where everything lies below the root folder of an experiment.
+
+::
+
+    store/<stage>/<key>/         a made stage: what its ``finish`` wrote, manifest.json
+    store/<stage>/units/<key>/   a made unit: what its ``work`` wrote, manifest.json
+    store/<stage>/lock           held while the stage is being made
+    store/<stage>/attempt.json   units of the last try, and which of them failed
+    latest/<stage>, report       links to the folders made or found last
+    refs/<profile>.json          the last request under a profile, and the keys it led to
+    logs/<time>-<pid>.jsonl      one line per event of a run
+    cache/fingerprints.json      identities of source files
+
+Folders carry the first 16 hexadecimal digits of their key.
+"""
+
+import json
+import os
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from infgen.config import ConfigError
+from pipeline.engine.atomic import PARTIAL, StoreError, sync_folder
+
+MANIFEST = "manifest.json"
+"""Written last; a folder that has one is whole."""
+RUN = "run.json"
+"""Beside it: what differs from run to run ..."""
+RUN_FOLDER = "run"
+"""... and, in this folder, more of that: no file in it is in the manifest."""
+KEY_DIGITS = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Root:
+    """The root folder of an experiment.
+
+    Attributes:
+        path: Absolute.
+    """
+
+    path: Path
+
+    @property
+    def store(self) -> Path:
+        """Folder of everything made."""
+        return self.path / "store"
+
+    @property
+    def latest(self) -> Path:
+        """Folder of links to what was made or found last."""
+        return self.path / "latest"
+
+    @property
+    def logs(self) -> Path:
+        """Folder of run logs."""
+        return self.path / "logs"
+
+    @property
+    def refs(self) -> Path:
+        """Folder of remembered requests."""
+        return self.path / "refs"
+
+    @property
+    def fingerprints(self) -> Path:
+        """File of remembered identities of source files."""
+        return self.path / "cache" / "fingerprints.json"
+
+    def stage(self, stage: str) -> Path:
+        """Folder of all that one stage ever made."""
+        return self.store / stage
+
+    def folder(self, stage: str, key: str) -> Path:
+        """Folder of a stage made under a key."""
+        return self.stage(stage) / key[:KEY_DIGITS]
+
+    def units(self, stage: str) -> Path:
+        """Folder of a stage's units."""
+        return self.stage(stage) / "units"
+
+    def unit(self, stage: str, key: str) -> Path:
+        """Folder of a unit."""
+        return self.units(stage) / key[:KEY_DIGITS]
+
+    def lock(self, stage: str) -> Path:
+        """Lock file of a stage."""
+        return self.stage(stage) / "lock"
+
+    def attempt(self, stage: str) -> Path:
+        """Record of a stage's last try."""
+        return self.stage(stage) / "attempt.json"
+
+    def is_made(self, stage: str, key: str) -> bool:
+        """Whether a stage is whole on disk."""
+        return (self.folder(stage, key) / MANIFEST).is_file()
+
+    def stages(self) -> list[str]:
+        """Names of all stages that were ever begun here."""
+        if not self.store.is_dir():
+            return []
+        return sorted(path.name for path in self.store.iterdir() if path.is_dir())
+
+    def made(self) -> Iterator[tuple[str, Path]]:
+        """Every whole folder here, stages and units, as (stage, folder)."""
+        for stage in self.stages():
+            for parent in (self.stage(stage), self.units(stage)):
+                for manifest in sorted(parent.glob(f"*/{MANIFEST}")):
+                    if not manifest.parent.name.endswith(PARTIAL):
+                        yield stage, manifest.parent
+
+    def point(self, stage: str, key: str) -> None:
+        """Make ``latest/<stage>`` (and ``report``) lead to a made folder."""
+        folder = self.folder(stage, key)
+        link(self.latest / stage, folder)
+        if stage == "report":
+            link(self.path / "report", folder)
+
+    def pointed(self, stage: str) -> Path | None:
+        """Return the folder that ``latest/<stage>`` leads to, if it is whole."""
+        folder = (self.latest / stage).resolve()
+        return folder if (folder / MANIFEST).is_file() else None
+
+
+def find_root(folder: Path, *, made: bool = False) -> Root:
+    """Take a folder that a command names as a root.
+
+    Args:
+        folder: As it was named.
+        made: Whether something must have been made there: a misspelt root that is empty
+            would pass for one without damage.
+
+    Raises:
+        ConfigError: if it is a file; or if nothing was made there, but must have been.
+    """
+    for place in (folder, *folder.absolute().parents):
+        if place.exists() and not place.is_dir():
+            own = "" if place == folder else f": {place}"
+            raise ConfigError(f"--root {folder}{own} is a file; expected a folder")
+    root = Root(folder.absolute())
+    if made and not root.store.is_dir():
+        what = "nothing was made there yet" if folder.exists() else "no such root"
+        raise ConfigError(
+            f"{folder}: {what}; expected the --root of a run (`infgen run --root {folder}` "
+            "makes one)"
+        )
+    return root
+
+
+def link(name: Path, target: Path) -> None:
+    """Make a relative link, or lead it elsewhere, in one step.
+
+    Raises:
+        StoreError: if something that is no link stands in its place.
+    """
+    name.parent.mkdir(parents=True, exist_ok=True)
+    relative = os.path.relpath(target, name.parent)
+    if name.is_symlink() and os.readlink(name) == relative:
+        return
+    if name.exists() and not name.is_symlink():
+        raise StoreError(f"{name} is in the way: expected a link; move it elsewhere")
+    fresh = name.with_name(f"{name.name}.{uuid.uuid4().hex[:8]}{PARTIAL}")
+    fresh.symlink_to(relative)
+    fresh.replace(name)
+    sync_folder(name.parent)
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        StoreError: naming the file, if it is missing or damaged.
+    """
+    try:
+        return json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        raise StoreError(f"{path} is missing") from error
+    except ValueError as error:
+        raise StoreError(f"{path} is damaged: {error}") from error

@@ -1,0 +1,215 @@
+"""What is to be made, under which keys. Knows this before anything has been made.
+
+The key of a stage is the hash of all that decides its bytes: the stage and its version,
+its settings, the keys of the stages it reads, and the fingerprints of its source files.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any
+
+from infgen.config import decisive, settle
+from pipeline.engine.layout import Root
+from pipeline.engine.registry import load_stage
+from pipeline.engine.stage import Source, Stage, Unit
+from pipeline.settings.overlay import Overlay, Value
+from pipeline.settings.stages_file import SOURCES, StageEntry
+from pipeline.storage.source_files import find_sources
+
+
+class PlanError(ValueError):
+    """A graph of stages that cannot be, or a stage that does not keep its word."""
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """One stage with everything settled.
+
+    Attributes:
+        stage: Its code.
+        module: Where that is, for workers.
+        settings: What its functions get.
+        values: The same as plain values, by section; those that decide what comes out.
+        inputs: Keys of the stages it reads.
+        sources: Source files it reads.
+        key: Its own key.
+    """
+
+    stage: Stage
+    module: str
+    settings: Any
+    values: Mapping[str, Mapping[str, Any]]
+    inputs: Mapping[str, str]
+    sources: tuple[Source, ...]
+    key: str
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return self.stage.name
+
+    def unit_key(self, unit: Unit) -> str:
+        """Key of one unit of the stage's work."""
+        return digest(
+            {
+                "stage": self.name,
+                "version": self.stage.version,
+                "settings": self.values,
+                "unit": unit.name,
+                "inputs": dict(unit.inputs),
+                "task": placeless(unit.task),
+            }
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Stages to make, each after those it reads."""
+
+    root: Root
+    stages: Mapping[str, Planned]
+
+    def __getitem__(self, name: str) -> Planned:
+        return self.stages[name]
+
+    def after(self, names: Iterable[str]) -> set[str]:
+        """Return these stages and all that read them, directly or not."""
+        found = set(names)
+        for name, planned in self.stages.items():
+            if found & planned.inputs.keys():
+                found.add(name)
+        return found
+
+
+def make_plan(
+    root: Root,
+    entries: Mapping[str, StageEntry],
+    chosen: Overlay,
+    targets: Sequence[str],
+) -> Plan:
+    """Settle the settings and keys of the targets and of all they need.
+
+    Raises:
+        ConfigError: for a setting that does not exist or cannot have its value, or for
+            source files that are not there.
+        PlanError: for a stage that does not exist, or stages that need each other.
+    """
+    order = needed(entries, targets)
+    reads_sources = any(SOURCES in entries[name].deps for name in order)
+    sources = find_sources(chosen.sources, root) if reads_sources else ()
+    stages: dict[str, Planned] = {}
+    for name in order:
+        stages[name] = _settle(entries[name], chosen, sources, stages, root)
+    return Plan(root, stages)
+
+
+def needed(entries: Mapping[str, StageEntry], targets: Sequence[str]) -> list[str]:
+    """List the targets and all they read, each after what it reads.
+
+    Raises:
+        PlanError: for a stage that does not exist, or stages that need each other.
+    """
+    order: list[str] = []
+    for target in targets:
+        _visit(target, "the command", entries, order, ())
+    return order
+
+
+def _visit(
+    name: str,
+    asker: str,
+    entries: Mapping[str, StageEntry],
+    order: list[str],
+    above: tuple[str, ...],
+) -> None:
+    if name not in entries:
+        near = get_close_matches(name, list(entries), n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"there is {', '.join(entries)}"
+        raise PlanError(f"{asker} asks for stage {name!r}, which does not exist; {hint}")
+    if name in above:
+        circle = " -> ".join([*above[above.index(name) :], name])
+        raise PlanError(f"{entries[name].where}: stages need each other: {circle}")
+    if name in order:
+        return
+    for dep in entries[name].deps:
+        if dep != SOURCES:
+            _visit(dep, entries[name].where, entries, order, (*above, name))
+    order.append(name)
+
+
+def _settle(
+    entry: StageEntry,
+    chosen: Overlay,
+    sources: tuple[Source, ...],
+    before: Mapping[str, Planned],
+    root: Root,
+) -> Planned:
+    stage = _load(entry)
+    sections: Mapping[str, Any] = {
+        section: _build(kind, chosen.values.get(section, {}))
+        for section, kind in stage.settings.items()
+    }
+    if stage.narrow is not None:
+        sections = stage.narrow(sections)
+    values = {section: decisive(settings) for section, settings in sections.items()}
+    only = next(iter(sections.values())) if len(sections) == 1 else sections
+    read = sources if SOURCES in entry.deps else ()
+    if stage.reads is not None:
+        read = (*read, *stage.reads(root.path, only))
+    inputs = {dep: before[dep].key for dep in entry.deps if dep != SOURCES}
+    key = digest(
+        {
+            "stage": stage.name,
+            "version": stage.version,
+            "settings": values,
+            "inputs": inputs,
+            "sources": {source.name: source.fingerprint for source in read},
+        }
+    )
+    return Planned(stage, entry.module, only, values, inputs, read, key)
+
+
+def _load(entry: StageEntry) -> Stage:
+    try:
+        stage = load_stage(entry.module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{entry.module}.".startswith(f"{error.name}."):
+            raise
+        raise PlanError(f"{entry.where}: there is no module {entry.module}") from error
+    except AttributeError as error:
+        raise PlanError(f"{entry.where}: {entry.module} ends in no STAGE") from error
+    if stage.name != entry.name:
+        raise PlanError(f"{entry.where}: {entry.module} holds stage {stage.name!r}")
+    if set(stage.settings) != set(entry.params):
+        raise PlanError(
+            f"{entry.where}: {entry.name} lists params {sorted(entry.params)}, but its "
+            f"code reads {sorted(stage.settings)}"
+        )
+    return stage
+
+
+def _build(kind: Any, values: Mapping[str, Value]) -> Any:
+    settled = {
+        name: settle(kind, name, given.value, given.where) for name, given in values.items()
+    }
+    return kind(**settled)
+
+
+def digest(value: Any) -> str:
+    """SHA-256 of a JSON-able value, independent of the order of its keys."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def placeless(value: Any) -> Any:
+    """Replace every absolute path and URL in a JSON-able value by nothing."""
+    if isinstance(value, Mapping):
+        return {name: placeless(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [placeless(part) for part in value]
+    if isinstance(value, str) and (value.startswith("/") or "://" in value):
+        return None
+    return value

@@ -1,0 +1,165 @@
+"""How far a stage is, how fast it goes, and how long it will take."""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from pipeline.engine.events import Event
+
+LONGEST_WORD = 36
+RECENT_S = 120.0
+"""Rates are those of about the last two minutes."""
+MARK_S = 1.0
+LEAST = 0.05
+"""Less of a unit says nothing of the rate: beginning takes longer than going on."""
+
+
+@dataclass
+class Gauge:
+    """Reads the events of one stage.
+
+    Units count one each; what units under way say of themselves counts as parts of them. A
+    stage that is all one unit (training) is told in that unit's own steps.
+
+    Attributes:
+        stage: Its name.
+        units: Units of its work.
+        before: Units that were made before this run.
+        what: What the steps of an only unit are.
+    """
+
+    stage: str
+    units: int
+    before: int
+    what: str = "steps"
+    clock: Callable[[], float] = time.monotonic
+    note: str = ""
+    finishing: bool = False
+    _done: int = 0
+    _part: tuple[float, float] = (0.0, 1.0)
+    _first_part: float | None = None
+    _marks: deque[tuple[float, float]] = field(default_factory=deque)
+
+    def __post_init__(self) -> None:
+        """Start the clock."""
+        self._marks.append((self.clock(), 0.0))
+
+    def take(self, event: Event) -> None:
+        """Note a unit's end, or how far it is."""
+        if event["event"] in ("unit-done", "unit-failed"):
+            self._done += 1
+            self._part, self.note = (0.0, 1.0), ""
+        elif event["event"] == "finish-started":
+            self.finishing, self._part, self.note = True, (0.0, 1.0), ""
+        elif event["event"] == "progress" and event["total"]:
+            self._part = (float(event["done"]), float(event["total"]))
+            self.note = str(event["note"])
+            if self._first_part is None:
+                self._first_part = self._part[0]
+        self._mark()
+
+    def _mark(self) -> None:
+        """Note how much is done by now, and forget what no longer counts for the rate."""
+        now, marks = self.clock(), self._marks
+        if len(marks) > 1 and now - marks[-1][0] < MARK_S:
+            marks[-1] = (marks[-1][0], self._made)
+        else:
+            marks.append((now, self._made))
+        while len(marks) > 2 and now - marks[1][0] > RECENT_S:
+            marks.popleft()
+
+    @property
+    def in_steps(self) -> bool:
+        """Whether the stage is told in the steps of its only unit."""
+        return self.units - self.before <= 1 and self._first_part is not None
+
+    @property
+    def done(self) -> float:
+        """Units, or steps, that are done."""
+        if self.finishing:
+            return self.total
+        if self.in_steps:
+            return self._part[0]
+        return min(float(self.units), self.before + self._done + self._fraction)
+
+    @property
+    def total(self) -> float:
+        """Units, or steps, in all."""
+        return self._part[1] if self.in_steps else float(self.units)
+
+    @property
+    def _fraction(self) -> float:
+        return self._part[0] / self._part[1]
+
+    @property
+    def _made(self) -> float:
+        """What of ``done`` this run did itself."""
+        return self.done - (self._first_part or 0.0 if self.in_steps else self.before)
+
+    @property
+    def per_s(self) -> float | None:
+        """Units, or steps, per second of late; None as long as next to nothing is done."""
+        since, before = self._marks[0]
+        taken, made = self.clock() - since, self._made - before
+        return made / taken if made >= LEAST and taken > 0 else None
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds to go at this rate."""
+        rate = self.per_s
+        return max(0.0, self.total - self.done) / rate if rate else None
+
+    def words(self) -> str:
+        """Say it in one line: ``12 of 27 units, 0.8/s, 0:19 left, note``."""
+        if self.finishing:
+            return self.remark
+        what = self.what if self.in_steps else "units"
+        parts = [f"{amount(self.done)} of {amount(self.total)} {what}"]
+        if self.per_s is not None and self.left_s is not None:
+            parts += [rate(self.per_s), f"{clock_time(self.left_s)} left"]
+        return ", ".join([*parts, *self._notes])
+
+    @property
+    def remark(self) -> str:
+        """What there is to say besides numbers."""
+        gathering = [f"gathering {self._fraction:.0%}"] if self.finishing else []
+        return ", ".join([*gathering, *self._notes])
+
+    @property
+    def _notes(self) -> list[str]:
+        return [self.note] if self.note else []
+
+
+def amount(count: float | int) -> str:
+    """Write how many: ``1.5``, ``12``, ``20000``."""
+    return f"{count:.4g}" if count < 1000 else f"{count:.0f}"
+
+
+def rate(per_s: float) -> str:
+    """Write a rate as ``0.8/s``, or the slow ones as ``40 s each``."""
+    return f"{per_s:.3g}/s" if per_s >= 0.1 else f"{1 / per_s:.3g} s each"
+
+
+def clock_time(seconds: float) -> str:
+    """Write a duration as ``0:07``, ``12:30`` or ``1:02:03``."""
+    minutes, second = divmod(round(seconds), 60)
+    hour, minute = divmod(minutes, 60)
+    return f"{hour}:{minute:02}:{second:02}" if hour else f"{minute}:{second:02}"
+
+
+def figures(report: dict[str, Any], most: int = 6) -> str:
+    """Write the plain figures of a report in one line."""
+    plain = {
+        name: value
+        for name, value in report.items()
+        if isinstance(value, int | float | str) and not isinstance(value, bool)
+    }
+    shown = list(plain.items())[:most]
+    return ", ".join(f"{name} {_short(value)}" for name, value in shown)
+
+
+def _short(value: Any) -> str:
+    text = f"{value:.4g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= LONGEST_WORD else f"{text[: LONGEST_WORD - 3]}..."

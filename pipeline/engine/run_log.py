@@ -1,0 +1,90 @@
+"""A run as its log tells of it, read while the run goes on writing."""
+
+import json
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from pipeline.engine.events import Event
+from pipeline.engine.progress import Gauge
+
+
+class LogTail:
+    """Reads what is new in a log since it was read last.
+
+    A line that is not whole yet is left for the next time; one that is damaged is skipped.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._offset = 0
+
+    def read(self) -> Iterator[dict[str, Any]]:
+        """Yield the new events; none if the log is gone."""
+        try:
+            with self.path.open("rb") as file:
+                file.seek(self._offset)
+                data = file.read()
+        except OSError:
+            return
+        whole = data[: data.rfind(b"\n") + 1]
+        self._offset += len(whole)
+        for line in whole.splitlines():
+            try:
+                event = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(event, dict) and "event" in event:
+                yield event
+
+
+class RunLog:
+    """Follows one run: which stage it is at, how far, how fast, what failed.
+
+    Attributes:
+        workers: Who does the units, as ``--dask`` said.
+        stage: The stage it is making; empty in between.
+        gauge: How far that is.
+        failed: Units of it that failed in this run.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._tail = LogTail(path)
+        self._now_s = 0.0
+        self.workers = "none"
+        self.stage = ""
+        self.gauge: Gauge | None = None
+        self.failed = 0
+
+    def follow(self, now_s: float) -> None:
+        """Take in what is new; rates then count up to now (seconds of the epoch)."""
+        for event in self._tail.read():
+            self._now_s = _time_s(event, self._now_s)
+            self._take(event)
+        # Clocks of two machines may differ; time does not run backwards here.
+        self._now_s = max(now_s, self._now_s)
+
+    def _take(self, event: Event) -> None:
+        kind = event["event"]
+        if kind == "run-started":
+            self.workers = str(event.get("workers", self.workers))
+        elif kind == "stage-started":
+            self.stage, self.failed = str(event["stage"]), 0
+            units, made = int(event["units"]), int(event["made"])
+            self.gauge = Gauge(self.stage, units, made, clock=lambda: self._now_s)
+        elif kind in _ENDS:
+            self.stage, self.gauge = "", None
+        elif self.gauge is not None:
+            self.failed += kind == "unit-failed"
+            self.gauge.take(event)
+
+
+_ENDS = ("stage-done", "stage-failed", "run-ended", "run-stopped")
+
+
+def _time_s(event: Event, otherwise: float) -> float:
+    try:
+        return datetime.fromisoformat(str(event["time"])).timestamp()
+    except (KeyError, ValueError):
+        return otherwise

@@ -1,0 +1,318 @@
+"""Making stages: what is whole stays, what is missing is made, and a kill loses little.
+
+The order on disk is what makes a kill harmless: a unit's files are synced, then its folder
+gets its name; only when all units have theirs does the stage's folder get one. Whatever
+else lies about is cleared, or gone on with, by the next run.
+"""
+
+import time
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from pipeline.engine import signals
+from pipeline.engine.atomic import PARTIAL, publish, remove_folder, write_json
+from pipeline.engine.events import Events
+from pipeline.engine.inputs import FinishedInputs, units_of
+from pipeline.engine.layout import KEY_DIGITS, MANIFEST, Root
+from pipeline.engine.locks import LockedError, locked
+from pipeline.engine.manifest import (
+    Run,
+    read_manifest,
+    seal,
+    split_report,
+)
+from pipeline.engine.plan import Plan, Planned
+from pipeline.engine.progress import figures
+from pipeline.engine.stage import Done, Progress, Report
+from pipeline.engine.status import has_other_code
+from pipeline.engine.tasks import about_stage, cut_tasks
+from pipeline.engine.units import Outcome, Task, failure
+from pipeline.workers.dask_cluster import Workers
+from pipeline.workers.scheduling import WorkersLostError
+
+FINISH = "finish"
+"""Stands for a stage's own last step among its failed units."""
+
+
+@dataclass(frozen=True, slots=True)
+class Orders:
+    """How to run; none of it decides bytes.
+
+    Attributes:
+        force: Stages to make again even if they are whole.
+        keep_going: After a failed unit go on with the others, and with stages that do not
+            need it.
+        wait: Queue behind a run that holds a lock.
+        strict_code: Make again what other code made.
+        workers: Who does the units (``--dask``).
+        visible_devices: ``CUDA_VISIBLE_DEVICES`` of this process, if it is set.
+    """
+
+    force: frozenset[str] = frozenset()
+    keep_going: bool = False
+    wait: bool = False
+    strict_code: bool = False
+    workers: str = "none"
+    visible_devices: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What became of one stage.
+
+    Attributes:
+        stage: Its name.
+        state: ``skipped`` where a stage it needs failed.
+        key: Its key.
+        units: Units of its work.
+        made: Units that this run made.
+        seconds: Time it took.
+        report: Its figures.
+        errors: One line per failed unit, by name.
+    """
+
+    stage: str
+    state: Literal["cached", "made", "failed", "skipped"]
+    key: str
+    units: int = 0
+    made: int = 0
+    seconds: float = 0.0
+    report: Report = field(default_factory=dict)
+    errors: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def words(self) -> str:
+        """Its key figures in one line."""
+        return figures(self.report)
+
+
+def run(plan: Plan, orders: Orders, events: Events) -> list[Result]:
+    """Make every planned stage that is not whole, each after those it reads.
+
+    Raises:
+        LockedError: if another run is making one of them.
+        PlanError: if a stage breaks its contract.
+        StoreError: if what a stage should read is damaged.
+        WorkersLostError: if the workers are gone, with what they had under way.
+    """
+    events.emit("run-started", stages=list(plan.stages), workers=orders.workers)
+    try:
+        results = _make_all(plan, orders, events)
+    except (signals.Stopped, LockedError, WorkersLostError) as error:
+        events.emit("run-stopped", why=str(error))
+        raise
+    failed = [result.stage for result in results if result.state == "failed"]
+    events.emit("run-ended", failed=failed)
+    return results
+
+
+def _make_all(plan: Plan, orders: Orders, events: Events) -> list[Result]:
+    force = plan.after(orders.force | _made_by_other_code(plan, orders))
+    results: list[Result] = []
+    with Workers(orders.workers, orders.visible_devices) as workers:
+        for planned in plan.stages.values():
+            unmet = {result.stage for result in results if result.state in _NOT_MADE}
+            if unmet and (not orders.keep_going or unmet & planned.inputs.keys()):
+                results.append(Result(planned.name, "skipped", planned.key))
+                events.emit("stage-skipped", stage=planned.name)
+                continue
+            making = _Making(plan, planned, orders, events, planned.name in force)
+            results.append(making.ensure(workers))
+    return results
+
+
+_NOT_MADE = ("failed", "skipped")
+
+
+def _made_by_other_code(plan: Plan, orders: Orders) -> frozenset[str]:
+    if not orders.strict_code:
+        return frozenset()
+    return frozenset(name for name in plan.stages if has_other_code(plan, name))
+
+
+@dataclass(frozen=True, slots=True)
+class _Making:
+    """One stage on its way."""
+
+    plan: Plan
+    planned: Planned
+    orders: Orders
+    events: Events
+    forced: bool
+
+    @property
+    def root(self) -> Root:
+        return self.plan.root
+
+    @property
+    def name(self) -> str:
+        return self.planned.name
+
+    @property
+    def folder(self) -> Path:
+        return self.root.folder(self.name, self.planned.key)
+
+    def ensure(self, workers: Workers) -> Result:
+        """Find the stage whole, or make it, alone."""
+        begun = time.monotonic()
+        if self._is_whole():
+            return self._cached()
+        with locked(self.root.lock(self.name), wait=self.orders.wait):
+            if self._is_whole():
+                return self._cached()
+            result = self._make(workers)
+        taken = time.monotonic() - begun
+        return replace(result, seconds=round(taken, 3))
+
+    def _is_whole(self) -> bool:
+        return not self.forced and self.root.is_made(self.name, self.planned.key)
+
+    def _cached(self) -> Result:
+        manifest = read_manifest(self.folder)
+        self.root.point(self.name, self.planned.key)
+        units = len(manifest["units"])
+        self.events.emit("stage-cached", stage=self.name, units=units)
+        report = manifest["report"]
+        return Result(self.name, "cached", self.planned.key, units, report=report)
+
+    def _make(self, workers: Workers) -> Result:
+        inputs = FinishedInputs(self.root, self.planned)
+        units = self.planned.stage.plan(inputs, self.planned.settings)
+        tasks = cut_tasks(self.root, self.planned, units)
+        if self.forced:
+            self._forget(tasks)
+        self._clear()
+        todo = [task for task in tasks if not (task.target / MANIFEST).is_file()]
+        self._note_attempt(tasks, {})
+        self.events.emit(
+            "stage-started",
+            stage=self.name,
+            key=self.planned.key,
+            units=len(tasks),
+            made=len(tasks) - len(todo),
+        )
+        outcomes = self._do(todo, workers)
+        errors = {outcome.name: outcome.error for outcome in outcomes if outcome.error}
+        report: Report = {}
+        if not errors:
+            self._clear()  # Of workers that died, too: others did their units.
+            report, errors = self._finish(inputs, tasks)
+        self._note_attempt(tasks, errors)
+        made = sum(outcome.report is not None for outcome in outcomes)
+        if errors:
+            self.events.emit("stage-failed", stage=self.name, errors=errors)
+            state: Literal["made", "failed"] = "failed"
+        else:
+            self.root.attempt(self.name).unlink()
+            self.root.point(self.name, self.planned.key)
+            self.events.emit("stage-done", stage=self.name, report=report)
+            state = "made"
+        return Result(
+            self.name, state, self.planned.key, len(tasks), made, 0.0, report, errors
+        )
+
+    def _do(self, todo: Sequence[Task], workers: Workers) -> list[Outcome]:
+        outcomes: list[Outcome] = []
+        if not todo:
+            return outcomes
+
+        def go_on() -> bool:
+            return self.orders.keep_going or not any(outcome.error for outcome in outcomes)
+
+        self.root.units(self.name).mkdir(parents=True, exist_ok=True)
+        executor = workers.executor(here=self.planned.stage.in_driver)
+        for outcome in executor.run(todo, go_on, self._progress(), self._tell_more):
+            outcomes.append(outcome)
+            self._tell(outcome)
+        return outcomes
+
+    def _tell(self, outcome: Outcome) -> None:
+        seconds = round(outcome.seconds, 3)
+        about: dict[str, Any] = {
+            "stage": self.name,
+            "unit": outcome.name,
+            "seconds": seconds,
+        }
+        if outcome.error:
+            self.events.emit(
+                "unit-failed", **about, error=outcome.error, trace=outcome.trace
+            )
+        else:
+            self.events.emit("unit-done", **about, report=outcome.report)
+
+    def _tell_more(self, event: str, **figures: Any) -> None:
+        self.events.emit(event, stage=self.name, **figures)
+
+    def _finish(
+        self, inputs: FinishedInputs, tasks: Sequence[Task]
+    ) -> tuple[Report, dict[str, str]]:
+        """Gather the units into the stage's folder; a failure becomes an error line."""
+        begun = time.monotonic()
+        self.events.emit("finish-started", stage=self.name)
+        try:
+            return self._gather(inputs, tasks), {}
+        except Exception as error:  # Recorded as a failed unit would be; others go on.
+            trace, seconds = traceback.format_exc(), time.monotonic() - begun
+            outcome = failure(FINISH, error, trace, seconds)
+            self._tell(outcome)
+            return {}, {FINISH: outcome.error}
+
+    def _gather(self, inputs: FinishedInputs, tasks: Sequence[Task]) -> Report:
+        started, begun = datetime.now(UTC).isoformat(timespec="seconds"), time.monotonic()
+        about = about_stage(self.planned, tasks)
+        dones: list[Done] = units_of(self.root, self.name, about)
+        settings = self.planned.settings
+        with publish(self.folder) as partial:
+            report = self.planned.stage.finish(
+                inputs, dones, partial, settings, self._progress()
+            )
+            same, varying = split_report(report)
+            seconds = time.monotonic() - begun
+            seal(partial, {**about, "report": same}, Run(started, seconds, varying))
+        return same
+
+    def _progress(self) -> Progress:
+        def tell(done: float | int, total: float | int, note: str = "") -> None:
+            self.events.emit("progress", stage=self.name, done=done, total=total, note=note)
+            signals.check()
+
+        return tell
+
+    def _note_attempt(self, tasks: Sequence[Task], failed: dict[str, str]) -> None:
+        """Say on disk what is under way, for ``status`` and ``gc``."""
+        units = {task.unit.name: task.about["key"] for task in tasks}
+        about = {"key": self.planned.key, "units": units, "failed": failed}
+        write_json(self.root.attempt(self.name), about)
+
+    def _forget(self, tasks: Sequence[Task]) -> None:
+        """Remove what is to be made again, the stage before its units."""
+        for folder in (self.folder, *[task.target for task in tasks]):
+            remove_folder(folder)
+
+    def _clear(self) -> None:
+        """Remove what killed runs left behind, but what this stage can go on from."""
+        stage = self.root.stage(self.name)
+        for path in [*stage.glob("*"), *stage.glob("units/*")]:
+            if path.name.endswith(PARTIAL):
+                resumable = len(path.name) == KEY_DIGITS + len(PARTIAL)
+                if self.forced or not (self.planned.stage.resumes and resumable):
+                    _remove(path)
+            elif _is_half_removed(path):
+                _remove(path)
+
+
+def _is_half_removed(path: Path) -> bool:
+    """Tell whether this is a folder that is in the way of what its name stands for."""
+    has_key = len(path.name) == KEY_DIGITS and path.is_dir()
+    return has_key and not (path / MANIFEST).is_file()
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        remove_folder(path)  # A worker of a run that is gone may still write there.
+    else:
+        path.unlink(missing_ok=True)

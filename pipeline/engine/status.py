@@ -1,0 +1,194 @@
+"""How the stages on disk stand to what is asked for, and why."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pipeline.engine.atomic import StoreError
+from pipeline.engine.code_hash import code_hash
+from pipeline.engine.inputs import FinishedInputs, are_made
+from pipeline.engine.layout import MANIFEST, read_json
+from pipeline.engine.locks import holder, is_locked
+from pipeline.engine.manifest import read_manifest
+from pipeline.engine.plan import Plan, PlanError, Planned
+
+State = Literal["cached", "stale", "missing", "running", "failed"]
+OTHER_CODE = "code differs from the run that made this"
+MAX_NAMES = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """How one stage stands.
+
+    Attributes:
+        stage: Its name.
+        state: ``cached``: made as asked. ``stale``: made, but otherwise than asked.
+            ``missing``: never made. ``running``: being made now. ``failed``: the last try
+            to make it as asked failed.
+        why: Reasons, in words.
+        key: Its key.
+        units: Units of its work, where that can be told.
+        made: How many of them are made.
+    """
+
+    stage: str
+    state: State
+    why: str
+    key: str
+    units: int | None
+    made: int | None
+
+    @property
+    def progress(self) -> str:
+        """Units made of all, as ``12/27``."""
+        return "" if self.units is None else f"{self.made}/{self.units}"
+
+
+def standings(
+    plan: Plan, made: Mapping[str, str], *, strict_code: bool = False
+) -> list[Standing]:
+    """Tell how every planned stage stands.
+
+    Args:
+        plan: What is asked for.
+        made: Keys of the stages made last; what is stale is compared with these.
+        strict_code: Whether other code makes a stage stale.
+    """
+    return [_standing(plan, name, made, strict_code) for name in plan.stages]
+
+
+def _standing(
+    plan: Plan, name: str, made: Mapping[str, str], strict_code: bool
+) -> Standing:
+    planned, root = plan[name], plan.root
+    other_code = has_other_code(plan, name)
+    if root.is_made(name, planned.key) and not (strict_code and other_code):
+        units = len(read_manifest(root.folder(name, planned.key))["units"])
+        why = OTHER_CODE if other_code else ""
+        return Standing(name, "cached", why, planned.key, units, units)
+    try:
+        total, done = count_units(plan, planned)
+    except PlanError as error:  # It cannot be cut as asked: the user must know, not stop.
+        return Standing(name, "missing", str(error), planned.key, None, None)
+    reasons = (
+        [OTHER_CODE] if other_code else why_remade(plan, name, _last(plan, name, made))
+    )
+    state: State = "stale" if reasons else "missing"
+    reasons = reasons or ["not made yet"]
+    attempt = last_attempt(plan, name)
+    if attempt.get("failed"):
+        state, reasons = "failed", _failures(attempt["failed"])
+    if is_locked(root.lock(name)):
+        about = holder(root.lock(name))
+        state = "running"
+        reasons = [f"process {about.get('pid')} on {about.get('host')}"]
+    if done and not other_code:
+        reasons = [*reasons, f"{done} of {total} units made"]
+    return Standing(name, state, "; ".join(reasons), planned.key, total, done)
+
+
+def has_other_code(plan: Plan, name: str) -> bool:
+    """Whether a stage was made as asked, but by code that has changed since."""
+    folder = plan.root.folder(name, plan[name].key)
+    if not (folder / MANIFEST).is_file():
+        return False
+    return read_manifest(folder).get("code") != code_hash(plan[name].stage.modules)
+
+
+def last_attempt(plan: Plan, name: str) -> Mapping[str, Any]:
+    """Return the record of the last try to make a stage as asked, if it did not end."""
+    try:
+        attempt = read_json(plan.root.attempt(name))
+    except StoreError:
+        return {}
+    return attempt if attempt.get("key") == plan[name].key else {}
+
+
+def count_units(plan: Plan, planned: Planned) -> tuple[int | None, int | None]:
+    """Count units, and those made; None where inputs must be made before this is known."""
+    if not are_made(plan, planned):
+        return None, None
+    units = planned.stage.plan(FinishedInputs(plan.root, planned), planned.settings)
+    folders = [plan.root.unit(planned.name, planned.unit_key(unit)) for unit in units]
+    return len(units), sum((folder / MANIFEST).is_file() for folder in folders)
+
+
+def _failures(failed: Mapping[str, str]) -> list[str]:
+    name, error = next(iter(failed.items()))
+    more = f" (and {len(failed) - 1} more units)" if len(failed) > 1 else ""
+    return [f"{name}: {error}{more}"]
+
+
+def _last(plan: Plan, name: str, made: Mapping[str, str]) -> Mapping[str, Any] | None:
+    """Manifest of the stage as it was made last: under this profile, or else at all."""
+    root = plan.root
+    if name in made and root.is_made(name, made[name]):
+        return read_manifest(root.folder(name, made[name]))
+    folder = root.pointed(name)
+    return read_manifest(folder) if folder is not None else None
+
+
+def why_remade(plan: Plan, name: str, old: Mapping[str, Any] | None) -> list[str]:
+    """Tell why a stage's key is not that of an old manifest; nothing if there is none."""
+    if old is None:
+        return []
+    planned = plan[name]
+    own = [
+        *_version_reasons(old.get("version"), planned.stage.version),
+        *_setting_reasons(old.get("settings", {}), planned.values),
+        *_source_reasons(
+            old.get("sources", {}),
+            {source.name: source.fingerprint for source in planned.sources},
+        ),
+    ]
+    for dep, key in planned.inputs.items():
+        was = old.get("inputs", {}).get(dep)
+        if was != key:
+            own += [
+                reason for reason in _input_reasons(plan, dep, was) if reason not in own
+            ]
+    return own
+
+
+def _input_reasons(plan: Plan, dep: str, was: str | None) -> list[str]:
+    if was is None:
+        return [f"new input {dep}"]
+    if not plan.root.is_made(dep, was):
+        return [f"input {dep}: differs from what it was"]
+    reasons = why_remade(plan, dep, read_manifest(plan.root.folder(dep, was)))
+    return [
+        reason if reason.startswith("input ") else f"input {dep}: {reason}"
+        for reason in reasons
+    ]
+
+
+def _version_reasons(old: Any, new: int) -> list[str]:
+    return [] if old == new else [f"code version {old} -> {new}"]
+
+
+def _setting_reasons(
+    old: Mapping[str, Mapping[str, Any]], new: Mapping[str, Mapping[str, Any]]
+) -> list[str]:
+    reasons = []
+    for section in sorted(old.keys() | new.keys()):
+        before, after = old.get(section, {}), new.get(section, {})
+        for name in sorted(before.keys() | after.keys()):
+            was, now = before.get(name, "unset"), after.get(name, "unset")
+            if was != now:
+                reasons.append(f"{section}.{name} {was} -> {now}")
+    return reasons
+
+
+def _source_reasons(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
+    added = [name for name in new if name not in old]
+    gone = [name for name in old if name not in new]
+    changed = [name for name in new if name in old and new[name] != old[name]]
+    kinds = (("new", added), ("changed", changed), ("removed", gone))
+    return [_count(kind, names) for kind, names in kinds if names]
+
+
+def _count(kind: str, names: Sequence[str]) -> str:
+    shown = ", ".join(sorted(names)[:MAX_NAMES])
+    more = ", ..." if len(names) > MAX_NAMES else ""
+    return f"{len(names)} {kind} {'file' if len(names) == 1 else 'files'} {shown}{more}"

@@ -1,0 +1,72 @@
+"""From units of a stage to tasks for workers, and what the manifests say of both."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+from pipeline.engine.code_hash import code_hash
+from pipeline.engine.layout import Root
+from pipeline.engine.manifest import package_versions, read_manifest
+from pipeline.engine.plan import PlanError, Planned, placeless
+from pipeline.engine.stage import Unit
+from pipeline.engine.units import Task
+
+UNIT_SCHEMA = "infgen.unit/1"
+STAGE_SCHEMA = "infgen.stage/1"
+
+
+def cut_tasks(root: Root, planned: Planned, units: Sequence[Unit]) -> list[Task]:
+    """Name the folder of every unit, and write down how it comes about.
+
+    Raises:
+        PlanError: if two units have one name, or a name is no file name.
+    """
+    for name, count in Counter(unit.name for unit in units).items():
+        if count > 1 or "/" in name or not name:
+            raise PlanError(f"stage {planned.name!r} cuts a bad or double unit {name!r}")
+    common = _common(planned)
+    return [_task(root, planned, unit, common) for unit in units]
+
+
+def _task(root: Root, planned: Planned, unit: Unit, common: dict[str, Any]) -> Task:
+    key = planned.unit_key(unit)
+    about = {
+        "schema": UNIT_SCHEMA,
+        **common,
+        "name": unit.name,
+        "key": key,
+        "inputs": dict(unit.inputs),
+        "task": placeless(unit.task),
+    }
+    target = root.unit(planned.name, key)
+    return Task(planned.module, unit, target, planned.settings, about)
+
+
+def about_stage(planned: Planned, tasks: Sequence[Task]) -> dict[str, Any]:
+    """Say how a stage comes about, once all its units are made: by name, with reports."""
+    ordered = sorted(tasks, key=lambda task: task.unit.name)
+    return {
+        "schema": STAGE_SCHEMA,
+        **_common(planned),
+        "key": planned.key,
+        "inputs": dict(planned.inputs),
+        "sources": {source.name: source.fingerprint for source in planned.sources},
+        "units": [_made_unit(task) for task in ordered],
+    }
+
+
+def _common(planned: Planned) -> dict[str, Any]:
+    """What the manifests of a stage and of its units have in common."""
+    stage = planned.stage
+    return {
+        "stage": stage.name,
+        "version": stage.version,
+        "settings": planned.values,
+        "code": code_hash(stage.modules),
+        "packages": package_versions(),
+    }
+
+
+def _made_unit(task: Task) -> dict[str, Any]:
+    report = read_manifest(task.target)["report"]
+    return {"name": task.unit.name, "key": task.about["key"], "report": report}

@@ -1,0 +1,1 @@
+"""Settings: ``stages.yaml`` and the command line to frozen records."""

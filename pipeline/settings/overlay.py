@@ -1,0 +1,91 @@
+"""Settings by section, as ``stages.yaml`` or the command line gave them, laid over others.
+
+A value knows the place that gave it, so that what is wrong with it is told with its line.
+"""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from infgen.config import ConfigError
+from pipeline.settings.lined_yaml import Lined, hint, inner, known
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """One value, and the place that gave it."""
+
+    value: Any
+    where: str
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """Settings by section, and source files; empty where nothing is said."""
+
+    sources: tuple[str, ...]
+    values: Mapping[str, Mapping[str, Value]]
+
+    def with_sources(self, sources: tuple[str, ...]) -> "Overlay":
+        """Replace the source files."""
+        return Overlay(sources, self.values)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Its settings as they would be written on the command line, after ``-s``."""
+        return tuple(
+            f"{section}.{key}={_word(given.value)}"
+            for section, settings in self.values.items()
+            for key, given in settings.items()
+        )
+
+
+def lay(layers: Iterable[Overlay]) -> Overlay:
+    """Lay overlays over each other, the last on top."""
+    sources: tuple[str, ...] = ()
+    values: dict[str, dict[str, Value]] = {}
+    for layer in layers:
+        sources = layer.sources or sources
+        for section, given in layer.values.items():
+            values.setdefault(section, {}).update(given)
+    return Overlay(sources, values)
+
+
+def read_values(params: Lined, sections: Sequence[str]) -> Overlay:
+    """Read settings by section from YAML; only their sections are checked.
+
+    Raises:
+        ConfigError: naming the line of what is not a section, or not a mapping.
+    """
+    known(params, sections, "params")
+    values = {
+        section: {
+            key: Value(value, f"{inner(params, section).where(key)}: {section}")
+            for key, value in inner(params, section).items()
+        }
+        for section in params
+    }
+    return Overlay((), values)
+
+
+def read_words(words: Sequence[str], sections: Sequence[str]) -> Overlay:
+    """Read settings from ``section.key=value`` words of the command line.
+
+    Raises:
+        ConfigError: naming the word.
+    """
+    values: dict[str, dict[str, Value]] = {}
+    for word in words:
+        match = re.fullmatch(r"([\w-]+)\.(\w+)=(.*)", word, re.DOTALL)
+        if match is None:
+            raise ConfigError(f"-s {word}: expected section.key=value, as train.steps=100")
+        section, key, value = match.groups()
+        if section not in sections:
+            raise ConfigError(f"-s {word}: no section {section!r}{hint(section, sections)}")
+        values.setdefault(section, {})[key] = Value(value, f"-s {section}")
+    return Overlay((), values)
+
+
+def _word(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)

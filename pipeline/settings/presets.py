@@ -1,0 +1,121 @@
+"""Presets of ``stages.yaml``: methods that are trained, played and scored to be compared.
+
+::
+
+    presets:
+      towns-benchmark:
+        profile: small,benchmark        # below all that follows
+        seeds: 3                        # 0, 1 and 2
+        count_error: truth              # what the agent count error is measured against
+        towns:                          # what is read where no records are named
+          training: {scenes: 2000, seconds: 9.1}
+        plays:                          # what is done with every arm's weights
+          long: {rollout: {mode: long}}
+          wosac: {rollout: {mode: wosac, count: 32}}
+        arms:
+          infgen: {published: InfGen, plays: [long, wosac]}
+          smart:
+            profile: smart              # over the preset's profile
+            plays: {long: {score: {enter_radius_m: 75}}, wosac: {}}
+          catk: {profile: "smart,closed-loop", start: smart, plays: [long]}
+          no-cell: {profile: no-cell-token, ablates: infgen, plays: [long]}
+
+Sections of settings may stand in the preset itself, in an arm, in a play, and in a play of
+an arm; each is laid over those before it, and all of them over the profiles.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from infgen.config import ConfigError
+from pipeline.settings.lined_yaml import hint
+from pipeline.settings.overlay import Overlay
+
+
+@dataclass(frozen=True, slots=True)
+class TownSet:
+    """Towns of one split that a preset reads.
+
+    Attributes:
+        scenes: How many.
+        seconds: Length of each.
+        seed: Other towns for another seed.
+        scenes_per_file: Most scenes of a file.
+    """
+
+    scenes: int
+    seconds: float
+    seed: int = 0
+    scenes_per_file: int = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One method of a comparison.
+
+    Attributes:
+        name: As on the command line.
+        label: In tables.
+        profile: Profiles that are laid over those of the preset.
+        settings: Laid over all profiles, those of the preset among them.
+        plays: The same of each of its plays, with what the play sets, by the play's name.
+        start: Arm whose weights it goes on from.
+        ablates: Arm of which it leaves something out; it then stands in the table of
+            ablations.
+        published: Row of the paper that it stands beside.
+        where: Its place in the file.
+    """
+
+    name: str
+    label: str
+    profile: tuple[str, ...]
+    settings: Overlay
+    plays: Mapping[str, Overlay]
+    start: str | None
+    ablates: str | None
+    published: str | None
+    where: str
+
+
+@dataclass(frozen=True, slots=True)
+class Preset:
+    """A comparison of methods.
+
+    Attributes:
+        name: As on the command line.
+        profile: Profiles below all arms.
+        seeds: Every arm is trained and played with so many.
+        count_error: What the agent count error of its tables is measured against.
+        towns: Towns that are written and read where no records are named, by split.
+        arms: Its methods by name, each after the one it goes on from.
+    """
+
+    name: str
+    profile: tuple[str, ...]
+    seeds: int
+    count_error: str
+    towns: Mapping[str, TownSet]
+    arms: Mapping[str, Arm]
+
+    def chosen(self, names: Sequence[str]) -> list[Arm]:
+        """Pick arms by name, all without names.
+
+        Raises:
+            ConfigError: for an arm that does not exist.
+        """
+        for name in names:
+            if name not in self.arms:
+                there = hint(name, list(self.arms))
+                raise ConfigError(f"--arms {name}: no arm {name!r} in {self.name}{there}")
+        return [arm for name, arm in self.arms.items() if not names or name in names]
+
+    def starts_of(self, arms: Sequence[Arm]) -> list[Arm]:
+        """Arms that others go on from but that are not among them, each after its own."""
+        have = {arm.name for arm in arms}
+        needed: set[str] = set()
+        for arm in arms:
+            start = arm.start
+            while start is not None:
+                needed.add(start)
+                start = self.arms[start].start
+        return [arm for name, arm in self.arms.items() if name in needed - have]

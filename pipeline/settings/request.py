@@ -1,0 +1,188 @@
+"""What the user asks of a root, and what a root remembers of having been asked.
+
+A command names records, a profile and settings, or leaves them to be as last time:
+``infgen status --root R`` alone speaks of the last run. Whoever names a profile or records
+starts a new request: settings of the last one then count no more.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from infgen.config import ConfigError
+from pipeline.engine.atomic import StoreError, write_file, write_json
+from pipeline.engine.layout import Root, link, read_json
+from pipeline.engine.plan import Plan, PlanError, make_plan
+from pipeline.settings.stages_file import DEFAULT_FILE, StagesFile, load_stages
+from pipeline.storage.source_files import absolute
+
+NO_PROFILE = "default"
+LAST = "last"
+OWN_FILE = "stages.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """All that decides what a run makes.
+
+    Attributes:
+        root: Where.
+        file: Its ``stages.yaml``.
+        profile: Laid over it; None for none.
+        records: Paths, patterns or URLs; empty to use those of the file.
+        overrides: ``section.key=value`` words.
+    """
+
+    root: Root
+    file: Path
+    profile: str | None
+    records: tuple[str, ...]
+    overrides: tuple[str, ...]
+
+    @property
+    def words(self) -> str:
+        """The request as it would be written on the command line."""
+        records = [f"--records {pattern}" for pattern in self.records]
+        profile = [f"--profile {self.profile}"] if self.profile else []
+        return " ".join([*profile, *records, *[f"-s {word}" for word in self.overrides]])
+
+    def stages(self, environ: Mapping[str, str]) -> StagesFile:
+        """Read the request's ``stages.yaml``."""
+        return load_stages(self.file, environ)
+
+    def plan(self, targets: Sequence[str], environ: Mapping[str, str]) -> Plan:
+        """Plan the targets (all stages if there are none) and what they need."""
+        file = self.stages(environ)
+        chosen = file.choose(self.profile, self.overrides)
+        if self.records:
+            chosen = chosen.with_sources(self.records)
+        return make_plan(self.root, file.stages, chosen, targets or list(file.stages))
+
+    def made(self) -> Mapping[str, str]:
+        """Keys of the stages that the last run under this profile was to make."""
+        return recall(self.root, self._name).get("keys", {})
+
+    def remember(self, plan: Plan, name: str | None = None) -> None:
+        """Make this the root's last request.
+
+        Args:
+            plan: What it leads to.
+            name: To remember it by; the profile if None.
+        """
+        name = name or self._name
+        before = recall(self.root, name).get("keys", {})
+        about = {
+            "profile": self.profile,
+            "records": self.records,
+            "overrides": self.overrides,
+            "file": None if self.file == DEFAULT_FILE else str(self.file),
+            "keys": {**before, **{stage: plan[stage].key for stage in plan.stages}},
+        }
+        path = ref(self.root, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, about)
+        link(self.root.refs / LAST, path)
+
+    @contextmanager
+    def remembered(self, plan: Plan, name: str | None = None) -> Iterator[None]:
+        """Remember this while it is made, and after that unless it is refused.
+
+        Others may look on while it is made, and a run that is killed goes on with it. Words
+        that are refused only then, by a stage, must not come back with the next command.
+        """
+        last, path = self.root.refs / LAST, ref(self.root, name or self._name)
+        pointed = last.resolve() if last.exists() else None
+        before = path.read_bytes() if path.is_file() else None
+        self.remember(plan, name)
+        ours = path.read_bytes()
+        try:
+            yield
+        except (ConfigError, PlanError):
+            if path.is_file() and path.read_bytes() == ours:  # Nobody asked since.
+                _put_back(last, pointed, path, before)
+            raise
+
+    @property
+    def _name(self) -> str:
+        return self.profile or NO_PROFILE
+
+
+def complete(
+    root: Root,
+    *,
+    file: Path | None,
+    profile: str | None,
+    records: Sequence[str],
+    overrides: Sequence[str],
+    environ: Mapping[str, str],
+) -> Request:
+    """Fill in from the root's memory what a command does not name."""
+    last = recall(root, LAST)
+    fresh = profile is not None or bool(records)
+    before = last if profile is None else recall(root, profile)
+    profile = profile or last.get("profile")
+    request = Request(
+        root=root,
+        file=find_file(file, before or last),
+        profile=profile,
+        records=tuple(absolute(pattern) for pattern in records),
+        overrides=(*(() if fresh else before.get("overrides", ())), *overrides),
+    )
+    if not records:
+        request = _with_known_records(request, before, last, environ)
+    return request
+
+
+def _with_known_records(
+    request: Request,
+    before: Mapping[str, Any],
+    last: Mapping[str, Any],
+    environ: Mapping[str, str],
+) -> Request:
+    """Take the records this profile had; or those of the file; or the root's last."""
+    known = before.get("records", ())
+    if not known and not request.stages(environ).names_sources(request.profile):
+        known = last.get("records", ())
+    return Request(
+        request.root, request.file, request.profile, tuple(known), request.overrides
+    )
+
+
+def find_file(named: Path | None, before: Mapping[str, Any]) -> Path:
+    """Choose the ``stages.yaml``: named, of this folder, remembered, or packaged."""
+    own = Path(OWN_FILE)
+    if named is not None:
+        return named.absolute()
+    if own.is_file():
+        return own.absolute()
+    remembered = before.get("file")
+    return Path(remembered) if remembered else DEFAULT_FILE
+
+
+def _put_back(last: Path, pointed: Path | None, path: Path, before: bytes | None) -> None:
+    """Remember by a name, and as the last request, what was remembered before."""
+    if last.resolve() == path.resolve():
+        last.unlink()
+        if pointed is not None:
+            link(last, pointed)
+    if before is None:
+        path.unlink()
+    else:
+        write_file(path, before)
+
+
+def ref(root: Root, name: str) -> Path:
+    """File in which a root remembers a request by a name."""
+    return root.refs / f"{name}.json"
+
+
+def recall(root: Root, name: str) -> dict[str, Any]:
+    """Return what a root remembers by a name; nothing if that is damaged."""
+    path = root.refs / LAST if name == LAST else ref(root, name)
+    try:
+        about = read_json(path)
+    except StoreError:
+        return {}
+    return about if isinstance(about, dict) else {}

@@ -1,0 +1,1 @@
+"""The stages, from raw records to a report."""

@@ -1,0 +1,243 @@
+"""Stage ``calibrate``: weights to what rollouts add to their odds of coming and going.
+
+Odds that are right half second by half second thin a street out, or fill it, once the
+network plays on its own. So a unit plays some scenes with one pair of biases and counts who
+came, went and was there, beside their logs; ``finish`` finds the pair with which both are
+alike. Where the last validation of the training is to decide, there are no units.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from itertools import chain, groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from infgen.clock import CLOCK
+from infgen.config import CalibrateSettings, RolloutSettings, TokenSettings
+from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
+from pipeline.stages.calibration import Biases, read_biases, write_found
+from pipeline.stages.simulation import begin, load_player, play_all, read_some
+from pipeline.storage.splits import files_of, spread
+
+if TYPE_CHECKING:
+    from infgen.metrics.flow import Turnover
+
+Settings = Mapping[str, Any]
+
+
+def narrow(settings: Settings) -> Settings:
+    """Leave only what decides: rollouts that differ in the rest share a calibration."""
+    how: CalibrateSettings = settings["calibrate"]
+    played: RolloutSettings = settings["rollout"]
+    if how.by != "play" or not (played.inserts and played.removes):
+        by = "none" if how.by == "none" else "odds"
+        return {
+            "tokenize": TokenSettings(),
+            "rollout": RolloutSettings(),
+            "calibrate": CalibrateSettings(by=by),
+        }
+    usual = RolloutSettings()
+    same = ("split", "scenes", "scenes_per_task", "batch", "add_bias", "leave_bias", "seed")
+    rest = {name: getattr(usual, name) for name in same}
+    return {**settings, "rollout": replace(played, count=1, **rest)}
+
+
+def plan(inputs: Inputs, settings: Settings) -> list[Unit]:
+    """One unit per pair of biases and some scenes; none if nothing is played."""
+    how: CalibrateSettings = settings["calibrate"]
+    if how.by != "play":
+        return []
+    from pipeline.stages.flow_response import DESIGN  # noqa: PLC0415
+
+    weights = inputs.folder("train")
+    identity = inputs.content("train", "model.safetensors", "model.json")
+    reach = _reach(weights, how)
+    units = []
+    for point, (add, leave) in enumerate(DESIGN):
+        biases = asdict(reach.at(add, leave))
+        for part, pieces in enumerate(_parts(inputs, how)):
+            units.append(
+                Unit(
+                    name=f"play-{point}-{part:03d}",
+                    inputs={
+                        "weights": identity,
+                        **{f"scenes/{done.name}": done.key for done, *_ in pieces},
+                    },
+                    task={
+                        "weights": str(weights),
+                        "biases": biases,
+                        "point": point,
+                        "pieces": [
+                            {"scenes": str(done.path), "rows": rows}
+                            for done, rows in pieces
+                        ],
+                    },
+                )
+            )
+    return units
+
+
+def _reach(weights: Path, how: CalibrateSettings) -> Any:
+    from pipeline.stages.flow_response import Reach  # noqa: PLC0415
+
+    return Reach(read_biases(weights), how.add_reach, how.leave_reach)
+
+
+def _parts(inputs: Inputs, how: CalibrateSettings) -> list[list[tuple[Done, list[int]]]]:
+    """Cut the scenes into parts for one unit each: file, rows of its scenes.
+
+    Raises:
+        PlanError: if there is no scene of the split.
+    """
+    files = files_of(
+        inputs.units("ingest"), how.split,
+        to="play and calibrate by", setting="calibrate.split or calibrate.by",
+    )  # fmt: skip
+    chosen = zip(files, spread(files, how.scenes), strict=True)
+    scenes = [(done, row) for done, rows in chosen for row in rows]
+    most = how.scenes_per_task
+    parts = [scenes[at : at + most] for at in range(0, len(scenes), most)]
+    return [
+        [(done, [row for _, row in some]) for done, some in groupby(part, itemgetter(0))]
+        for part in parts
+    ]
+
+
+def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Report:
+    """Play some scenes with one pair of biases; count them, and their logs."""
+    from infgen.metrics.flow import add_up, count_turnover  # noqa: PLC0415
+    from infgen.metrics.traffic import from_log, from_rollout, on_map  # noqa: PLC0415
+    from infgen.rollout.rules.off_road import lane_pieces  # noqa: PLC0415
+
+    target.mkdir(parents=True, exist_ok=True)
+    how: CalibrateSettings = settings["calibrate"]
+    played = Biases(**unit.task["biases"]).over(settings["rollout"])
+    folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
+    player, weights = load_player(folder, identity, played)
+    starts, played_on, logs, refused = [], [], [], []
+    longest = CLOCK.tokens_in(player.settings.length_s)
+    for scene in _scenes(unit):
+        try:
+            logged = from_log(scene, settings["tokenize"])
+            starts += begin(player, scene)
+        except ValueError as error:
+            refused.append(f"{scene.scenario_id}: {error}")
+            continue
+        # The longer of a log and its rollouts is cut into windows as long as the shorter.
+        played_on.append((min(longest, logged.future_tokens), lane_pieces(scene)))
+        logs.append(count_turnover(logged, how.count_radius_m, longest))
+
+    def tell(done: float) -> None:
+        progress(done, len(starts), "rollouts")
+
+    rollouts = chain.from_iterable(play_all(player, starts, weights, tell))
+    # Beyond the end of a map nobody enters: biases are not to make up for that.
+    plays = [
+        count_turnover(on_map(from_rollout(rollout), lanes), how.count_radius_m, length)
+        for rollout, (length, lanes) in zip(rollouts, played_on, strict=True)
+    ]
+    return {
+        "point": unit.task["point"],
+        "scenes": len(starts),
+        "played": asdict(add_up(plays)),
+        "logged": asdict(add_up(logs)),
+        "refused": refused,
+    }
+
+
+def _scenes(unit: Unit) -> Iterator[Any]:
+    for piece in unit.task["pieces"]:
+        yield from read_some(Path(piece["scenes"]), piece["rows"])
+
+
+def finish(
+    inputs: Inputs,
+    units: Sequence[Done],
+    target: Path,
+    settings: Settings,
+    progress: Progress,
+) -> Report:
+    """Find the biases, and write them and what was played for them."""
+    target.mkdir(parents=True, exist_ok=True)
+    how: CalibrateSettings = settings["calibrate"]
+    odds = Biases() if how.by == "none" else read_biases(inputs.folder("train"))
+    found, about = odds, {"by": how.by}
+    if units:
+        found, about = _find(inputs, units, target, how)
+    write_found(target, found)
+    return {"add_bias": found.add, "leave_bias": found.leave, **about}
+
+
+def _find(
+    inputs: Inputs, units: Sequence[Done], target: Path, how: CalibrateSettings
+) -> tuple[Biases, Report]:
+    """Find the biases in what was played, and say how sure that is."""
+    from pipeline.engine.atomic import write_json  # noqa: PLC0415
+    from pipeline.stages.flow_response import DESIGN, find_best  # noqa: PLC0415
+
+    reach = _reach(inputs.folder("train"), how)
+    plays = [_sum(units, "played", point) for point in range(len(DESIGN))]
+    logs = _sum(units, "logged", 0)
+    lines = [
+        {**asdict(reach.at(*point)), **_rates(play)}
+        for point, play in zip(DESIGN, plays, strict=True)
+    ]
+    write_json(target / "plays.json", {"logs": _rates(logs), "plays": lines})
+    refused = sorted({line for done in units for line in done.report["refused"]})
+    scenes = sum(done.report["scenes"] for done in units if done.report["point"] == 0)
+    about: Report = {"scenes": scenes, "refused": refused}
+    best = find_best(plays, logs, reach)
+    if best is None:
+        # Nobody enters, or too few did to tell.
+        return reach.around, {"by": "odds", **about}
+    return best.biases, {
+        "by": "play",
+        "came_expected": best.came,
+        "went_expected": best.went,
+        "agents_expected": best.agents,
+        "at_the_end_of_reach": best.at_the_end,
+        **about,
+    }
+
+
+def _sum(units: Sequence[Done], what: str, point: int) -> "Turnover":
+    from infgen.metrics.flow import Turnover, add_up  # noqa: PLC0415
+
+    return add_up(
+        Turnover(**done.report[what]) for done in units if done.report["point"] == point
+    )
+
+
+def _rates(counts: "Turnover") -> dict[str, float | None]:
+    """Rates as they are written: None where nothing was looked at."""
+    found = {
+        "came_per_token": counts.came,
+        "went_per_token": counts.went,
+        "agents": counts.agents,
+    }
+    return {
+        name: round(counts.per_token(count), 4) if counts.tokens else None
+        for name, count in found.items()
+    }
+
+
+STAGE = Stage(
+    name="calibrate",
+    version=6,
+    settings={
+        "tokenize": TokenSettings,
+        "rollout": RolloutSettings,
+        "calibrate": CalibrateSettings,
+    },
+    plan=plan,
+    work=work,
+    finish=finish,
+    narrow=narrow,
+    modules=(
+        "pipeline.stages.calibrate",
+        "pipeline.stages.calibration",
+        "pipeline.stages.simulation",
+        "pipeline.stages.flow_response",
+    ),
+)

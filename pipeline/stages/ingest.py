@@ -1,0 +1,243 @@
+"""Ingest: raw records -> scenes in Zarr, an index of them, and a quarantine of the rest.
+
+One unit per source file. Memory stays bounded whatever the file holds: scenes are written
+in groups of bounded size as they come. A record that cannot be used is a named row of
+``quarantine.parquet``; it never stops the file, and the file never stops the stage.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from infgen.config import IngestSettings
+from infgen.scene import Scene
+from infgen.sources.tfrecord import BadRecord, Record, iter_records
+from infgen.sources.womd import scene_or_fault
+from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
+from pipeline.storage.duplicates import mark_duplicates, tell_left_out
+from pipeline.storage.parquet import joined, table
+from pipeline.storage.splits import split_of
+
+if TYPE_CHECKING:
+    import polars as pl
+
+SCHEMA = "infgen.scenes/1"
+GROUP_BYTES = 96 << 20
+"""Columns of one group in memory; a worker holds about three times as much."""
+
+_INDEX = {
+    "scenario_id": str,
+    "split": str,
+    "group": str,
+    "row": int,
+    "source": str,
+    "record": int,
+    "offset": int,
+    "record_bytes": int,
+    "agents": int,
+    "steps": int,
+    "features": int,
+    "points": int,
+    "signals": int,
+}
+_QUARANTINE = {"source": str, "record": int, "offset": int, "reason": str}
+_DUPLICATES = {**_QUARANTINE, "scenario_id": str, "first_source": str, "first_record": int}
+_MARKED = ("scenario_id", "split", "duplicate", "source", "record", "offset")
+
+
+def read_scenes(unit_folder: Path) -> Iterator[Scene]:
+    """Stream the scenes of one ingested file, in the order of its records.
+
+    One group is in memory at a time.
+
+    Raises:
+        StoreError: if a group is damaged.
+    """
+    from pipeline.storage.zarr_store import read_records  # noqa: PLC0415
+
+    for path in sorted(unit_folder.glob("scenes-*.zarr")):
+        yield from read_records(path, Scene, SCHEMA, whole=True)
+
+
+def plan(inputs: Inputs, settings: IngestSettings) -> Sequence[Unit]:
+    """One unit per source file."""
+    return [
+        Unit(source.name, {"source": source.fingerprint}, {"url": source.url})
+        for source in inputs.sources
+    ]
+
+
+def work(unit: Unit, target: Path, settings: IngestSettings, progress: Progress) -> Report:
+    """Ingest one file."""
+    target.mkdir(parents=True, exist_ok=True)
+    shard = _Shard(target, unit.name, settings.max_scenes_per_shard)
+    for record in iter_records(unit.task["url"]):
+        shard.take(record)
+        if settings.limit and len(shard.index) >= settings.limit:
+            break
+    shard.close()
+    return shard.report()
+
+
+def finish(
+    inputs: Inputs,
+    units: Sequence[Done],
+    target: Path,
+    settings: IngestSettings,
+    progress: Progress,
+) -> Report:
+    """Join the units' tables, and name scenes that several files hold.
+
+    All are listed in ``duplicates.parquet``; those marked in the index do not count.
+    """
+    target.mkdir(parents=True, exist_ok=True)
+    paths = [unit.path for unit in units]
+    index = mark_duplicates(joined(paths, "index.parquet", _INDEX))
+    quarantine = joined(paths, "quarantine.parquet", _QUARANTINE)
+    duplicates = _duplicates(index)
+    index.write_parquet(target / "index.parquet")
+    quarantine.write_parquet(target / "quarantine.parquet")
+    duplicates.write_parquet(target / "duplicates.parquet")
+    left_out = tell_left_out(index)
+    return {
+        "scenes": len(index),
+        "quarantined": len(quarantine),
+        "duplicates": int(index["duplicate"].sum()),
+        **({"units": left_out} if left_out else {}),
+    }
+
+
+class _Shard:
+    """The scenes of one file on their way to disk."""
+
+    def __init__(self, target: Path, source: str, max_scenes: int) -> None:
+        self.index: list[dict[str, Any]] = []
+        self._target, self._source, self._max_scenes = target, source, max_scenes
+        self._bad: list[dict[str, Any]] = []
+        self._pending: list[Scene] = []
+        self._pending_bytes = self._record_bytes = self._groups = 0
+        self._records: dict[str, int] = {}
+
+    def take(self, record: Record | BadRecord) -> None:
+        """Keep one record as a scene, or as a row of the quarantine."""
+        found = record if isinstance(record, BadRecord) else scene_or_fault(record)
+        if isinstance(record, Record):
+            self._record_bytes += len(record.data)
+        if isinstance(found, Scene) and found.scenario_id in self._records:
+            first = self._records[found.scenario_id]
+            reason = f"duplicate id {found.scenario_id}: record {first} has it already"
+            found = BadRecord(record.number, record.offset, reason)
+        if isinstance(found, BadRecord):
+            row = (self._source, found.number, found.offset, found.reason)
+            self._bad.append(dict(zip(_QUARANTINE, row, strict=True)))
+        elif isinstance(record, Record):
+            self._keep(record, found)
+
+    def close(self) -> None:
+        """Write what is left, and the tables."""
+        self._flush()
+        table(self.index, _INDEX).write_parquet(self._target / "index.parquet")
+        table(self._bad, _QUARANTINE).write_parquet(self._target / "quarantine.parquet")
+
+    def report(self) -> Report:
+        """Sum up the unit."""
+        files = [path for path in self._target.rglob("*") if path.is_file()]
+        return {
+            "split": split_of(self._source),
+            "scenes": len(self.index),
+            "quarantined": len(self._bad),
+            "record_bytes": self._record_bytes,
+            "disk_bytes": sum(path.stat().st_size for path in files),
+        }
+
+    def _keep(self, record: Record, scene: Scene) -> None:
+        self._records[scene.scenario_id] = record.number
+        row = {
+            "scenario_id": scene.scenario_id,
+            "split": split_of(self._source),
+            "group": self._group_name,
+            "row": len(self._pending),
+            "source": self._source,
+            "record": record.number,
+            "offset": record.offset,
+            "record_bytes": len(record.data),
+            "agents": scene.tracks.num_agents,
+            "steps": scene.tracks.num_steps,
+            "features": scene.road_map.num_features,
+            "points": len(scene.road_map.xyz_m),
+            "signals": len(scene.signals.step),
+        }
+        self.index.append(row)
+        self._pending.append(scene)
+        self._pending_bytes += num_bytes(scene)
+        if len(self._pending) >= self._max_scenes or self._pending_bytes >= GROUP_BYTES:
+            self._flush()
+
+    @property
+    def _group_name(self) -> str:
+        return f"scenes-{self._groups:03d}.zarr"
+
+    def _flush(self) -> None:
+        from pipeline.storage.zarr_store import write_records  # noqa: PLC0415
+
+        if not self._pending:
+            return
+        path = self._target / self._group_name
+        write_records(path, self._pending, Scene, SCHEMA, compress=True)
+        self._pending, self._pending_bytes = [], 0
+        self._groups += 1
+
+
+def num_bytes(record: Any) -> int:
+    """Count the bytes of all arrays of a record."""
+    total = 0
+    for field in fields(record):
+        value = getattr(record, field.name)
+        if isinstance(value, np.ndarray):
+            total += value.nbytes
+        elif is_dataclass(value):
+            total += num_bytes(value)
+    return total
+
+
+def _duplicates(index: "pl.DataFrame") -> "pl.DataFrame":
+    """Name the scenes that an earlier file holds too, of their split or of another."""
+    import polars as pl  # noqa: PLC0415
+
+    several = index.filter(pl.col("scenario_id").is_duplicated()).select(_MARKED)
+    first: dict[tuple[str, ...], tuple[str, int]] = {}
+    rows = []
+    for name, split, left_out, source, record, offset in several.iter_rows():
+        place = (source, record)
+        in_split = first.setdefault((name, split), place)
+        earlier = first.setdefault((name,), place)
+        if left_out:
+            earlier, fate = in_split, "left out"
+        elif earlier != place:
+            fate = "both count"
+        else:
+            continue
+        reason = f"scenario {name} is in {earlier[0]} too: {fate}"
+        rows.append((*place, offset, reason, name, *earlier))
+    return table([dict(zip(_DUPLICATES, row, strict=True)) for row in rows], _DUPLICATES)
+
+
+STAGE = Stage(
+    name="ingest",
+    version=1,
+    settings={"ingest": IngestSettings},
+    plan=plan,
+    work=work,
+    finish=finish,
+    modules=(
+        "pipeline.storage.columns",
+        "pipeline.storage.duplicates",
+        "pipeline.stages.ingest",
+        "pipeline.storage.parquet",
+        "pipeline.storage.splits",
+        "pipeline.storage.zarr_store",
+    ),
+)

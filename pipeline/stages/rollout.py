@@ -1,0 +1,219 @@
+"""Stage ``rollout``: weights and the first second of every scene to played futures.
+
+One unit is some scenes of one shard with all their rollouts, so a task is long beside its
+overhead. What a rollout does depends on its scene, its index and the seed alone.
+"""
+
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from infgen.config import RolloutSettings
+from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
+from pipeline.stages.calibration import Biases, read_found
+from pipeline.stages.simulation import begin, load_player, play_all, read_some
+from pipeline.storage.parquet import Fields, joined, table
+from pipeline.storage.splits import files_of, spread
+
+if TYPE_CHECKING:
+    from infgen.rollout.recording import Start
+    from infgen.rollout.rollout import Rollout
+    from infgen.rollout.simulator import Player
+
+SCHEMA = "infgen.rollouts/1"
+INDEX: Fields = {
+    "scenario_id": str,
+    "rollout": int,
+    "unit": str,
+    "group": int,
+    "row": int,
+    "agents": int,
+    "inserted": int,
+    "left": int,
+    "steps": int,
+}
+
+
+OF_ENTRIES = (
+    "add_bias",
+    "keep_count",
+    "entry_mask",
+    "entry_lane_m",
+    "entry_tries",
+    "max_entries",
+    "top_cells",
+    "cell_nucleus",
+    "cell_temperature",
+    "heading_temperature",
+)
+OF_EXITS = ("leave_bias", "leave_radius_m")
+
+
+def narrow(sections: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Set what is about who enters, or leaves, to its default where nobody does."""
+    settings: RolloutSettings = sections["rollout"]
+    idle = (() if settings.inserts else OF_ENTRIES) + (() if settings.removes else OF_EXITS)
+    usual = RolloutSettings()
+    return {"rollout": replace(settings, **{name: getattr(usual, name) for name in idle})}
+
+
+def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
+    """Cut each shard, or a part of it, into units of about equally many scenes.
+
+    Raises:
+        PlanError: if there is no scene of the split.
+    """
+    weights = inputs.folder("train")
+    identity = inputs.content("train", "model.safetensors", "model.json")
+    found = read_found(inputs.folder("calibrate"))
+    biases = Biases(
+        add=found.add if settings.inserts else 0.0,
+        leave=found.leave if settings.removes else 0.0,
+    )
+    every = inputs.units("ingest")
+    shards = files_of(every, settings.split, to="play", setting="rollout.split")
+    units = []
+    for done, rows in zip(shards, spread(shards, settings.scenes), strict=True):
+        for first, after in pairwise(_edges(len(rows), settings.scenes_per_task)):
+            units.append(
+                Unit(
+                    name=f"{done.name}-{rows[first]:05d}",
+                    inputs={"scenes": done.key, "weights": identity},
+                    task={
+                        "scenes": str(done.path),
+                        "weights": str(weights),
+                        "biases": asdict(biases),
+                        "rows": rows[first:after],
+                    },
+                )
+            )
+    return units
+
+
+def _edges(scenes: int, most: int) -> list[int]:
+    """Cut scenes into as few parts as may be: where each begins, and the end."""
+    parts = math.ceil(scenes / most)
+    return [math.ceil(scenes * at / parts) for at in range(parts)] + [scenes]
+
+
+def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress) -> Report:
+    """Play all rollouts of some scenes, a batch at a time, and write them as groups."""
+    from infgen.rollout.rollout import Rollout  # noqa: PLC0415
+    from pipeline.storage.zarr_store import write_records  # noqa: PLC0415
+
+    biases = Biases(**unit.task["biases"])
+    settings = biases.over(settings)
+    folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
+    player, weights = load_player(folder, identity, settings)
+    starts, refused = _starts(unit, player)
+    begun = time.monotonic()
+
+    def tell(played: float) -> None:
+        progress(played, len(starts), f"{_rate(played, begun):.3g} rollouts/s")
+
+    rows: list[dict[str, Any]] = []
+    for group, rollouts in enumerate(play_all(player, starts, weights, tell)):
+        path = target / f"rollouts-{group:03d}.zarr"
+        write_records(path, rollouts, Rollout, SCHEMA, compress=True)
+        rows += [_row(unit.name, group, at, done) for at, done in enumerate(rollouts)]
+    table(rows, INDEX).write_parquet(target / "index.parquet")
+    pace = {"rollouts_per_s": round(_rate(len(rows), begun), 4)}
+    told = {"add_bias": settings.add_bias, "leave_bias": settings.leave_bias}
+    return {**_report(rows, refused), **told, "plays": player.plays, "run": pace}
+
+
+def _rate(played: float | int, begun: float) -> float:
+    return played / max(time.monotonic() - begun, 1e-9)
+
+
+def read_rollouts(folder: Path) -> "Iterator[Rollout]":
+    """Read the rollouts of one unit, a group in memory at a time."""
+    from infgen.rollout.rollout import Rollout  # noqa: PLC0415
+    from pipeline.storage.zarr_store import read_records  # noqa: PLC0415
+
+    for path in sorted(folder.glob("rollouts-*.zarr")):
+        yield from read_records(path, Rollout, SCHEMA, whole=True)
+
+
+def finish(
+    inputs: Inputs,
+    units: Sequence[Done],
+    target: Path,
+    settings: RolloutSettings,
+    progress: Progress,
+) -> Report:
+    """Write one index of all rollouts, and what they add up to."""
+    index = joined([done.path for done in units], "index.parquet", INDEX)
+    index.write_parquet(target / "index.parquet")
+    count = sum(done.report["rollouts"] for done in units)
+    totals = {
+        name: sum(done.report[name] for done in units)
+        for name in ("rollouts", "inserted", "left", "agents")
+    }
+    means = {
+        f"{name}_per_rollout": totals[name] / count if count else 0.0
+        for name in ("inserted", "left", "agents")
+    }
+    refused = [line for done in units for line in done.report["refused"]]
+    plays = sorted({done.report["plays"] for done in units})
+    biases = {name: units[0].report[name] for name in ("add_bias", "leave_bias") if units}
+    return {
+        "rollouts": count,
+        "plays": "; ".join(plays),
+        **means,
+        **biases,
+        "refused": refused,
+    }
+
+
+def _starts(unit: Unit, player: "Player") -> "tuple[list[Start], list[str]]":
+    """Begin all rollouts; scenes that cannot be played are named with the reason."""
+    task = unit.task
+    starts, refused = [], []
+    for scene in read_some(Path(task["scenes"]), task["rows"]):
+        try:
+            starts += begin(player, scene)
+        except ValueError as error:
+            refused.append(f"{scene.scenario_id}: {error}")
+    return starts, refused
+
+
+def _row(unit: str, group: int, at: int, rollout: "Rollout") -> dict[str, Any]:
+    return {
+        "scenario_id": rollout.scenario_id,
+        "rollout": rollout.index,
+        "unit": unit,
+        "group": group,
+        "row": at,
+        "agents": len(rollout.id),
+        "inserted": int((~rollout.logged).sum()),
+        "left": int((rollout.exit_step >= 0).sum()),
+        "steps": rollout.num_steps,
+    }
+
+
+def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
+    totals = {
+        name: sum(row[name] for row in rows) for name in ("agents", "inserted", "left")
+    }
+    return {"rollouts": len(rows), **totals, "refused": refused}
+
+
+STAGE = Stage(
+    name="rollout",
+    version=7,
+    settings={"rollout": RolloutSettings},
+    plan=plan,
+    work=play,
+    finish=finish,
+    narrow=narrow,
+    modules=(
+        "pipeline.stages.calibration",
+        "pipeline.stages.simulation",
+        "pipeline.stages.rollout",
+    ),
+)

@@ -1,0 +1,220 @@
+"""Stage ``score``: rollouts to a table of scores, against the reference of their split.
+
+A unit scores the rollouts of one rollout unit, window by window and by the official metric;
+``finish`` only joins what the units wrote.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from infgen.config import ConfigError, ReferenceSettings, ScoreSettings
+from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
+from pipeline.storage.splits import in_split, split_of
+
+if TYPE_CHECKING:
+    from infgen.metrics.long_term.reference import Counts
+    from infgen.metrics.long_term.table import Against
+    from infgen.rollout.rollout import Rollout
+    from infgen.scene import Scene
+    from pipeline.stages.score_write import ScoreRow
+
+
+def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
+    """One unit per rollout unit.
+
+    Raises:
+        ConfigError: if the rollouts are not of the reference's split, or if there is no
+            such version of Waymo's metric.
+    """
+    from infgen.metrics.wosac.versions import VERSIONS  # noqa: PLC0415
+
+    if (version := settings["score"].wosac) not in VERSIONS:
+        raise ConfigError(
+            f"score.wosac is {version!r}; expected one of {', '.join(VERSIONS)}"
+        )
+    _check_split(inputs.units("rollout"), settings["reference"].split)
+    scenes = {done.name: done for done in inputs.units("ingest")}
+    logs = {done.name: done for done in inputs.units("reference")}
+    identity = inputs.content("reference", "counts.zarr", "means.json")
+    folder = str(inputs.folder("reference"))
+    units = []
+    for done in inputs.units("rollout"):
+        source = done.name.rsplit("-", 1)[0]
+        reads = {"rollouts": done, "scenes": scenes.get(source), "logs": logs.get(source)}
+        keys = {name: one.key if one else "" for name, one in reads.items()}
+        paths = {name: str(one.path) if one else "" for name, one in reads.items()}
+        units.append(
+            Unit(
+                done.name,
+                {**keys, "reference": identity},
+                {**paths, "reference": folder},
+            )
+        )
+    return units
+
+
+def _check_split(rollouts: Sequence[Done], split: str) -> None:
+    for done in rollouts:
+        if not in_split(done.name, split):
+            found = split_of(done.name)
+            raise ConfigError(
+                f"the rollouts are of split {found!r}, the reference of {split!r}; set "
+                f"reference.split={found}"
+            )
+
+
+def work(
+    unit: Unit, target: Path, settings: Mapping[str, Any], progress: Progress
+) -> Report:
+    """Score all rollouts of some scenes."""
+    from pipeline.engine.atomic import write_json  # noqa: PLC0415
+    from pipeline.stages.reference_files import (  # noqa: PLC0415
+        read_against,
+        read_logged,
+        write_counts,
+    )
+    from pipeline.stages.rollout import read_rollouts  # noqa: PLC0415
+    from pipeline.stages.score_tables import WOSAC  # noqa: PLC0415
+    from pipeline.stages.score_write import ROWS, write_part, write_tally  # noqa: PLC0415
+
+    target.mkdir(parents=True, exist_ok=True)
+    folder, logs = Path(unit.task["rollouts"]), unit.task["logs"]
+    logged = read_logged(Path(logs)) if logs else {}
+    against = read_against(Path(unit.task["reference"]), logged, settings["reference"])
+    wanted = _scenario_ids(folder)
+    scenes = dict(_scenes(unit.task["scenes"], wanted))
+    scorer = _Scorer(against, settings["reference"], settings["score"])
+    grouped = groupby(read_rollouts(folder), key=lambda rollout: rollout.scenario_id)
+    for scenario_id, group in grouped:
+        if scenario_id in scenes:
+            scorer.take(scenes[scenario_id], list(group))
+            progress(len(scorer.official), len(wanted), "scenes")
+    scorer.tally.close_unit()
+    write_part(target / ROWS, scorer.rows())
+    write_tally(target, scorer.tally)
+    write_counts(target, scorer.counts)
+    write_json(target / WOSAC, scorer.official)
+    missing = [scenario_id for scenario_id in wanted if scenario_id not in scenes]
+    return {
+        "scenes": len(scorer.official),
+        "rollouts": scorer.tally.rollouts,
+        "missing": missing,
+    }
+
+
+class _Scorer:
+    """The scores of one unit, taken scene by scene."""
+
+    def __init__(
+        self, against: "Against", reference: ReferenceSettings, settings: ScoreSettings
+    ) -> None:
+        from infgen.metrics.long_term.reference import no_counts  # noqa: PLC0415
+        from pipeline.stages.score_summary import Tally  # noqa: PLC0415
+
+        self.tally: Tally = Tally()
+        self.counts: Counts = no_counts()
+        self.official: list[dict[str, Any]] = []
+        self._against, self._reference, self._settings = against, reference, settings
+        self._rows: list[ScoreRow] = []
+
+    def take(self, scene: "Scene", rollouts: "Sequence[Rollout]") -> None:
+        """Score the rollouts of one scene."""
+        from infgen.metrics.long_term.binned import bin_traffic  # noqa: PLC0415
+        from infgen.metrics.long_term.radius import live_within  # noqa: PLC0415
+        from infgen.metrics.long_term.reference import count_simulated  # noqa: PLC0415
+        from infgen.metrics.long_term.table import make_row  # noqa: PLC0415
+        from infgen.metrics.traffic import from_rollout  # noqa: PLC0415
+        from infgen.spatial.road_edges import edges_of  # noqa: PLC0415
+        from pipeline.stages.score_write import rows_of  # noqa: PLC0415
+
+        edges, radius_m = edges_of(scene), self._settings.enter_radius_m
+        self.official.append(_score_wosac(scene, rollouts, self._settings.wosac))
+        for rollout in rollouts:
+            lived = live_within(rollout, radius_m) if radius_m else rollout
+            near_m = self._reference.count_radius_m
+            binned = bin_traffic(from_rollout(lived), edges, near_m, as_logged=False)
+            windows = self._against.windows(binned.bins.shape[-1])
+            self.counts += count_simulated(binned, windows)
+            row = make_row(binned, self._against)
+            self.tally.add(scene.scenario_id, row)
+            self._rows += rows_of(scene.scenario_id, rollout.index, row.numbers, "")
+
+    def rows(self) -> "list[ScoreRow]":
+        """Rows of the rollouts, and then of the official metric."""
+        from pipeline.stages.score_write import rows_of  # noqa: PLC0415
+
+        found = list(self._rows)
+        for one in self.official:
+            prefix = f"{self._settings.wosac}/"
+            found += rows_of(one["scenario_id"], None, one.get("scores", {}), prefix)
+        return found
+
+
+def _score_wosac(
+    scene: "Scene", rollouts: "Sequence[Rollout]", version: str
+) -> dict[str, Any]:
+    """Official scores of one scene, or why there are none."""
+    from infgen.metrics.wosac import metric  # noqa: PLC0415
+
+    found: dict[str, Any] = {"scenario_id": scene.scenario_id}
+    try:
+        log = metric.from_scene(scene)
+        scores = metric.score(log, metric.from_rollouts(rollouts), version)
+    except ValueError as error:
+        return {**found, "skipped": str(error)}
+    return {**found, "scores": scores.numbers()}
+
+
+def _scenario_ids(folder: Path) -> list[str]:
+    """Scenes of a rollout unit, in its order."""
+    import polars as pl  # noqa: PLC0415
+
+    column = pl.read_parquet(folder / "index.parquet", columns=["scenario_id"])
+    return list(dict.fromkeys(column["scenario_id"].to_list()))
+
+
+def _scenes(folder: str, wanted: Sequence[str]) -> "Iterator[tuple[str, Scene]]":
+    """Find scenes of an ingested file by id; stops with the last of them."""
+    from pipeline.stages.ingest import read_scenes  # noqa: PLC0415
+
+    left = set(wanted)
+    for scene in read_scenes(Path(folder)) if folder else ():
+        if scene.scenario_id in left:
+            left.remove(scene.scenario_id)
+            yield scene.scenario_id, scene
+        if not left:
+            return
+
+
+def finish(
+    inputs: Inputs,
+    units: Sequence[Done],
+    target: Path,
+    settings: Mapping[str, Any],
+    progress: Progress,
+) -> Report:
+    """Join the units' scores; write tables, curves and the summary."""
+    from pipeline.stages.score_tables import gather  # noqa: PLC0415
+
+    target.mkdir(parents=True, exist_ok=True)
+    return asdict(gather(inputs, units, target, settings, progress))
+
+
+STAGE = Stage(
+    name="score",
+    version=3,
+    settings={"reference": ReferenceSettings, "score": ScoreSettings},
+    plan=plan,
+    work=work,
+    finish=finish,
+    modules=(
+        "pipeline.stages.reference_files",
+        "pipeline.stages.score",
+        "pipeline.stages.score_summary",
+        "pipeline.stages.score_tables",
+        "pipeline.stages.score_write",
+    ),
+)

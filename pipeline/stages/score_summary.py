@@ -1,0 +1,256 @@
+"""What a split's scores add up to: means over scenes with their intervals."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from infgen.config import ReferenceSettings, ScoreSettings
+from infgen.metrics.intervals import Interval, bootstrap, scene_mean
+from infgen.metrics.long_term.protocols import FEATURES, PROTOCOLS
+from infgen.metrics.long_term.table import COMPOSITE, Row, named
+
+MAX_NAMED = 20
+"""Scenes named for each reason; the rest is counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gathered:
+    """What the stage reports.
+
+    Attributes:
+        scenes: Scenes with scored rollouts.
+        rollouts: Scored rollouts.
+        logs: Logs behind the reference.
+        missing: Scenes that have rollouts but no log.
+        composite_paper: Mean over scenes.
+        composite_corrected: Mean over scenes.
+        mean_ace: Against the scenes' own logs, within the count radius.
+        wosac_metametric: Mean over the scenes that could be scored; None without any.
+    """
+
+    scenes: int
+    rollouts: int
+    logs: int
+    missing: list[str]
+    composite_paper: float | None
+    composite_corrected: float | None
+    mean_ace: float | None
+    wosac_metametric: float | None
+
+
+class Curve(NamedTuple):
+    """Mean of a metric in each window, and how many rollouts have a value there."""
+
+    value: np.ndarray
+    rollouts: np.ndarray
+
+
+@dataclass(slots=True)
+class Tally:
+    """Means per scene and sums per window, filled rollout by rollout.
+
+    Attributes:
+        means: Mean over a scene's rollouts of each metric, by scenario id.
+        rollouts: Rollouts seen.
+        sums: Sum of each metric that has a value in every window, and how many rollouts
+            have one, [value or count, window].
+    """
+
+    means: dict[str, dict[str, float]] = field(default_factory=dict)
+    rollouts: int = 0
+    sums: dict[str, np.ndarray] = field(default_factory=dict)
+    _open: dict[str, list[Mapping[str, float]]] = field(default_factory=dict)
+
+    def add(self, scenario_id: str, row: Row) -> None:
+        """Take one rollout."""
+        self.rollouts += 1
+        self._open.setdefault(scenario_id, []).append(row.numbers)
+        for name, values in row.curves.items():
+            known = ~np.isnan(values)
+            add = np.stack([np.where(known, values, 0.0), known.astype(np.float64)])
+            self.sums[name] = _add(self.sums.get(name, add[:, :0]), add)
+
+    def close_unit(self) -> None:
+        """Average the rollouts of each scene; all of a scene's rollouts are in one unit."""
+        for scenario_id, rows in self._open.items():
+            values = np.array([list(row.values()) for row in rows])
+            mean = scene_mean(values, np.ones((1, len(rows))))[0]
+            self.means[scenario_id] = dict(zip(rows[0], mean.tolist(), strict=True))
+        self._open.clear()
+
+    def merge(self, other: "Tally") -> None:
+        """Take what another unit has tallied."""
+        self.means |= other.means
+        self.rollouts += other.rollouts
+        for name, sums in other.sums.items():
+            self.sums[name] = _add(self.sums.get(name, sums[:, :0]), sums)
+
+    def names(self) -> list[str]:
+        """All metrics."""
+        return list(next(iter(self.means.values()), {}))
+
+    def matrix(self, names: Sequence[str]) -> np.ndarray:
+        """Means [scene, metric], scenes in the order they came."""
+        rows = [[means[name] for name in names] for means in self.means.values()]
+        return np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
+
+    def curves(self) -> dict[str, Curve]:
+        """Mean curves; buckets and composites follow from the features' curves."""
+        found = {}
+        for name, (total, count) in self.sums.items():
+            mean = np.where(count > 0, total / np.where(count > 0, count, 1), np.nan)
+            found[name] = Curve(mean, count)
+        for protocol in PROTOCOLS if found else ():
+            names = [f"{protocol.name}/{feature.name}" for feature in FEATURES]
+            features = np.stack([found[name].value for name in names], axis=-1)
+            rollouts = found[f"{protocol.name}/num_entries"].rollouts
+            for label, value in named(features):
+                name = f"{protocol.name}/{label}"
+                if name not in names:
+                    found[name] = Curve(value, ~np.isnan(value) * rollouts)
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """All a split's scores on their way to ``summary.json``.
+
+    Attributes:
+        settings: Of the stage.
+        reference: How logs and rollouts were measured.
+        tally: Of the rollouts.
+        log_tally: Of the logs, scored as if they were rollouts.
+        divergence: Jensen-Shannon, [protocol, feature].
+        wosac: Official scores, or why there are none, by scenario id.
+    """
+
+    settings: ScoreSettings
+    reference: ReferenceSettings
+    tally: Tally
+    log_tally: Tally
+    divergence: np.ndarray
+    wosac: Mapping[str, Mapping[str, Any]]
+
+    def build(self, missing: Sequence[str], skipped: Sequence[str]) -> dict[str, Any]:
+        """Everything, JSON-able; a number without a value is null."""
+        names = [n for n in self.tally.names() if n.split("/")[0] not in _PROTOCOL_NAMES]
+        names += [n for n in self.tally.names() if n.endswith("_rate")]
+        return {
+            "scenes": len(self.tally.means),
+            "rollouts": self.tally.rollouts,
+            "logs": len(self.log_tally.means),
+            "missing_scenes": _some(missing),
+            "skipped_logs": _some(skipped),
+            "window_s": self.reference.window_s,
+            "stride_s": self.reference.stride_s,
+            "count_radius_m": self.reference.count_radius_m,
+            "protocols": {
+                protocol.name: self._protocol(at) for at, protocol in enumerate(PROTOCOLS)
+            },
+            "numbers": self._numbers(names),
+            "wosac": self._official(),
+        }
+
+    def report(self, missing: Sequence[str]) -> Gathered:
+        """The few figures that the engine shows."""
+        summary = self.build(missing, ())
+        metametric = summary["wosac"]["scores"].get("metametric", {}).get("mean")
+        ace = summary["numbers"].get("ace/own_near", {}).get("mean")
+        composite = {
+            name: protocol["scores"][COMPOSITE]["mean"]
+            for name, protocol in summary["protocols"].items()
+        }
+        return Gathered(
+            scenes=summary["scenes"],
+            rollouts=summary["rollouts"],
+            logs=summary["logs"],
+            missing=list(missing),
+            composite_paper=composite["paper"],
+            composite_corrected=composite["corrected"],
+            mean_ace=ace,
+            wosac_metametric=metametric,
+        )
+
+    def _protocol(self, at: int) -> dict[str, Any]:
+        """Scores with intervals and the log's own, and each feature's divergence."""
+        protocol = PROTOCOLS[at].name
+        names = [f"{protocol}/{feature.name}" for feature in FEATURES]
+        played, logged = (self._bootstrap(t, names, _follow) for t in self._both())
+        labels = [name for name, _ in named(np.zeros((1, len(FEATURES))))]
+        divergence = dict(
+            zip([f.name for f in FEATURES], map(_number, self.divergence[at]), strict=True)
+        )
+        return {"scores": _entries(labels, played, logged), "divergence": divergence}
+
+    def _numbers(self, names: Sequence[str]) -> dict[str, Any]:
+        played, logged = (self._bootstrap(t, names, _same) for t in self._both())
+        return _entries(names, played, logged)
+
+    def _official(self) -> dict[str, Any]:
+        scored = [entry["scores"] for entry in self.wosac.values() if "scores" in entry]
+        reasons = {k: v["skipped"] for k, v in self.wosac.items() if "skipped" in v}
+        skipped = [text if k in text else f"{k}: {text}" for k, text in reasons.items()]
+        names = list(scored[0]) if scored else []
+        values = np.array([[s[name] for name in names] for s in scored], dtype=np.float64)
+        values = values.reshape(len(scored), len(names))
+        interval = bootstrap(values, _same, self.settings.resamples, self.settings.seed)
+        return {
+            "version": self.settings.wosac,
+            "scenes": len(scored),
+            "skipped": _some(skipped),
+            "scores": _entries(names, interval, None),
+        }
+
+    def _both(self) -> tuple[Tally, Tally]:
+        return self.tally, self.log_tally
+
+    def _bootstrap(self, tally: Tally, names: Sequence[str], follow: Any) -> Interval:
+        known = names if tally.means else []
+        values = tally.matrix(known) if known else np.full((1, len(names)), np.nan)
+        return bootstrap(values, follow, self.settings.resamples, self.settings.seed)
+
+
+_PROTOCOL_NAMES = tuple(protocol.name for protocol in PROTOCOLS)
+
+
+def _follow(means: np.ndarray) -> np.ndarray:
+    """Composites, buckets and features [resample, number] from feature means."""
+    return np.stack([value for _, value in named(means)], axis=-1)
+
+
+def _same(means: np.ndarray) -> np.ndarray:
+    return means
+
+
+def _entries(
+    names: Sequence[str], played: Interval, logged: Interval | None
+) -> dict[str, dict[str, float | None]]:
+    """One entry per number: mean and interval, and the log's own mean."""
+    entries = {}
+    for at, name in enumerate(names):
+        entries[name] = {
+            "mean": _number(played.mean[at]),
+            "low": _number(played.low[at]),
+            "high": _number(played.high[at]),
+        }
+        if logged is not None:
+            entries[name]["log"] = _number(logged.mean[at])
+    return entries
+
+
+def _some(lines: Sequence[str]) -> dict[str, Any]:
+    """Count lines and name the first."""
+    return {"count": len(lines), "first": list(lines[:MAX_NAMED])}
+
+
+def _number(value: float) -> float | None:
+    """JSON knows no NaN."""
+    return None if np.isnan(value) else float(value)
+
+
+def _add(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Add sums [value or count, window], the shorter one padded with nothing."""
+    width = max(one.shape[1], other.shape[1])
+    return sum(np.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in (one, other))  # type: ignore[return-value]

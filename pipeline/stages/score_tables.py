@@ -1,0 +1,58 @@
+"""From scored units to the tables of the ``score`` stage: small rows, no scoring."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from infgen.metrics.long_term.reference import add_up, divergence
+from pipeline.engine.atomic import write_json
+from pipeline.engine.layout import read_json
+from pipeline.engine.stage import Done, Inputs, Progress
+from pipeline.stages.reference_files import read_counts
+from pipeline.stages.score_summary import Gathered, Summary, Tally
+from pipeline.stages.score_write import ROWS, join_parts, read_tally, write_curves
+
+WOSAC = "wosac.json"
+
+
+def gather(
+    inputs: Inputs,
+    units: Sequence[Done],
+    target: Path,
+    settings: Mapping[str, Any],
+    progress: Progress,
+) -> Gathered:
+    """Join all units, and write the tables of scores and curves, and the summary."""
+    reference = inputs.folder("reference")
+    parts = [folder / ROWS for folder in (reference, *(done.path for done in units))]
+    join_parts(parts, target / "scores.parquet")
+    tally = Tally()
+    wosac: dict[str, dict[str, Any]] = {}
+    for at, done in enumerate(units):
+        progress(at, len(units), "units gathered")
+        tally.merge(read_tally(done.path, done.report["rollouts"]))
+        wosac |= {one["scenario_id"]: one for one in read_json(done.path / WOSAC)}
+    write_curves(target / "curves.parquet", tally)
+    summary = Summary(
+        settings=settings["score"],
+        reference=settings["reference"],
+        tally=tally,
+        log_tally=read_tally(reference, 0),
+        divergence=divergence(
+            read_counts(reference), add_up(read_counts(done.path) for done in units)
+        ),
+        wosac=wosac,
+    )
+    missing = sorted({scene for done in units for scene in done.report["missing"]})
+    skipped = _skipped(inputs.units("reference"))
+    write_json(target / "summary.json", summary.build(missing, skipped))
+    return summary.report(missing)
+
+
+def _skipped(logs: Sequence[Done]) -> list[str]:
+    """Logs that could not be measured, each with the reason."""
+    return [
+        f"{scenario_id}: {reason}"
+        for done in logs
+        for scenario_id, reason in done.report["skipped"].items()
+    ]

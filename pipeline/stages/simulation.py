@@ -1,0 +1,114 @@
+"""Scenes on disk to rollouts in memory, for every stage that plays."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import groupby, islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from infgen.clock import CLOCK
+from infgen.config import RolloutSettings
+
+if TYPE_CHECKING:
+    from infgen.rollout.recording import Start
+    from infgen.rollout.rollout import Rollout
+    from infgen.rollout.simulator import Player
+    from infgen.scene import Scene
+
+TOGETHER_S = 1000.0
+"""Seconds of rollouts that are made whole at once: 33 of 30 s, or one of ten minutes."""
+
+
+@lru_cache(maxsize=2)
+def load_player(
+    weights: Path, identity: str, settings: RolloutSettings
+) -> "tuple[Player, str]":
+    """Load weights once per process: it may outlive what was at a path when it began.
+
+    Returns:
+        What plays, and the fingerprint of the weights.
+    """
+    import torch  # noqa: PLC0415
+
+    from infgen.model.stepping import Stepper  # noqa: PLC0415
+    from infgen.rollout.simulator import Player  # noqa: PLC0415
+    from pipeline.storage.weights import load_network, read_about  # noqa: PLC0415
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    network = load_network(weights).to(device).eval()
+    player = Player(
+        stepper=Stepper(network),
+        codebook=network.motion_codebook(),
+        roads=network.road_codebook(),
+        tokens=network.grid_settings,
+        settings=settings,
+        device=device,
+    )
+    return player, str(read_about(weights)["weights"])
+
+
+def read_some(folder: Path, rows: Sequence[int]) -> "Iterator[Scene]":
+    """Read some scenes of an ingested file; rows are ascending."""
+    from pipeline.stages.ingest import read_scenes  # noqa: PLC0415
+
+    wanted = set(rows)
+    scenes = islice(read_scenes(folder), max(rows, default=-1) + 1)
+    return (scene for row, scene in enumerate(scenes) if row in wanted)
+
+
+def begin(player: "Player", scene: "Scene") -> "list[Start]":
+    """Tokenize a scene's history, for all of its rollouts.
+
+    Raises:
+        ValueError: if it cannot be played, with the reason.
+    """
+    from infgen.rollout.recording import Start  # noqa: PLC0415
+    from infgen.tokens.tokenizer import read_lights, tokenize_scene  # noqa: PLC0415
+
+    tokens, settings = player.tokens, player.settings
+    if settings.plays_everyone:
+        tokens = replace(tokens, max_distance_m=math.inf)
+    history = tokenize_scene(scene, player.codebook, player.roads, tokens, until=scene.now)
+    lights = read_lights(scene) if settings.lights == "log" else None
+    return [
+        Start(scene, history, at, settings.seed, lights) for at in range(settings.count)
+    ]
+
+
+def play_all(
+    player: "Player",
+    starts: "Sequence[Start]",
+    weights: str,
+    tell: Callable[[float], None],
+) -> "Iterator[list[Rollout]]":
+    """Play rollouts, a batch at a time, and make them whole a few at a time.
+
+    Args:
+        player: What plays.
+        starts: Where they begin.
+        weights: Fingerprint of the weights.
+        tell: Told how many rollouts are played, at every half second of a batch.
+    """
+    from infgen.rollout.recording import Frame, collect  # noqa: PLC0415
+    from infgen.rollout.simulate import simulate  # noqa: PLC0415
+
+    length_s, done = player.settings.length_s, 0
+    few = max(1, int(TOGETHER_S / length_s))
+    for batch in _batches(starts, player.settings.batch):
+        frames: list[Frame] = []
+        for frame in simulate(player, batch):
+            frames.append(frame)
+            tell(done + len(batch) * len(frames) * CLOCK.token_s / length_s)
+        done += len(batch)
+        for first in range(0, len(batch), few):
+            places = range(len(batch))[first : first + few]
+            yield collect(batch, frames, weights, places)
+
+
+def _batches(starts: "Sequence[Start]", size: int) -> "Iterator[list[Start]]":
+    """Cut into batches whose histories are of one length."""
+    for _, group in groupby(starts, key=lambda start: start.history.now):
+        alike = list(group)
+        yield from (alike[at : at + size] for at in range(0, len(alike), size))

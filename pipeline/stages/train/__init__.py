@@ -1,0 +1,1 @@
+"""Stage ``train``: token shards and vocabularies to weights."""

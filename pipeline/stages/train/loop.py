@@ -1,0 +1,158 @@
+"""The training loop: plain steps, one after the other, that can stop after any of them."""
+
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from signal import SIGTERM
+from typing import Any
+
+from torch import Tensor
+
+from infgen.tokens.perturbation import Noise, make_noise
+from pipeline.engine import signals
+from pipeline.engine.signals import Stopped
+from pipeline.engine.stage import Progress
+from pipeline.stages.train.loader import Recipe, train_batches
+from pipeline.stages.train.optimizer_step import Descent, NotFiniteError, Stepped
+from pipeline.stages.train.precision import Pass
+from pipeline.stages.train.process_group import PeerError, Team, own_device
+from pipeline.stages.train.recorder import Journal, is_validated
+from pipeline.stages.train.setup import Course, TrainingError, repeatable
+from pipeline.stages.train.validation import validate
+from pipeline.storage.checkpoint import Training, load_checkpoint
+
+
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """What a whole run found.
+
+    Attributes:
+        validation: Figures of the final weights; empty without held-out scenes.
+        run: Figures that differ from run to run.
+    """
+
+    validation: dict[str, Any]
+    run: dict[str, Any]
+
+
+def train(
+    course: Course, training: Training, progress: Progress, team: Team | None = None
+) -> Trained:
+    """Train from the last checkpoint on, to the last step.
+
+    Args:
+        course: What on what; only the first process of a team writes to its folder.
+        training: The network with its first weights.
+        progress: Told by the first process.
+        team: The processes that train together; None for this one alone.
+
+    Raises:
+        TrainingError: if there is nothing to train on, or a loss is not finite.
+        PeerError: if another process is gone.
+        Stopped: if the run is to stop; all is saved to go on.
+    """
+    team = team or Team(device=own_device())
+    recipe = replace(course.recipe(team), noise=_noise(course, training))
+    with repeatable(), ExitStack() as stack:
+        first = load_checkpoint(course.folder, training)
+        team.check_same(first, "steps done")
+        descent = Descent(training, course.train, team, recipe.parts)
+        if not team.leads:
+            _go_down(course, recipe, descent, team, first, None)
+            return Trained({}, {})
+        journal = stack.enter_context(Journal(course, training, first, progress))
+        run = _Run(course, training, descent.forward, journal)
+        _go_down(course, recipe, descent, team, first, run)
+        if first < course.train.steps:
+            journal.save()  # Whatever ends what is left to do costs no step.
+        found = run.validate()
+        journal.flush()
+        return Trained(found, run.figures())
+
+
+def _noise(course: Course, training: Training) -> Noise | None:
+    """How scenes are disturbed to learn from; held-out ones never are."""
+    network = training.network
+    return make_noise(course.train, network.motion_codebook(), network.road_codebook())
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """What the first process does besides the steps."""
+
+    course: Course
+    training: Training
+    forward: Pass
+    journal: Journal
+
+    def after(self, done: int, stepped: Stepped) -> None:
+        """Write down one step, and all that is due after it."""
+        self.journal.add(done, stepped)
+        if is_validated(self.course.train, done):
+            self.validate()
+        self.journal.keep_up(stepped)
+
+    def validate(self) -> dict[str, Any]:
+        """Find the figures of the held-out scenes and write them down."""
+        found = validate(self.course, self.training, self.forward)
+        self.journal.add_validation(found)
+        return found
+
+    def figures(self) -> dict[str, Any]:
+        """What differs from run to run."""
+        return {
+            "scenes_per_s": round(self.journal.pace.overall(self.course.train.steps), 3),
+            "bf16": self.forward.bf16,
+            "compiled": self.forward.compiled,
+        }
+
+
+def _go_down(
+    course: Course,
+    recipe: Recipe,
+    descent: Descent,
+    team: Team,
+    first: int,
+    run: _Run | None,
+) -> None:
+    """Do all steps from ``first`` on. All processes of a team stop after the same one."""
+    steps = range(first, course.train.steps)
+    stop: Stopped | None = None
+    try:
+        with closing(train_batches(recipe, steps, course.train.loader_workers)) as batches:
+            for step, parts in zip(steps, batches, strict=True):
+                if team.any(stop is not None or signals.asked() > 0):
+                    stop = stop or Stopped(signals.asked() or SIGTERM)
+                    break
+                stepped = _step(descent, recipe, parts, step)
+                try:
+                    if run is not None:
+                        run.after(step + 1, stepped)
+                except Stopped as asked:
+                    stop = asked
+    except (TrainingError, PeerError):
+        if run is not None:
+            run.journal.save()  # The weights are still the last good ones.
+        raise
+    if stop is not None:
+        if run is not None:
+            run.journal.save()
+        raise stop
+
+
+def _step(descent: Descent, recipe: Recipe, parts: list[Any], step: int) -> Stepped:
+    """Do a step; if its loss is not finite, say of which scenes."""
+    try:
+        return descent.step(parts, recipe.own, step)
+    except NotFiniteError as error:
+        bad = error.parts or range(recipe.parts)
+        rows = [row for part in bad for row in recipe.rows(step, part)]
+        scenes = ", ".join(recipe.scenes[row].scenario_id for row in rows)
+        what = ", ".join(error.terms) or "the gradient"
+        raise TrainingError(
+            f"step {step}: the loss is not finite ({what}); its scenes: {scenes}"
+        ) from error
+
+
+def final_state(training: Training) -> dict[str, Tensor]:
+    """Weights to keep: the averaged ones if there are any."""
+    return {**training.network.state_dict(), **training.average}

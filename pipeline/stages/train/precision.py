@@ -1,0 +1,77 @@
+"""One pass of a network over a batch: in which precision, and compiled or not.
+
+Under bf16 only matrix products lose bits. Poses, distances and angles are float32 and never
+multiplied as matrices; softmax and norms are brought to float32 by autocast, and outputs
+here, so that all losses are computed in it.
+"""
+
+import warnings
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+
+import torch
+from torch import Tensor
+
+from infgen.config import TrainSettings
+from infgen.model.batching.batch import Batch
+from infgen.model.logits import Outputs
+from infgen.model.network import Network
+from infgen.model.tensors import in_float32
+
+
+class Pass:
+    """A network's pass over batches, as the settings say."""
+
+    def __init__(self, network: Network, settings: TrainSettings) -> None:
+        self._network = network
+        self._device = next(network.parameters()).device
+        self._hidden_roads = settings.map_weight > 0
+        self.bf16 = _wants_bf16(settings.precision, self._device)
+        self._compiled: Callable[..., Outputs] | None = None
+        if _wants_compiled(settings.compile, self._device):
+            self._compiled = torch.compile(network, dynamic=True)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the network is compiled (as far as known: it happens at first use)."""
+        return self._compiled is not None
+
+    def __call__(self, batch: Batch) -> Outputs:
+        """Compute all outputs, for the loss: in float32."""
+        with self._casting():
+            return in_float32(self._forward(batch))
+
+    def averaged(self, batch: Batch, average: Mapping[str, Tensor]) -> Outputs:
+        """Compute all outputs with other parameters: those of a moving average."""
+        wanted = {"hidden_roads": self._hidden_roads}
+        with self._casting():
+            outputs: Outputs = torch.func.functional_call(
+                self._network, dict(average), (batch,), wanted
+            )
+            return in_float32(outputs)
+
+    def _forward(self, batch: Batch) -> Outputs:
+        if self._compiled is not None:
+            try:
+                return self._compiled(batch, hidden_roads=self._hidden_roads)
+            except RuntimeError as error:  # All of the compiler's errors are.
+                self._compiled = None
+                why = str(error).strip().splitlines()[0]
+                warnings.warn(f"going on without compiling: {why}", stacklevel=2)
+        outputs: Outputs = self._network(batch, hidden_roads=self._hidden_roads)
+        return outputs
+
+    def _casting(self) -> AbstractContextManager[object]:
+        if not self.bf16:
+            return nullcontext()
+        return torch.autocast(self._device.type, torch.bfloat16)
+
+
+def _wants_bf16(precision: str, device: torch.device) -> bool:
+    if precision == "auto":
+        return device.type == "cuda" and torch.cuda.is_bf16_supported()
+    return precision == "bf16"
+
+
+def _wants_compiled(choice: str, device: torch.device) -> bool:
+    return device.type == "cuda" if choice == "auto" else choice == "true"

@@ -1,0 +1,115 @@
+"""What is trained on what, and the network it begins with."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.model.batching.batch import Limits
+from infgen.model.network import Network
+from infgen.tokens.scene_tokens import SceneTokens
+from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from pipeline.stages.train.loader import Recipe, TokenScenes
+from pipeline.stages.train.process_group import Team, own_device
+from pipeline.stages.train.sampler import Order
+from pipeline.storage.checkpoint import Training
+from pipeline.storage.weights import take_weights
+
+
+class TrainingError(ValueError):
+    """Training that cannot go on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """What is trained on what.
+
+    Attributes:
+        model: Sizes.
+        train: How.
+        grid: How the scenes were tokenized.
+        scenes: To learn from.
+        held_out: For the validation loss.
+        folder: Where checkpoints and the log go.
+        start: Folder of the weights to begin with; None for fresh ones.
+    """
+
+    model: ModelSettings
+    train: TrainSettings
+    grid: TokenSettings
+    scenes: TokenScenes
+    held_out: Sequence[SceneTokens]
+    folder: Path
+    start: Path | None = None
+
+    @property
+    def limits(self) -> Limits:
+        """How much of a scene a batch holds."""
+        return Limits.of(self.model, self.train, self.grid)
+
+    def recipe(self, team: Team) -> Recipe:
+        """Say what this process makes of the batch of each step.
+
+        Raises:
+            TrainingError: if there is nothing to learn from, or not for everyone.
+        """
+        how = self.train
+        if how.steps and not len(self.scenes):
+            raise TrainingError(f"no scenes of split {how.split!r} to train on")
+        parts = how.accumulate * team.size
+        if parts > how.batch_scenes:
+            raise TrainingError(
+                f"train.batch_scenes is {how.batch_scenes}, too few for {team.size} "
+                f"processes with {how.accumulate} parts each; expected {parts} or more"
+            )
+        sizes = self.scenes.sizes(self.limits)
+        order = Order(sizes, how.batch_scenes, how.bucket_batches, how.seed)
+        first = team.rank * how.accumulate
+        own = range(first, first + how.accumulate)
+        return Recipe(self.scenes, self.limits, order, parts, own)
+
+
+def begin(course: Course, motion: MotionCodebook, roads: RoadCodebook) -> Training:
+    """Make a network with its first weights, and its optimiser.
+
+    Raises:
+        StoreError: if the weights to begin with do not fit.
+    """
+    torch.manual_seed(course.train.seed)
+    network = Network(course.model, motion, roads, course.grid)
+    if course.start is not None:
+        take_weights(network, course.start)
+    network = network.to(own_device())
+    parameters = list(network.parameters())
+    decay = course.train.weight_decay
+    optimiser = torch.optim.AdamW(
+        [
+            {"params": [p for p in parameters if p.dim() > 1], "weight_decay": decay},
+            {"params": [p for p in parameters if p.dim() <= 1], "weight_decay": 0.0},
+        ],
+        lr=course.train.learning_rate,
+        fused=True,
+    )
+    average = {name: p.detach().clone() for name, p in network.named_parameters()}
+    return Training(network, average if course.train.ema_decay else {}, optimiser)
+
+
+@contextmanager
+def repeatable() -> Iterator[None]:
+    """Make equal runs give equal bits, as long as they use as many threads.
+
+    The number of threads is torch's own choice: all cores, or what OMP_NUM_THREADS says.
+    """
+    strict = torch.are_deterministic_algorithms_enabled()
+    filled = torch.utils.deterministic.fill_uninitialized_memory  # type: ignore[attr-defined]
+    torch.use_deterministic_algorithms(True, warn_only=own_device().type != "cpu")
+    # Nothing here reads memory before it is written; filling it costs a tenth of a step.
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(strict)
+        torch.utils.deterministic.fill_uninitialized_memory = filled  # type: ignore[attr-defined]

@@ -1,0 +1,202 @@
+"""Stage ``train``: token shards and codebooks to weights.
+
+One unit, in the driver's process. It saves a checkpoint every so many steps and goes on
+from the last one; a run that was killed ends with the same bytes as one that was not.
+"""
+
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from infgen.config import ModelSettings, TokenSettings, TrainSettings, build
+from pipeline.engine.atomic import write_json
+from pipeline.engine.layout import RUN_FOLDER, read_json
+from pipeline.engine.stage import Done, Inputs, Progress, Report, Source, Stage, Unit
+from pipeline.storage.initial_weights import ABOUT, START, WEIGHTS, find_start
+from pipeline.storage.splits import in_split
+
+if TYPE_CHECKING:
+    from infgen.model.network import Network
+    from pipeline.stages.train.process_group import Team
+    from pipeline.stages.train.setup import Course
+    from pipeline.storage.checkpoint import Training
+
+CODEBOOKS = ("motion.zarr", "roads.zarr")
+OUTPUTS = (WEIGHTS, ABOUT, "train.jsonl")
+DONE = "trained.json"
+"""Below ``run``: all else is written, and no checkpoint is needed any more."""
+
+
+def load_network(folder: Path) -> "Network":
+    """Load the network whose weights a stage folder holds, ready to be played.
+
+    Raises:
+        StoreError: if there is none, or it is damaged.
+    """
+    from pipeline.storage import weights  # noqa: PLC0415
+
+    return weights.load_network(folder)
+
+
+def reads(root: Path, settings: Mapping[str, Any]) -> list[Source]:
+    """Find the weights to begin with, if any are named: a folder, or a key of this stage.
+
+    Raises:
+        ConfigError: if there are none, or the key is of several.
+    """
+    return find_start(root, "train.start", settings["train"].start)
+
+
+def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
+    """One unit, of all shards of the two splits."""
+    how: TrainSettings = settings["train"]
+    shards = {
+        "scenes": _shards(inputs, how.split),
+        "held_out": _shards(inputs, how.held_out),
+    }
+    keys = {f"{use}/{d.name}": d.key for use, dones in shards.items() for d in dones}
+    keys |= {source.name: source.fingerprint for source in inputs.sources}
+    folders = {use: [str(d.path) for d in dones] for use, dones in shards.items()}
+    starts = {source.name: source.url for source in inputs.sources}
+    return [
+        Unit(
+            name="weights",
+            inputs={**keys, "codebooks": inputs.content("build-vocab", *CODEBOOKS)},
+            task={**folders, **starts, "codebooks": str(inputs.folder("build-vocab"))},
+        )
+    ]
+
+
+def _shards(inputs: Inputs, split: str) -> list[Done]:
+    return [done for done in inputs.units("tokenize") if in_split(done.name, split)]
+
+
+def work(
+    unit: Unit, target: Path, settings: Mapping[str, Any], progress: Progress
+) -> Report:
+    """Train, or go on training, and write the averaged weights."""
+    from pipeline.storage.checkpoint import drop_checkpoints  # noqa: PLC0415
+
+    done = target / RUN_FOLDER / DONE
+    if not done.is_file():
+        write_json(done, _train(unit, target, settings, progress))
+    drop_checkpoints(target)
+    report: Report = read_json(done)
+    return report
+
+
+def _train(
+    unit: Unit, target: Path, settings: Mapping[str, Any], progress: Progress
+) -> Report:
+    import torch  # noqa: PLC0415
+
+    from pipeline.stages.train.loop import final_state, train  # noqa: PLC0415
+    from pipeline.stages.train.process_group import called_together  # noqa: PLC0415
+    from pipeline.stages.train.throughput import peak_memory_mib  # noqa: PLC0415
+    from pipeline.storage.weights import save_network  # noqa: PLC0415
+
+    begun = time.monotonic()
+    target.mkdir(parents=True, exist_ok=True)
+    how: TrainSettings = settings["train"]
+    plain = {name: asdict(section) for name, section in settings.items()}
+    call = {"task": dict(unit.task), "target": str(target), "settings": plain}
+    with called_together(call, how.peer_timeout_s) as team:
+        course, training = _prepare(unit.task, target, settings)
+        found = train(course, training, progress, team)
+    weights = save_network(target, training.network, final_state(training), how.steps)
+    return {
+        "steps": how.steps,
+        "scenes": len(course.scenes),
+        "held_out": len(course.held_out),
+        "parameters": sum(p.numel() for p in training.network.parameters()),
+        "weights": weights,
+        "validation": found.validation,
+        "run": {
+            **found.run,
+            "seconds": round(time.monotonic() - begun, 1),
+            "threads": torch.get_num_threads(),
+            "processes": team.size,
+            "device": team.device.type,
+            "peak_memory_mib": round(peak_memory_mib(), 1),
+        },
+    }
+
+
+def take_part(call: Mapping[str, Any], team: "Team") -> None:
+    """Do the steps of another process's ``work`` with it; write nothing."""
+    from pipeline.stages.train.loop import train  # noqa: PLC0415
+
+    settings: dict[str, Any] = {
+        name: build(kind, call["settings"][name], name)
+        for name, kind in STAGE.settings.items()
+    }
+    course, training = _prepare(call["task"], Path(call["target"]), settings)
+    train(course, training, _say_nothing, team)
+
+
+def _prepare(
+    task: Mapping[str, Any], target: Path, settings: Mapping[str, Any]
+) -> "tuple[Course, Training]":
+    from pipeline.stages.train.loader import TokenScenes  # noqa: PLC0415
+    from pipeline.stages.train.setup import Course, begin  # noqa: PLC0415
+    from pipeline.stages.vocabulary import load_codebooks  # noqa: PLC0415
+
+    course = Course(
+        model=settings["model"],
+        train=settings["train"],
+        grid=settings["tokenize"],
+        scenes=TokenScenes([Path(path) for path in task["scenes"]]),
+        held_out=TokenScenes([Path(path) for path in task["held_out"]]),
+        folder=target,
+        start=Path(task[START]) if START in task else None,
+    )
+    return course, begin(course, *load_codebooks(Path(task["codebooks"])))
+
+
+def _say_nothing(done: float, total: float, note: str = "") -> None:
+    """Only the first process tells progress."""
+
+
+def finish(
+    inputs: Inputs,
+    units: Sequence[Done],
+    target: Path,
+    settings: Mapping[str, Any],
+    progress: Progress,
+) -> Report:
+    """Put the weights and their log in the stage's folder."""
+    target.mkdir(parents=True, exist_ok=True)
+    (unit,) = units
+    for name in OUTPUTS:
+        shutil.copyfile(unit.path / name, target / name)
+    return {name: value for name, value in unit.report.items() if name != "run"}
+
+
+STAGE = Stage(
+    name="train",
+    version=4,
+    settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
+    plan=plan,
+    work=work,
+    finish=finish,
+    reads=reads,
+    modules=(
+        "pipeline.storage.checkpoint",
+        "pipeline.stages.train.setup",
+        "pipeline.stages.train.optimizer_step",
+        "pipeline.stages.train.recorder",
+        "pipeline.stages.train.loader",
+        "pipeline.stages.train.sampler",
+        "pipeline.stages.train.precision",
+        "pipeline.stages.train.stage",
+        "pipeline.stages.train.train_log",
+        "pipeline.stages.train.loop",
+        "pipeline.stages.train.validation",
+        "pipeline.storage.weights",
+    ),
+    resumes=True,
+    in_driver=True,
+)

@@ -1,0 +1,334 @@
+"""Stage ``build-vocab``: scenes to the two codebooks, and a report on what they can write.
+
+A unit is one ingested file: a bounded sample of its moves and map pieces. Samples are
+chosen by hashes of what they are, so neither workers nor the order of files matter.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from infgen.config import TokenSettings, VocabSettings
+from infgen.scene import Scene
+from infgen.tokens.clustering.coverage import describe_moves, describe_roads, match_paths
+from infgen.tokens.clustering.map_samples import (
+    NO_CURVES,
+    Curves,
+    sample_curves,
+    scene_curves,
+)
+from infgen.tokens.clustering.motion_samples import (
+    NO_SEGMENTS,
+    Segments,
+    sample_segments,
+    scene_segments,
+)
+from infgen.tokens.clustering.physical_limits import limits_of
+from infgen.tokens.clustering.sample_keys import name_key
+from infgen.tokens.clustering.vocabularies import Origin, cluster_moves, cluster_roads
+from infgen.tokens.tracks import Paths, TokensError, read_paths
+from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.views.charts.vocabularies import codebook_page
+from pipeline.engine.plan import PlanError
+from pipeline.engine.stage import Done, Inputs, Progress, Report, Source, Stage, Unit
+from pipeline.storage.duplicates import read_scenes_of, scenes_of
+from pipeline.storage.initial_weights import find_start
+from pipeline.storage.splits import in_split, split_of
+
+if TYPE_CHECKING:
+    from pipeline.storage.columns import Unpacked
+
+T = TypeVar("T")
+
+MOTION_SCHEMA, ROADS_SCHEMA = "infgen.motion/1", "infgen.roads/1"
+SEGMENTS_SCHEMA, CURVES_SCHEMA = "infgen.segments/1", "infgen.curves/1"
+PATHS_SCHEMA = "infgen.paths/1"
+
+LEARN, HELD_OUT, BOTH = "learn", "held-out", "both"
+"""Roles of a file: source of moves, measure of them, or (by scene) either."""
+_SIDES = (LEARN, HELD_OUT)
+HELD_OUT_EVERY = 8
+"""Without a split to hold out, one scene in so many is."""
+
+SCENES_PER_UNIT = {LEARN: 8, HELD_OUT: 250}
+"""Scenes of a file whose tracks are matched once the codebooks stand ..."""
+SCENES_IN_ALL = {LEARN: 200, HELD_OUT: 1000}
+"""... and of all files."""
+
+_MERGE_EVERY = 16
+
+
+@dataclass(frozen=True, slots=True)
+class KeyedPaths:
+    """The tracks of one scene.
+
+    Attributes:
+        key: Hash of the scene's id.
+        paths: Its road users, ready for matching.
+    """
+
+    key: int
+    paths: Paths
+
+
+class _Gathered(NamedTuple):
+    """One side's samples of all files."""
+
+    segments: Segments
+    curves: Curves
+    paths: Sequence[Paths]
+
+
+class _Books(NamedTuple):
+    """Both codebooks, the ``Origin`` of their rows, and the radius of a disk of roads."""
+
+    motion: MotionCodebook
+    move_origin: np.ndarray
+    roads: RoadCodebook
+    road_origin: np.ndarray
+    road_tolerance_m: float
+
+
+def load_codebooks(folder: Path) -> tuple[MotionCodebook, RoadCodebook]:
+    """Read both codebooks from the folder of this stage.
+
+    Raises:
+        StoreError: if one is missing or damaged.
+    """
+    motion = _read(folder / "motion.zarr", MotionCodebook, MOTION_SCHEMA)
+    roads = _read(folder / "roads.zarr", RoadCodebook, ROADS_SCHEMA)
+    return motion[0], roads[0]
+
+
+def reads(root: Path, settings: VocabSettings) -> list[Source]:
+    """Find the weights whose codebooks are taken, if any are named.
+
+    Raises:
+        ConfigError: if there are none, or a key is of several.
+    """
+    return find_start(root, "build-vocab.start", settings.start)
+
+
+def plan(inputs: Inputs, settings: VocabSettings) -> list[Unit]:
+    """One unit per file of the two splits.
+
+    Codebooks that are taken, not made, need no file to learn from.
+
+    Raises:
+        PlanError: if there is no file to learn from, or none at all.
+    """
+    files = inputs.units("ingest")
+    learn = [done for done in files if in_split(done.name, settings.split)]
+    held_out = [done for done in files if in_split(done.name, settings.held_out)]
+    if not learn and not (settings.start and held_out):
+        found = ", ".join(sorted({split_of(done.name) for done in files})) or "none"
+        raise PlanError(
+            f"no file of split {settings.split!r} to build vocabularies from (there is: "
+            f"{found}); set build-vocab.split"
+        )
+    others = [done for done in held_out if done not in learn]
+    roles = {done.name: LEARN if others else BOTH for done in learn}
+    roles |= {done.name: HELD_OUT for done in others}
+    return [
+        Unit(
+            name=done.name,
+            inputs={"scenes": done.key, "role": roles[done.name]},
+            task={**scenes_of(done), "role": roles[done.name]},
+        )
+        for done in files
+        if done.name in roles
+    ]
+
+
+def work(unit: Unit, target: Path, settings: VocabSettings, progress: Progress) -> Report:
+    """Sample the moves, map pieces and tracks of one file."""
+    role = unit.task["role"]
+    samples = {side: _Sample(side, settings) for side in _SIDES}
+    for scene in read_scenes_of(unit.task):
+        held_out = role == BOTH and name_key(scene.scenario_id) % HELD_OUT_EVERY == 0
+        samples[HELD_OUT if held_out or role == HELD_OUT else LEARN].take(scene)
+    for sample in samples.values():
+        sample.write(target)
+    return {"role": role, **{side: sample.scenes for side, sample in samples.items()}}
+
+
+def finish(
+    inputs: Inputs,
+    units: Sequence[Done],
+    target: Path,
+    settings: VocabSettings,
+    progress: Progress,
+) -> Report:
+    """Cluster all samples, and measure the codebooks on what was held out."""
+    progress(0, 4, "samples")
+    learn, held_out = (_gather(units, side, settings) for side in _SIDES)
+    starts = [Path(source.url) for source in inputs.sources]
+    books = _taken(starts[0]) if starts else _clustered(learn, settings, progress)
+    motion, move_origin, roads, road_origin, road_tolerance_m = books
+    _write(target / "motion.zarr", [motion], MotionCodebook, MOTION_SCHEMA)
+    _write(target / "roads.zarr", [roads], RoadCodebook, ROADS_SCHEMA)
+
+    progress(3, 4, "coverage")
+    matches, familiar = (match_paths(side.paths, motion) for side in (held_out, learn))
+    report = {
+        "scenes": {side: sum(done.report[side] for done in units) for side in _SIDES},
+        "held_out": _held_out_words(units, settings),
+        "tolerance_m": settings.tolerance_m,
+        "road_tolerance_m": round(road_tolerance_m, 5),
+        "motion": describe_moves(motion, move_origin, matches, familiar, settings),
+        "roads": describe_roads(
+            roads, road_origin, held_out.curves.curve_m, learn.curves.curve_m
+        ),
+    }
+    from pipeline.storage.zarr_store import write_file, write_json  # noqa: PLC0415
+
+    write_json(target / "report.json", report)
+    page = codebook_page(report, motion, move_origin, roads, road_origin)
+    write_file(target / "report.html", page.encode())
+    return _headline(report)
+
+
+def _clustered(learn: _Gathered, settings: VocabSettings, progress: Progress) -> _Books:
+    progress(1, 4, "moves")
+    motion, move_origin = cluster_moves(learn.segments, settings)
+    progress(2, 4, "roads")
+    roads, road_origin, tolerance_m = cluster_roads(learn.curves.curve_m, settings)
+    return _Books(motion, move_origin, roads, road_origin, tolerance_m)
+
+
+def _taken(folder: Path) -> _Books:
+    """Take codebooks from weights; what is not logged in them counts as made."""
+    from pipeline.storage.weights import load_codebooks as load  # noqa: PLC0415
+
+    motion, roads = load(folder)
+    move_origin, road_origin = (
+        np.where(book.real, Origin.LOGGED, Origin.MADE).astype(np.int8)
+        for book in (motion, roads)
+    )
+    return _Books(motion, move_origin, roads, road_origin, 0.0)
+
+
+class _Sample:
+    """One side's sample of one file, while it is read."""
+
+    def __init__(self, side: str, settings: VocabSettings) -> None:
+        self.scenes = 0
+        self._side, self._settings = side, settings
+        self._limits = limits_of(settings)
+        self._segments: list[Segments] = []
+        self._curves: list[Curves] = []
+        self._paths: dict[int, Paths] = {}
+
+    def take(self, scene: Scene) -> None:
+        """Add one scene."""
+        self.scenes += 1
+        if self._side == LEARN:
+            still_m = self._settings.tolerance_m
+            self._segments.append(scene_segments(scene, self._limits, still_m))
+        self._curves.append(scene_curves(scene))
+        self._take_paths(scene)
+        if len(self._curves) == _MERGE_EVERY:
+            self._merge()
+
+    def write(self, target: Path) -> None:
+        """Write the sample, if there is any, below the unit's folder."""
+        if self.scenes == 0:
+            return
+        self._merge()
+        folder = target / self._side
+        folder.mkdir(parents=True)
+        paths = [KeyedPaths(key, self._paths[key]) for key in sorted(self._paths)]
+        _write(folder / "segments.zarr", self._segments, Segments, SEGMENTS_SCHEMA)
+        _write(folder / "curves.zarr", self._curves, Curves, CURVES_SCHEMA)
+        _write(folder / "paths.zarr", paths, KeyedPaths, PATHS_SCHEMA)
+
+    def _take_paths(self, scene: Scene) -> None:
+        # A key that fits the signed integers of the store.
+        key, most = name_key(scene.scenario_id) >> 1, SCENES_PER_UNIT[self._side]
+        if len(self._paths) == most and key > max(self._paths):
+            return
+        try:
+            self._paths[key] = read_paths(scene, TokenSettings())
+        except TokensError:
+            return  # ``tokenize`` names the scenes that cannot be written as tokens.
+        if len(self._paths) > most:
+            del self._paths[max(self._paths)]
+
+    def _merge(self) -> None:
+        most = self._settings.segments_per_shard
+        if self._segments:
+            self._segments = [sample_segments(self._segments, most)]
+        self._curves = [sample_curves(self._curves, most)]
+
+
+def _gather(units: Sequence[Done], side: str, settings: VocabSettings) -> _Gathered:
+    """Merge one side's samples of all files, one file in memory at a time."""
+    segments, curves, paths = NO_SEGMENTS, NO_CURVES, dict[int, Paths]()
+    most = settings.segments_per_kind
+    for done in units:
+        folder = done.path / side
+        if not folder.is_dir():
+            continue
+        parts = _read(folder / "segments.zarr", Segments, SEGMENTS_SCHEMA)
+        segments = sample_segments([segments, *parts], most)
+        pieces = _read(folder / "curves.zarr", Curves, CURVES_SCHEMA)
+        curves = sample_curves([curves, *pieces], most)
+        scenes = _read(folder / "paths.zarr", KeyedPaths, PATHS_SCHEMA)
+        paths |= {scene.key: scene.paths for scene in scenes}
+        paths = {key: paths[key] for key in sorted(paths)[: SCENES_IN_ALL[side]]}
+    return _Gathered(segments, curves, list(paths.values()))
+
+
+def _held_out_words(units: Sequence[Done], settings: VocabSettings) -> str:
+    """Say in words what the coverage is measured on."""
+    scenes = sum(done.report[HELD_OUT] for done in units)
+    if any(done.report["role"] == HELD_OUT for done in units):
+        return f"{scenes} scenes of split {settings.held_out}"
+    return (
+        f"{scenes} scenes of split {settings.split}, held out by the hash of their id: "
+        f"there is no split {settings.held_out}"
+    )
+
+
+def _headline(report: dict[str, Any]) -> Report:
+    """Pick the few figures that the run's log shows."""
+    kinds = report["motion"].items()
+    return {
+        "scenes": report["scenes"][LEARN],
+        "held_out": report["held_out"],
+        "real": {kind: figures["real"] for kind, figures in kinds},
+        "error_m": {
+            kind: (figures["held_out_error_m"] or {}).get("mean") for kind, figures in kinds
+        },
+        "roads_real": report["roads"]["real"],
+    }
+
+
+def _write(path: Path, records: Sequence[Any], kind: type, schema: str) -> None:
+    from pipeline.storage.zarr_store import write_records  # noqa: PLC0415
+
+    write_records(path, records, kind, schema, compress=False)
+
+
+def _read(path: Path, kind: type[T], schema: str) -> "Unpacked[T]":
+    from pipeline.storage.zarr_store import read_records  # noqa: PLC0415
+
+    return read_records(path, kind, schema, whole=True)
+
+
+STAGE = Stage(
+    name="build-vocab",
+    version=1,
+    settings={"build-vocab": VocabSettings},
+    plan=plan,
+    work=work,
+    finish=finish,
+    reads=reads,
+    modules=(
+        "pipeline.storage.duplicates",
+        "pipeline.stages.vocabulary",
+    ),
+)

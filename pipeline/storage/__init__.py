@@ -1,0 +1,1 @@
+"""Storage: Zarr groups, Parquet tables, weights, source files and splits."""

@@ -1,0 +1,94 @@
+"""All that training needs to go on from a step as if it had never stopped.
+
+A checkpoint is a folder, complete once ``checkpoint.json`` names it; that file is replaced
+whole, so a kill at any moment leaves the old checkpoint or the new one. Random numbers are
+keyed by the step, so the step is all there is to remember of them, and of the place in the
+data and the schedule.
+"""
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from infgen.model.network import Network
+from pipeline.engine.atomic import write_json
+from pipeline.storage.weights import read_tensors, state_of, write_tensors
+
+POINTER = "checkpoint.json"
+PREFIX = "checkpoint-"
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """A network as it is being trained.
+
+    Attributes:
+        network: The network.
+        average: Moving average of its parameters, by name; empty if there is none.
+        optimiser: AdamW over its parameters.
+    """
+
+    network: Network
+    average: dict[str, Tensor]
+    optimiser: torch.optim.AdamW
+
+
+def save_checkpoint(folder: Path, training: Training, step: int) -> None:
+    """Write everything after ``step`` optimiser steps, then forget the one before."""
+    target = folder / f"{PREFIX}{step:09d}"
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir()
+    write_tensors(target / "network.safetensors", state_of(training.network))
+    write_tensors(target / "average.safetensors", training.average)
+    write_tensors(target / "optimiser.safetensors", _optimiser_state(training))
+    write_json(folder / POINTER, {"folder": target.name, "step": step})
+    _drop(folder, keep=target.name)
+
+
+def load_checkpoint(folder: Path, training: Training) -> int:
+    """Go on from the last checkpoint: return the optimiser steps done, 0 if none."""
+    pointer = folder / POINTER
+    if not pointer.is_file():
+        return 0
+    about = json.loads(pointer.read_text())
+    source = folder / about["folder"]
+    training.network.load_state_dict(read_tensors(source / "network.safetensors"))
+    for name, value in read_tensors(source / "average.safetensors").items():
+        training.average[name].copy_(value)
+    _restore_optimiser(training, read_tensors(source / "optimiser.safetensors"))
+    return int(about["step"])
+
+
+def drop_checkpoints(folder: Path) -> None:
+    """Remove all checkpoints, the pointer first."""
+    (folder / POINTER).unlink(missing_ok=True)
+    _drop(folder, keep="")
+
+
+def _drop(folder: Path, keep: str) -> None:
+    for path in sorted(folder.glob(f"{PREFIX}*")):
+        if path.name != keep:
+            shutil.rmtree(path)
+
+
+def _optimiser_state(training: Training) -> dict[str, Tensor]:
+    """State of every parameter as ``<parameter>/<what>``."""
+    return {
+        f"{name}/{what}": value
+        for name, parameter in training.network.named_parameters()
+        for what, value in training.optimiser.state[parameter].items()
+    }
+
+
+def _restore_optimiser(training: Training, tensors: dict[str, Tensor]) -> None:
+    parameters = dict(training.network.named_parameters())
+    for key, value in tensors.items():
+        name, what = key.rsplit("/", 1)
+        parameter = parameters[name]
+        # The count of steps stays on the CPU, as the optimiser itself keeps it.
+        kept = value if what == "step" else value.to(parameter.device)
+        training.optimiser.state[parameter][what] = kept

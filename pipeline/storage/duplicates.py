@@ -1,0 +1,74 @@
+"""Scenes that several files of a split hold: the first file, by name, keeps them.
+
+Here alone it is settled which scenes of an ingested file count. Whatever is made of scenes
+passes the others over: they would be learned from, played and scored twice.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.engine.stage import Done, Report
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from infgen.scene import Scene
+
+LEFT_OUT = "left_out"
+"""Ranges ``[first, after)`` of rows of a file's scenes that do not count: in what stage
+``ingest`` reports of the file, and in the tasks of those who read it."""
+
+
+def mark_duplicates(index: "pl.DataFrame") -> "pl.DataFrame":
+    """Mark the scenes that do not count in an index of all files, ordered by name."""
+    import polars as pl  # noqa: PLC0415
+
+    first = pl.struct("split", "scenario_id").is_first_distinct()
+    return index.with_columns(duplicate=~first)
+
+
+def tell_left_out(index: "pl.DataFrame") -> dict[str, Report]:
+    """Say of each file with marked scenes which of its rows they are."""
+    import polars as pl  # noqa: PLC0415
+
+    rows = index.select("source", "duplicate", at=pl.int_range(pl.len()).over("source"))
+    parts = rows.filter("duplicate").partition_by("source", maintain_order=True)
+    return {part["source"][0]: {LEFT_OUT: _ranges(part["at"].to_numpy())} for part in parts}
+
+
+def rows_that_count(file: Done) -> list[int]:
+    """Rows of the scenes of an ingested file that count."""
+    left_out = _rows(file.report)
+    return [row for row in range(int(file.report["scenes"])) if row not in left_out]
+
+
+def scenes_of(file: Done) -> dict[str, Any]:
+    """Name the scenes of an ingested file that count, in the task of a unit."""
+    left_out = file.report.get(LEFT_OUT)
+    return {"scenes": str(file.path), **({LEFT_OUT: left_out} if left_out else {})}
+
+
+def read_scenes_of(task: Mapping[str, Any]) -> "Iterator[Scene]":
+    """Stream the scenes that a task names.
+
+    Raises:
+        StoreError: if a group of them is damaged.
+    """
+    from pipeline.stages.ingest import read_scenes  # noqa: PLC0415
+
+    left_out = _rows(task)
+    scenes = enumerate(read_scenes(Path(task["scenes"])))
+    return (scene for row, scene in scenes if row not in left_out)
+
+
+def _rows(about: Mapping[str, Any]) -> set[int]:
+    return {row for first, after in about.get(LEFT_OUT, ()) for row in range(first, after)}
+
+
+def _ranges(rows: np.ndarray) -> list[list[int]]:
+    """Write ascending rows as ranges."""
+    parts = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
+    return [[int(part[0]), int(part[-1]) + 1] for part in parts]

@@ -1,0 +1,54 @@
+"""Weights that a stage begins with: those of the package, of a folder, or of a key."""
+
+from pathlib import Path
+
+from infgen.config import ConfigError
+from infgen.pretrained import builtin_weights
+from pipeline.engine.layout import KEY_DIGITS, Root, read_json
+from pipeline.engine.stage import Source
+
+WEIGHTS, ABOUT = "model.safetensors", "model.json"
+BUILTIN = "builtin"
+"""The word for the weights that come with the package."""
+START = "start"
+"""Name of the weights to begin with, among a stage's sources."""
+
+
+def find_start(root: Path, setting: str, named: str) -> list[Source]:
+    """Find the weights that a setting names.
+
+    Args:
+        root: Of the experiment.
+        setting: Its name, for errors.
+        named: ``builtin``, a folder, or the start of a key of stage ``train``; or nothing.
+
+    Returns:
+        One source, or none where nothing is named.
+
+    Raises:
+        ConfigError: if there are none, or the key is of several.
+    """
+    if not named:
+        return []
+    stage = Root(root).stage("train")
+    keyed = [path for path in stage.glob("*") if path.name.startswith(named[:KEY_DIGITS])]
+    own = [builtin_weights()] if named == BUILTIN else [Path(named).absolute()]
+    found = [place for place in (*own, *sorted(keyed)) if (place / ABOUT).is_file()]
+    if len(found) != 1:
+        told = "several have it" if found else "there is no such folder or key"
+        raise ConfigError(
+            f"{setting} is {named!r}, but {told}; expected {BUILTIN!r}, a folder with "
+            f"{WEIGHTS} and {ABOUT}, or the start of a key below {stage}"
+        )
+    folder = found[0].resolve()
+    return [Source(str(folder), START, _fingerprint(folder / ABOUT, setting))]
+
+
+def _fingerprint(path: Path, setting: str) -> str:
+    about = read_json(path)
+    if not isinstance(about, dict) or "weights" not in about:
+        raise ConfigError(
+            f"{setting}: {path} lacks the entry 'weights'; expected a folder that stage "
+            f"'train' made, with {WEIGHTS} and the {ABOUT} that tells of them"
+        )
+    return str(about["weights"])

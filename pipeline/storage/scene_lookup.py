@@ -1,0 +1,178 @@
+"""Logs found by scenario id, in raw records or in an ingested store, in any order.
+
+Neither holds more than a bounded part of the logs: what rollouts ask for comes in their
+order, not in that of the records.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+
+from infgen.config import ConfigError
+from infgen.scene import Scene
+from infgen.sources.tfrecord import BadRecord, RecordError, iter_records, read_record
+from infgen.sources.womd import decode_scene, read_scenario_id
+from pipeline.engine.layout import KEY_DIGITS, MANIFEST
+from pipeline.engine.manifest import read_manifest
+from pipeline.storage.source_files import find_urls
+
+if TYPE_CHECKING:
+    from pipeline.storage.columns import Unpacked
+
+KEPT_BYTES = 256 << 20
+"""Records that were passed on the way to another, kept in case they are next."""
+OPEN_GROUPS = 2
+MAX_NAMED = 3
+
+
+class MissingLogError(ValueError):
+    """No log of a scene."""
+
+
+@runtime_checkable
+class Logs(Protocol):
+    """Logs by scenario id."""
+
+    def find(self, scenario_id: str) -> Scene:
+        """Return one log.
+
+        Raises:
+            MissingLogError: if there is none.
+            RecordError: if there is, but it cannot be used.
+        """
+
+
+class _Place(NamedTuple):
+    url: str
+    offset: int
+
+
+class RecordLogs:
+    """Logs in raw records: read once, as far as is needed, and again where asked back.
+
+    Where rollouts come in the order of the records, each record is read and held alone.
+    """
+
+    def __init__(self, urls: Sequence[str], kept_bytes: int = KEPT_BYTES) -> None:
+        self._coming = self._read(urls)
+        self._places: dict[str, _Place] = {}
+        self._kept: dict[str, bytes] = {}
+        self._room = kept_bytes
+        self._bad: list[str] = []
+
+    def find(self, scenario_id: str) -> Scene:
+        """Return one log.
+
+        Raises:
+            MissingLogError: if there is none.
+            RecordError: if there is, but it cannot be used.
+            ConfigError: if no file holds any usable record.
+        """
+        while scenario_id not in self._places:
+            if next(self._coming, None) is None:
+                raise self._missing(scenario_id)
+        data = self._kept.pop(scenario_id, None)
+        if data is None:
+            return decode_scene(self._reread(self._places[scenario_id]))
+        self._room += len(data)
+        return decode_scene(data)
+
+    def _read(self, urls: Sequence[str]) -> Iterator[str]:
+        """Pass record after record, and keep it; yields ids."""
+        for url in urls:
+            for record in iter_records(url):
+                try:
+                    if isinstance(record, BadRecord):
+                        raise RecordError(record.reason)
+                    scenario_id = read_scenario_id(record.data)
+                except RecordError as error:
+                    self._bad.append(f"{url}, record {record.number}: {error}")
+                    continue
+                if scenario_id not in self._places:
+                    self._places[scenario_id] = _Place(url, record.offset)
+                    self._keep(scenario_id, record.data)
+                    yield scenario_id
+
+    def _keep(self, scenario_id: str, data: bytes) -> None:
+        """Keep a record, and let go of the oldest ones while there is no room."""
+        self._kept[scenario_id] = data
+        self._room -= len(data)
+        while self._room < 0 and len(self._kept) > 1:
+            oldest = next(iter(self._kept))
+            self._room += len(self._kept.pop(oldest))
+
+    def _reread(self, place: _Place) -> bytes:
+        record = read_record(place.url, place.offset)
+        if isinstance(record, BadRecord):
+            raise RecordError(f"{place.url} at byte {place.offset}: {record.reason}")
+        return record.data
+
+    def _missing(self, scenario_id: str) -> ValueError:
+        bad = "; ".join(self._bad[:MAX_NAMED])
+        if not self._places:
+            return ConfigError(f"no usable record: {bad}")
+        unusable = f" ({len(self._bad)} unusable records: {bad})" if self._bad else ""
+        none = f"scene {scenario_id}: none of {len(self._places)} records holds it"
+        return MissingLogError(f"{none}{unusable}")
+
+
+class StoreLogs:
+    """Logs in an ingested store, a few groups of scenes in memory at a time."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        import polars as pl  # noqa: PLC0415
+
+        self._places: dict[str, tuple[Path, int]] = {}
+        self._open: dict[Path, Unpacked[Scene]] = {}
+        for folder in folders:
+            index = pl.read_parquet(folder / "index.parquet")
+            for scenario_id, group, row in index.select(_PLACE).iter_rows():
+                self._places.setdefault(scenario_id, (folder / group, row))
+
+    def find(self, scenario_id: str) -> Scene:
+        """Return one log.
+
+        Raises:
+            MissingLogError: if there is none.
+            StoreError: if its group is damaged.
+        """
+        if scenario_id not in self._places:
+            none = f"none of {len(self._places)} ingested scenes has its id"
+            raise MissingLogError(f"scene {scenario_id}: {none}")
+        path, row = self._places[scenario_id]
+        return self._group(path)[row]
+
+    def _group(self, path: Path) -> "Unpacked[Scene]":
+        from pipeline.stages.ingest import SCHEMA  # noqa: PLC0415
+        from pipeline.storage.zarr_store import read_records  # noqa: PLC0415
+
+        if path not in self._open:
+            while len(self._open) >= OPEN_GROUPS:
+                self._open.pop(next(iter(self._open)))
+            self._open[path] = read_records(path, Scene, SCHEMA, whole=True)
+        return self._open[path]
+
+
+_PLACE = ("scenario_id", "group", "row")
+
+
+def open_logs(names: Sequence[str]) -> Logs:
+    """Open raw records (paths, patterns, folders, URLs), or one folder of a store.
+
+    Raises:
+        ConfigError: if there is nothing by such a name, or the store holds no scenes.
+    """
+    if len(names) == 1 and (folders := unit_folders(Path(names[0]))) is not None:
+        if not any(any(folder.glob("scenes-*.zarr")) for folder in folders):
+            raise ConfigError(f"{names[0]} holds no ingested scenes")
+        return StoreLogs(folders)
+    return RecordLogs(find_urls(names))
+
+
+def unit_folders(folder: Path) -> list[Path] | None:
+    """List the unit folders of a made stage; a unit is its own; None for other folders."""
+    manifest = read_manifest(folder) if (folder / MANIFEST).is_file() else {}
+    if "units" not in manifest:
+        return [folder] if manifest or any(folder.glob("*.zarr")) else None
+    units = folder.resolve().parent / "units"
+    return [units / unit["key"][:KEY_DIGITS] for unit in manifest["units"]]

@@ -1,0 +1,83 @@
+"""Splits, told by file names: ``training.tfrecord-00000-of-01000`` is of ``training``."""
+
+from collections.abc import Sequence
+from itertools import accumulate, pairwise
+
+import numpy as np
+
+from pipeline.engine.plan import PlanError
+from pipeline.engine.stage import Done
+from pipeline.storage.duplicates import rows_that_count
+
+
+def split_of(name: str) -> str:
+    """Return the split that a file belongs to: its name up to ``.tfrecord``.
+
+    WOMD's own long names are cut to the word that tells:
+    ``uncompressed_scenario_training_training.tfrecord-...`` is of ``training``.
+    """
+    stem = name.split(".tfrecord")[0]
+    if "scenario_" not in stem:
+        return stem
+    folder = stem.rsplit("scenario_", 1)[1]
+    words = folder.split("_")
+    half = len(words) // 2
+    doubled = len(words) % 2 == 0 and words[:half] == words[half:]
+    return "_".join(words[:half]) if doubled else folder
+
+
+def in_split(name: str, split: str) -> bool:
+    """Tell whether a file belongs to a split."""
+    return split_of(name) == split
+
+
+def files_of(files: Sequence[Done], split: str, *, to: str, setting: str) -> list[Done]:
+    """Find the ingested files of a split that hold a scene.
+
+    Args:
+        files: Of all splits.
+        split: Whose.
+        to: What they are for; and ...
+        setting: ... what to set where there are none; both for the message.
+
+    Raises:
+        PlanError: if no file is of the split, or none of them holds a usable scene.
+    """
+    found = [done for done in files if in_split(done.name, split)]
+    if not found:
+        others = ", ".join(sorted({split_of(done.name) for done in files})) or "none"
+        raise PlanError(
+            f"no file of split {split!r} to {to} (there is: {others}); set {setting}, or "
+            "name records of that split"
+        )
+    if not any(done.report["scenes"] for done in found):
+        raise PlanError(
+            f"no scene of split {split!r} to {to}: no record of its {len(found)} files is "
+            "usable; quarantine.parquet of stage 'ingest' says why"
+        )
+    return found
+
+
+def spread(files: Sequence[Done], most: int) -> list[list[int]]:
+    """Choose scenes of ingested files, evenly spread over all of them.
+
+    Neighbours in a file may be alike: views of one town, cuts of one drive.
+
+    Args:
+        files: Of one split, in order.
+        most: How many scenes to choose; 0 for all.
+
+    Returns:
+        For each file the rows of its scenes, ascending.
+    """
+    rows = [np.array(rows_that_count(done), int) for done in files]
+    counts = [len(each) for each in rows]
+    total = sum(counts)
+    chosen = np.arange(total)
+    if 0 < most < total:
+        chosen = np.arange(most) * total // most
+    ends = accumulate(counts, initial=0)
+    return [
+        each[chosen[(chosen >= begin) & (chosen < end)] - begin].tolist()
+        for each, (begin, end) in zip(rows, pairwise(ends), strict=True)
+    ]

@@ -1,0 +1,224 @@
+"""Weights on disk: safetensors with the codebooks in them, and a page of JSON."""
+
+import hashlib
+import json
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from infgen.config import ModelSettings, TokenSettings, build
+from infgen.model.network import Network
+from infgen.pretrained import builtin_weights
+from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from pipeline.engine.atomic import StoreError, write_file, write_json
+from pipeline.engine.layout import read_json
+from pipeline.storage.initial_weights import ABOUT, WEIGHTS
+
+SCHEMA = "infgen.model/1"
+MAX_NAMED = 3
+MAX_SAID = 300
+_NEEDED = ("model", "tokenize", "vocabulary", "weights")
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> str:
+    """Write named tensors whole or not at all; return the sha256 of the file."""
+    ready = {k: tensors[k].detach().cpu().contiguous() for k in sorted(tensors)}
+    data = save(ready)
+    write_file(path, data)
+    return hashlib.sha256(data).hexdigest()
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Read named tensors.
+
+    Raises:
+        StoreError: if the file is missing or damaged.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise StoreError(f"{path} cannot be read: {error}") from error
+
+
+def save_network(
+    folder: Path, network: Network, state: Mapping[str, Tensor], step: int
+) -> str:
+    """Write weights so that nothing else is needed to load them.
+
+    Args:
+        folder: Where to.
+        network: Whose sizes, codebooks and grid they are for.
+        state: The weights (of the network itself, or averaged).
+        step: Optimiser step they are from.
+
+    Returns:
+        Their fingerprint.
+    """
+    fingerprint = write_tensors(folder / WEIGHTS, state)
+    about = {
+        "schema": SCHEMA,
+        "model": asdict(network.settings),
+        "tokenize": asdict(network.grid_settings),
+        "vocabulary": vocabulary_fingerprint(
+            network.motion_codebook(), network.road_codebook()
+        ),
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "step": step,
+        "weights": fingerprint,
+    }
+    write_json(folder / ABOUT, about)
+    return fingerprint
+
+
+def load_network(folder: Path) -> Network:
+    """Load the network whose weights a folder holds, ready to be played.
+
+    Raises:
+        StoreError: if a file is missing, damaged, or of another schema.
+    """
+    about = read_about(folder)
+    tensors = read_tensors(folder / WEIGHTS)
+    motion, roads = _codebooks(tensors)
+    where = str(folder / ABOUT)
+    network = Network(
+        build(ModelSettings, about["model"], where),
+        motion,
+        roads,
+        build(TokenSettings, about["tokenize"], where),
+    )
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as error:  # It names every tensor.
+        said = textwrap.shorten(str(error), MAX_SAID, placeholder=" ...")
+        raise StoreError(
+            f"{folder / WEIGHTS} does not fit its settings in {ABOUT}: {said}"
+        ) from error
+    return network.eval()
+
+
+def load_codebooks(folder: Path) -> tuple[MotionCodebook, RoadCodebook]:
+    """Read the codebooks that the weights in a folder were trained with.
+
+    Raises:
+        StoreError: if a file is missing, damaged, or of another schema.
+    """
+    read_about(folder)
+    return _codebooks(read_tensors(folder / WEIGHTS))
+
+
+def take_weights(network: Network, folder: Path) -> None:
+    """Give a network the weights in a folder, made with the same vocabularies.
+
+    What the folder holds beyond the network's own parameters is left aside.
+
+    Raises:
+        StoreError: naming the parameters that are missing there or of another shape; or if
+            the weights were made with other vocabularies, or are not what they were.
+    """
+    about = read_about(folder)
+    own_books = vocabulary_fingerprint(network.motion_codebook(), network.road_codebook())
+    if about["vocabulary"] != own_books:
+        raise StoreError(
+            f"{folder} was trained with vocabulary {about['vocabulary'][:12]}, expected "
+            f"{own_books[:12]}; build-vocab must have the same settings and records"
+            f"{_way_out(folder)}"
+        )
+    found = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+    if found != about["weights"]:
+        raise StoreError(f"{folder / WEIGHTS} is not the one that {ABOUT} tells of")
+    tensors = read_tensors(folder / WEIGHTS)
+    parameters = dict(network.named_parameters())
+    unfit = [
+        name
+        for name, parameter in parameters.items()
+        if name not in tensors or tensors[name].shape != parameter.shape
+    ]
+    if unfit:
+        raise StoreError(
+            f"{folder} has no weights of the right shape for {_some(unfit)}"
+            f"{_other_settings(about, network)}{_way_out(folder)}"
+        )
+    with torch.no_grad():
+        for name, parameter in parameters.items():
+            parameter.copy_(tensors[name])
+
+
+def _some(names: Sequence[str]) -> str:
+    more = len(names) - MAX_NAMED
+    return ", ".join(names[:MAX_NAMED]) + (f" and {more} more tensors" if more > 0 else "")
+
+
+def _other_settings(about: Mapping[str, Any], network: Network) -> str:
+    """Say which settings of a network are not those that its weights were trained with."""
+    model, grid = asdict(network.settings), asdict(network.grid_settings)
+    for section, asked in (("model", model), ("tokenize", grid)):
+        had = about[section]
+        other = [
+            f"{section}.{name}={json.dumps(had[name])} (not {json.dumps(value)})"
+            for name, value in asked.items()
+            if had.get(name, value) != value
+        ]
+        if other:
+            return f"; they were trained with {', '.join(other)}"
+    return ""
+
+
+def _way_out(folder: Path) -> str:
+    """Say where the settings are that go with the weights of the package."""
+    own = folder.resolve() == builtin_weights().resolve()
+    return "; --profile pretrained has all that goes with them" if own else ""
+
+
+def read_about(folder: Path) -> dict[str, Any]:
+    """Read what is said about the weights in a folder.
+
+    Raises:
+        StoreError: if there are none, or they are of another schema.
+    """
+    path = folder / ABOUT
+    if not path.is_file():
+        raise StoreError(f"{path} is missing; run stage 'train' first")
+    read = read_json(path)
+    about: dict[str, Any] = read if isinstance(read, dict) else {}
+    if about.get("schema") != SCHEMA:
+        raise StoreError(f"{path} holds {about.get('schema')!r}, expected {SCHEMA!r}")
+    lacks = [name for name in _NEEDED if name not in about]
+    if lacks:
+        raise StoreError(f"{path} lacks {', '.join(lacks)}; run stage 'train' again")
+    return about
+
+
+def vocabulary_fingerprint(motion: MotionCodebook, roads: RoadCodebook) -> str:
+    """Identity of two codebooks: the same arrays, the same text."""
+    digest = hashlib.sha256()
+    for array in (motion.size_lw_m, motion.path, motion.real, roads.curve_m, roads.real):
+        digest.update(f"{array.shape}{array.dtype}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def state_of(network: torch.nn.Module) -> dict[str, Tensor]:
+    """Weights and codebooks of a network by name (not copied)."""
+    return {name: tensor.detach() for name, tensor in network.state_dict().items()}
+
+
+def _codebooks(tensors: Mapping[str, Tensor]) -> tuple[MotionCodebook, RoadCodebook]:
+    return (
+        MotionCodebook(*_arrays(tensors, "motion_size_lw_m motion_path motion_real")),
+        RoadCodebook(*_arrays(tensors, "road_curve_m road_real")),
+    )
+
+
+def _arrays(tensors: Mapping[str, Tensor], names: str) -> list[Any]:
+    missing = [name for name in names.split() if name not in tensors]
+    if missing:
+        raise StoreError(f"the weights lack {', '.join(missing)}")
+    return [tensors[name].numpy() for name in names.split()]

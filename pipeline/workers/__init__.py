@@ -1,0 +1,1 @@
+"""Workers: in which process, and on which machine, units of work run."""

@@ -1,0 +1,333 @@
+"""The door to Dask: workers on this machine, on its GPUs, or on any cluster.
+
+Workers write their results themselves and send back a few figures.
+"""
+
+import logging
+import os
+import re
+import time
+import traceback
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager, suppress
+from importlib import import_module
+from queue import SimpleQueue
+from typing import Any
+
+from infgen.config import ConfigError
+from pipeline.engine.stage import Progress
+from pipeline.engine.units import Executor, InProcess, Outcome, Task, do
+from pipeline.workers.scheduling import (
+    RETRIES,
+    Broken,
+    ByCrew,
+    Ended,
+    Full,
+    Lost,
+    News,
+    Share,
+    WorkersLostError,
+)
+
+HELP = "none | local[:N] | gpu[:0,1] | tcp://HOST:PORT | file:scheduler.json"
+LOOPBACK = "127.0.0.1"  # Dask runs what anyone who connects sends it.
+WEB: dict[str, Any] = {"dashboard": False, "dashboard_address": f"{LOOPBACK}:0"}
+"""Any free port for a scheduler's web server: another cluster may have the usual one."""
+SILENT_S = 60.0
+"""Longest that a scheduler may leave a question unanswered."""
+CLOSE_S, POLL_S = 10.0, 0.1
+TELL_EVERY_S = 2.0
+CONFIG = {
+    # A worker that is just being restarted when this time is up is given up for good; with
+    # the usual 15 seconds a few crashes leave a cluster without workers.
+    "distributed.deploy.lost-worker-timeout": "1 day",
+    # Workers of our own are lost by what they do, and that is tried again alone.
+    "distributed.scheduler.allowed-failures": 1,
+}
+WORKER_ENVIRONMENT = {"ZARR_ASYNC__CONCURRENCY": "4", "ZARR_THREADING__MAX_WORKERS": "2"}
+VISIBLE_DEVICES = "CUDA_VISIBLE_DEVICES"
+COMING_TOPIC, MEMORY_TOPIC = "all", "worker-restart-memory"
+"""What Dask tells there: workers that come and go, and those it restarts."""
+SHARE_TOPIC = "infgen-share"
+
+
+class Workers:
+    """Whoever does the units. A cluster starts only when the first unit needs it.
+
+    Args:
+        words: Who (``--dask``).
+        visible: ``CUDA_VISIBLE_DEVICES`` of this process, if it is set.
+    """
+
+    def __init__(self, words: str, visible: str | None = None) -> None:
+        self._words, self._visible = words, visible
+        self._stack = ExitStack()
+        self._executor: Executor | None = InProcess() if words == "none" else None
+        if words != "none":
+            parse(words)
+
+    def __enter__(self) -> "Workers":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
+
+    def executor(self, *, here: bool) -> Executor:
+        """Return who does the units of a stage; ``here`` if it must be this process."""
+        if here:
+            return InProcess()
+        if self._executor is None:
+            client = self._stack.enter_context(_client(self._words, self._visible))
+            crew = DaskCrew(client)
+            self._stack.callback(crew.close)
+            self._executor = ByCrew(crew)
+        return self._executor
+
+
+def parse(words: str) -> tuple[str, str]:
+    """Split ``local:4`` into kind and rest.
+
+    Raises:
+        ConfigError: for words that name no kind of workers.
+    """
+    if not re.fullmatch(r"local(:[1-9]\d*)?|gpu(:\d+(,\d+)*)?|(tcp|tls|file):.+", words):
+        raise ConfigError(f"--dask {words}: expected {HELP}")
+    kind, _, rest = words.partition(":")
+    return kind, rest
+
+
+@contextmanager
+def _client(words: str, visible: str | None) -> Iterator[Any]:
+    kind, rest = parse(words)
+    place: dict[str, Any] = {"address": words}
+    with ExitStack() as stack:
+        _dask()  # First: it adds to the settings that are put back in the end.
+        stack.enter_context(import_module("dask").config.set(CONFIG))
+        if kind == "local":
+            cluster = _local(int(rest or os.cpu_count() or 1))
+            place = {"address": stack.enter_context(cluster)}
+        elif kind == "gpu":
+            cluster = _gpus(pick_gpus(rest, visible))
+            place = {"address": stack.enter_context(cluster)}
+        elif kind == "file":
+            place = {"scheduler_file": _await_file(rest)}
+        client = _connect(words, place)
+        stack.callback(_close, client)
+        client.get_versions(check=True)
+        yield client
+
+
+def _close(client: Any) -> None:
+    with suppress(OSError):  # Nobody waits for a scheduler that does not answer.
+        client.close(timeout=CLOSE_S)
+
+
+def _await_file(path: str) -> str:
+    """Wait for the file that a scheduler writes: Dask would do so for ever."""
+    begun = time.monotonic()
+    while not os.path.exists(path):
+        if time.monotonic() - begun > SILENT_S:
+            raise WorkersLostError(f"no Dask scheduler has written {path}: start one")
+        time.sleep(POLL_S)
+    return path
+
+
+def _connect(words: str, place: Mapping[str, Any]) -> Any:
+    try:
+        return _dask().Client(**place, set_as_default=False)
+    except OSError as error:
+        raise WorkersLostError(f"the Dask scheduler {words} does not answer") from error
+
+
+def _dask() -> Any:
+    """Import Dask late, and once: it takes more than a second and is not typed."""
+    return import_module("distributed")
+
+
+def _local(count: int) -> Any:
+    return _dask().LocalCluster(
+        n_workers=count,
+        threads_per_worker=1,
+        memory_limit=_memory_bytes(count),
+        host=LOOPBACK,
+        dashboard_address=WEB["dashboard_address"],
+        scheduler_kwargs={"dashboard": WEB["dashboard"]},
+        silence_logs=logging.ERROR,
+        env=WORKER_ENVIRONMENT,
+    )
+
+
+def _memory_bytes(workers: int) -> int:
+    """What each of some workers may use of this machine's memory."""
+    return int(import_module("distributed.system").MEMORY_LIMIT) // workers
+
+
+def _gpus(devices: Sequence[str]) -> Any:
+    options = {"host": LOOPBACK, **WEB}
+    scheduler = {"cls": _dask().Scheduler, "options": options}
+    return _dask().SpecCluster(workers=gpu_workers(devices), scheduler=scheduler)
+
+
+def gpu_workers(devices: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Say how a worker process per device is started, which sees that device alone.
+
+    The environment is set before anything is imported there.
+    """
+    return {
+        device: {
+            "cls": _dask().Nanny,
+            "options": {
+                "host": LOOPBACK,
+                "nthreads": 1,
+                "memory_limit": _memory_bytes(len(devices)),
+                "resources": {"GPU": 1},
+                "env": {**WORKER_ENVIRONMENT, VISIBLE_DEVICES: device},
+            },
+        }
+        for device in devices
+    }
+
+
+def pick_gpus(wanted: str, visible: str | None) -> list[str]:
+    """Name the devices that workers are started for.
+
+    Args:
+        wanted: Numbers with commas, as this process counts them; empty for all.
+        visible: ``CUDA_VISIBLE_DEVICES`` of this process, by which devices are renumbered.
+
+    Raises:
+        ConfigError: if there is no such device.
+    """
+    import torch  # noqa: PLC0415
+
+    count = torch.cuda.device_count()
+    numbers = [int(word) for word in wanted.split(",")] if wanted else list(range(count))
+    if not count:
+        raise ConfigError(
+            f"--dask gpu{wanted and ':'}{wanted}: this machine has no CUDA device that "
+            "torch can use; try --dask local"
+        )
+    if max(numbers) >= count or len(set(numbers)) < len(numbers):
+        raise ConfigError(
+            f"--dask gpu:{wanted}: expected different numbers from 0 to {count - 1}, one "
+            "per CUDA device"
+        )
+    names = visible.split(",") if visible else [str(number) for number in range(count)]
+    return [names[number].strip() for number in numbers]
+
+
+class DaskCrew:
+    """The workers of a Dask client, as a ``Crew``."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._futures: dict[str, Any] = {}
+        self._inbox: SimpleQueue[News] = SimpleQueue()
+        # Two runs on one cluster may do units of one name, for two roots.
+        self._mark = uuid.uuid4().hex[:8]
+        self._topics = {
+            COMING_TOPIC: self._hear,
+            MEMORY_TOPIC: self._hear_full,
+            f"{SHARE_TOPIC}-{self._mark}": self._hear_share,
+        }
+        for topic, hear in self._topics.items():
+            client.subscribe_topic(topic, hear)
+
+    def close(self) -> None:
+        """Listen no more: a cluster that is about to stop has nothing to tell."""
+        if self._client.status == "running":
+            for topic in self._topics:
+                self._client.unsubscribe_topic(topic)
+
+    @property
+    def inbox(self) -> "SimpleQueue[News]":
+        """What they report, as it comes in."""
+        return self._inbox
+
+    def begin(self, name: str, task: Task) -> None:
+        """Hand out a task as a try of that name."""
+        key = f"{name}-{self._mark}"
+        future = self._client.submit(
+            _do_telling, task, key, self._mark, key=key, retries=RETRIES, pure=False
+        )
+        self._futures[key] = future
+        future.add_done_callback(lambda _: self._inbox.put(Ended(name)))
+
+    def take(self, name: str) -> Outcome | Broken:
+        """Return what became of a try that has ended.
+
+        Raises:
+            WorkersLostError: if the scheduler cannot tell.
+        """
+        future = self._futures.pop(f"{name}-{self._mark}")
+        try:
+            if future.status == "finished":
+                outcome: Outcome = future.result()
+                return outcome
+            error = future.exception() if future.status == "error" else None
+        except (OSError, CancelledError) as lost:
+            raise self._lost() from lost
+        if error is None:
+            raise self._lost()
+        trace = "".join(traceback.format_tb(future.traceback()))
+        return Broken(error, trace, isinstance(error, _dask().KilledWorker))
+
+    def threads(self) -> int:
+        """Count how many tasks they can do at once.
+
+        Raises:
+            WorkersLostError: if the scheduler does not answer.
+        """
+        client = self._client
+        if client.status != "running":
+            raise self._lost()
+        try:
+            found = client.sync(client.scheduler.ncores, callback_timeout=SILENT_S)
+        except OSError as error:
+            raise self._lost() from error
+        return sum(found.values())
+
+    def _lost(self) -> WorkersLostError:
+        where = getattr(self._client.scheduler, "address", "of this run")
+        return WorkersLostError(
+            f"the Dask scheduler {where} is lost; what is done is kept: run again when "
+            "there is one"
+        )
+
+    def _hear(self, event: tuple[float, Mapping[str, Any]]) -> None:
+        """Take note of workers that come and go."""
+        about = event[1]
+        if about.get("action") == "remove-worker" and not about.get("expected"):
+            keys = map(str, about.get("processing-tasks", ()))
+            ours = [key for key in keys if key.endswith(self._mark)]
+            names = tuple(key.removesuffix(f"-{self._mark}") for key in ours)
+            self._inbox.put(Lost(str(about["worker"]), names))
+
+    def _hear_full(self, event: tuple[float, Mapping[str, Any]]) -> None:
+        about = event[1]
+        self._inbox.put(Full(str(about["worker"]), int(about["rss"])))
+
+    def _hear_share(self, event: tuple[float, Mapping[str, Any]]) -> None:
+        about = event[1]
+        name = str(about["key"]).removesuffix(f"-{self._mark}")
+        self._inbox.put(Share(name, about["done"], about["total"], about["note"]))
+
+
+def _do_telling(task: Task, key: str, mark: str) -> Outcome:
+    """Do a task on a worker; now and then tell the driver how far it is."""
+    return do(task, _teller(key, mark))
+
+
+def _teller(key: str, mark: str) -> Progress:
+    worker, told = _dask().get_worker(), time.monotonic()
+
+    def tell(done: float | int, total: float | int, note: str = "") -> None:
+        nonlocal told
+        if time.monotonic() - told >= TELL_EVERY_S:
+            told = time.monotonic()
+            about = {"key": key, "done": float(done), "total": float(total), "note": note}
+            worker.log_event(f"{SHARE_TOPIC}-{mark}", about)
+
+    return tell

@@ -1,0 +1,104 @@
+"""What tensors find is what arrays find."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from infgen import geometry
+from infgen.model.nearest_tokens import MoveEnds, nearest, nearest_of, to_local, to_world
+from infgen.tokens.motion_tokens import advance, make_move_table, nearest_moves
+from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook
+
+CPU = torch.device("cpu")
+
+
+def random_codebook(rng, moves=200):
+    end = rng.normal(size=(3, moves, 3)) * [8.0, 1.0, 0.6]
+    end[:, 0] = 0
+    end[:, moves // 2] = end[:, 1]  # twins
+    path = end[:, :, None] * np.linspace(0, 1, 6)[:, None]
+    return MotionCodebook(BOX_LW_M, path.astype(np.float32), np.ones((3, moves), bool))
+
+
+def poses(rng, rows, far_m=30.0):
+    pose = rng.normal(size=(rows, 3)) * [far_m, far_m, 1.5]
+    return pose.astype(np.float32)
+
+
+@given(
+    st.integers(0, 2**32),
+    st.sampled_from([0.01, 0.3, 3.0, 300.0]),
+    st.sampled_from([0, 1, 40, 2500]),
+)
+@example(0, 300.0, 2500)
+@settings(max_examples=40)
+def test_the_nearest_move_is_the_same_on_tensors(seed, stray, rows):
+    rng = np.random.default_rng(seed)
+    codebook = random_codebook(rng)
+    kind = rng.integers(0, 3, rows).astype(np.int8)
+    pose = poses(rng, rows)
+    ahead = advance(pose, kind, rng.integers(0, 200, rows).astype(np.int16), codebook)
+    target = ahead + (rng.normal(size=(rows, 3)) * stray).astype(np.float32)
+
+    wanted = torch.from_numpy(geometry.to_local(target, pose))
+    ends = MoveEnds.of(codebook, CPU)
+    found = nearest(wanted, torch.from_numpy(kind).long(), ends)
+
+    expected = nearest_moves(target, pose, kind, make_move_table(codebook))
+    np.testing.assert_array_equal(found.numpy(), expected)
+
+
+@given(st.integers(0, 2**32))
+@settings(max_examples=20)
+def test_the_nearest_of_all_moves_is_the_nearest(seed):
+    rng = np.random.default_rng(seed)
+    ends = MoveEnds.of(random_codebook(rng), CPU)
+    wanted = torch.from_numpy(poses(rng, 60, far_m=4.0))
+    kind = torch.from_numpy(rng.integers(0, 3, 60))
+    everything = torch.arange(200).expand(60, 200)
+
+    assert torch.equal(
+        nearest_of(wanted, kind, everything, ends), nearest(wanted, kind, ends)
+    )
+
+
+def test_the_nearest_of_some_is_among_them_and_the_first_of_twins():
+    rng = np.random.default_rng(0)
+    codebook = random_codebook(rng)
+    ends = MoveEnds.of(codebook, CPU)
+    wanted = torch.from_numpy(codebook.end_pose[0, [1, 1, 7]])
+    kind = torch.zeros(3, dtype=torch.int64)
+    choice = torch.tensor([[1, 7, 100], [7, 100, 1], [7, 9, 3]])
+
+    assert nearest_of(wanted, kind, choice, ends).tolist() == [1, 100, 7]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_the_search_is_exact_under_autocast(dtype):
+    rng = np.random.default_rng(1)
+    codebook = random_codebook(rng)
+    ends = MoveEnds.of(codebook, CPU)
+    wanted = torch.from_numpy(codebook.end_pose[1])
+    kind = torch.ones(200, dtype=torch.int64)
+
+    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=dtype == torch.bfloat16):
+        found = nearest(wanted, kind, ends)
+
+    expected = torch.arange(200)
+    expected[100] = 1  # twins
+    assert torch.equal(found, expected)
+
+
+def test_poses_change_frames_as_arrays_do():
+    rng = np.random.default_rng(2)
+    pose, frame = poses(rng, 500), poses(rng, 500)
+    on_tensors = torch.from_numpy(pose), torch.from_numpy(frame)
+
+    local, world = to_local(*on_tensors), to_world(*on_tensors)
+
+    np.testing.assert_allclose(local, geometry.to_local(pose, frame), atol=1e-4)
+    np.testing.assert_allclose(world, geometry.to_world(pose, frame), atol=1e-4)
+    back = to_world(local, on_tensors[1])[:, :2]
+    np.testing.assert_allclose(back, pose[:, :2], atol=1e-3)

@@ -1,0 +1,148 @@
+"""Played one column at a time, the network says what it says of all columns at once."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from infgen.model.batching.batch import collate, collate_roads
+from infgen.model.batching.insertion_targets import OUTSIDE
+from infgen.model.neighbours import grid_place
+from infgen.model.stepping import Stepper
+from infgen.model.token_step import Column
+from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE, Presence
+
+CLOSE = {"atol": 1e-4, "rtol": 1e-4}
+
+
+def column_at(agents, token, turns=OUTSIDE + 1):
+    """Column of a batch with newcomers up to a turn; the others are not there yet."""
+    hidden = agents.turn[:, token] >= turns
+    presence = agents.presence[:, token].masked_fill(hidden, int(Presence.ABSENT))
+    return Column(
+        kind=agents.kind,
+        size_lwh_m=agents.size_lwh_m,
+        pose=agents.pose[:, token],
+        move=agents.move[:, token].masked_fill(hidden, NO_MOVE),
+        presence=presence,
+        observed=agents.observed[:, token] & ~hidden,
+        cell=agents.cell[:, token].masked_fill(hidden, NO_CELL),
+    )
+
+
+def places(batch, token, slot):
+    """Where the newcomer of a slot is in the ego's grid frame; anything for nobody."""
+    pose = batch.agents.pose[:, token]
+    agent = batch.entries.agent[:, token, slot].clamp(min=0)
+    return grid_place(pose[torch.arange(len(agent)), agent], pose[:, 0])
+
+
+def same(step, wanted):
+    """Both say nothing, or both the same."""
+    assert (step is None) == (wanted is None)
+    if step is not None:
+        torch.testing.assert_close(step, wanted, **CLOSE)
+
+
+def of(values, *index):
+    return None if values is None else values[index]
+
+
+def play(network, batch, records):
+    """Teacher-forced logits: motion per token, entries per (token, turn)."""
+    stepper = Stepper(network)
+    scenes = len(records)
+    rows = batch.agents.kind.shape[1]
+    maps = replace(collate_roads(records, 10_000), shown=batch.roads.shown)
+    memory = stepper.begin(maps, torch.arange(scenes), rows)
+    motion, queries, details = [], {}, {}
+    slots, by_cell = batch.entries.agent.shape[2], network.settings.cell_token
+    for token in range(batch.agents.pose.shape[1]):
+        if token > 0 and stepper.life_cycle:
+            entries = stepper.entry_begin(memory, column_at(batch.agents, token, turns=0))
+            for slot in range(slots):
+                queries[token, slot] = stepper.entry_query(entries)
+                cell = batch.entries.cell[:, token, slot]
+                place_m = None if by_cell else places(batch, token, slot)
+                details[token, slot] = stepper.entry_details(entries, cell, place_m)
+                column = column_at(batch.agents, token, turns=slot + 1)
+                entries = stepper.entry_add(entries, column)
+        motion.append(stepper.motion_step(memory, column_at(batch.agents, token)))
+    return motion, queries, details
+
+
+@pytest.fixture(scope="module")
+def records(record):
+    # Fourteen columns: three times the window of past columns; entries, exits, padding.
+    return [record(3, agents=12, tokens=14), record(4, agents=6, tokens=9, roads=31)]
+
+
+@pytest.fixture(scope="module")
+def both(variant, new_network, records, limits):
+    network = new_network(variant).eval()
+    batch = collate(records, limits, draw=0)
+    with torch.no_grad():
+        outputs = network(batch)
+    return batch, outputs, play(network, batch, records)
+
+
+def test_motion_is_the_same_step_by_step(both):
+    batch, outputs, (motion, _, _) = both
+    for name in ("move_logits", "leave_logit", "pattern_logits"):
+        said = getattr(outputs.motion, name)
+        spread = None if said is None else outputs.motion.rows.spread(said)
+        for token, step in enumerate(motion):
+            seen = batch.agents.visible[:, token]
+            wanted = None if spread is None else spread[:, token][seen]
+            same(of(getattr(step, name), seen), wanted)
+
+
+def test_queries_for_newcomers_are_the_same_step_by_step(both):
+    batch, outputs, (_, queries, _) = both
+    said = outputs.entries
+    assert (said is None) == (not queries)
+    assert (batch.entries.agent >= 0).sum() >= 3
+    for (token, slot), query in queries.items():
+        seen = batch.entries.asked[:, token]
+        for name in ("add_logit", "cell_logits", "place_m"):
+            wanted = getattr(said, name)
+            wanted = None if wanted is None else said.rows.spread(wanted)
+            same(of(getattr(query, name), seen), of(wanted, seen, token, slot))
+
+
+def test_details_of_newcomers_are_the_same_step_by_step(both):
+    batch, outputs, (_, _, details) = both
+    found, wanted = outputs.details, batch.details
+    if found is None:
+        return
+    pack = found.rows.pack
+    scene = found.rows.at // wanted.present.shape[1]
+    compared = 0
+    for row in pack(wanted.newcomer).nonzero()[:, 0].tolist():
+        token, turn = int(pack(wanted.token)[row]), int(pack(wanted.turn)[row])
+        step, kind = details[token, turn], int(pack(wanted.kind)[row])
+        at = scene[row]
+        same(step.kind_logits[at], found.kind_logits[row])
+        same(step.size_lwh_m[at, kind].log(), found.size_log_m[row])
+        for name in ("heading_logits", "turned_rad", "offset_m"):
+            same(of(getattr(step, name), at, kind), of(getattr(found, name), row))
+        compared += 1
+    assert compared >= 3
+
+
+def test_weights_that_know_motion_only_let_nobody_in(tiny, new_network, records):
+    stepper = Stepper(new_network(replace(tiny, life_cycle=False)))
+    roads = collate_roads(records, 10_000)
+    memory = stepper.begin(roads, torch.arange(2), rows=4)
+    nobody = Column(
+        kind=torch.zeros((2, 4), dtype=torch.int64),
+        size_lwh_m=torch.ones((2, 4, 3)),
+        pose=torch.zeros((2, 4, 3)),
+        move=torch.full((2, 4), NO_MOVE),
+        presence=torch.zeros((2, 4), dtype=torch.int64),
+        observed=torch.zeros((2, 4), dtype=torch.bool),
+        cell=torch.full((2, 4), NO_CELL),
+    )
+
+    with pytest.raises(ValueError, match="motion only"):
+        stepper.entry_begin(memory, nobody)

@@ -1,0 +1,43 @@
+"""What a batch supervises is known before anything is computed."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from infgen.config import TrainSettings
+from infgen.model.batching.batch import collate
+from infgen.model.training.loss_weights import TERMS, supervised
+from infgen.model.training.losses import losses
+
+HOW = TrainSettings(first_move_weight=3.0)
+VARIANTS = {
+    "whole": {},
+    "patterns": {"pattern_tokens": True},
+    "motion only": {"life_cycle": False},
+    "regressed": {"cell_token": False, "heading_token": False},
+    "nobody leaves": {"leave_token": False},
+}
+
+
+@pytest.mark.parametrize("changes", VARIANTS.values(), ids=VARIANTS)
+def test_weights_are_those_the_losses_divide_by(record, limits, new_network, tiny, changes):
+    scenes = [record(seed, agents=6 + seed, tokens=5 + seed) for seed in range(4)]
+    batch = collate(scenes, limits, 0)
+    network = new_network(replace(tiny, **changes))
+
+    known = dict(zip(TERMS, supervised(batch, HOW).tolist(), strict=True))
+
+    with torch.no_grad():
+        terms = losses(network(batch, hidden_roads=True), batch, HOW)
+    found = {name: float(term.weight) for name, term in terms.items()}
+    assert found == pytest.approx({name: known[name] for name in terms})
+    assert sum(found.values()) > 0
+
+
+def test_weights_of_parts_add_up_to_those_of_the_whole(record, limits):
+    scenes = [record(seed, agents=4 + 3 * seed, tokens=4 + seed) for seed in range(4)]
+
+    parts = sum(supervised(collate(scenes[at::2], limits, 0), HOW) for at in (0, 1))
+
+    torch.testing.assert_close(parts, supervised(collate(scenes, limits, 0), HOW))

@@ -1,0 +1,155 @@
+"""Presets as stages.yaml has them: read whole, and what is wrong is told with its line."""
+
+import pytest
+
+from infgen.config import ConfigError
+from infgen.views.published import ABLATIONS, PAPER
+from pipeline.settings.presets import TownSet
+from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
+
+GOOD = """\
+version: 1
+stages:
+  train: {params: [train, model]}
+  rollout: {deps: [train], params: [rollout]}
+profiles:
+  small: {train: {steps: 9}}
+  motion: {model: {life_cycle: false}}
+presets:
+  mini:
+    profile: small
+    seeds: 2
+    count_error: truth
+    train: {batch_scenes: 4}
+    towns:
+      training: {scenes: 40, seconds: 9.1}
+    plays:
+      long: {rollout: {mode: long, count: 2}}
+      brief: {rollout: {mode: wosac}}
+    arms:
+      fine: {profile: motion, start: plain, train: {steps: 1}, plays: [long]}
+      plain:
+        label: Plain
+        profile: motion
+        plays: {long: {rollout: {count: 3}}, brief: {}}
+      whole: {published: InfGen, plays: [brief]}
+      part: {published: no cell token, ablates: whole, plays: [brief]}
+"""
+
+
+@pytest.fixture
+def load(tmp_path):
+    def build(text=GOOD):
+        path = tmp_path / "stages.yaml"
+        path.write_text(text)
+        return load_stages(path, {})
+
+    return build
+
+
+def words(overlay):
+    return set(overlay.words)
+
+
+def test_a_preset_is_read_whole(load):
+    mini = load().preset("mini")
+
+    assert (mini.profile, mini.seeds, mini.count_error) == (("small",), 2, "truth")
+    assert mini.towns == {"training": TownSet(scenes=40, seconds=9.1)}
+    assert mini.arms["plain"].label == "Plain"
+    assert mini.arms["whole"].label == "InfGen"
+    assert mini.arms["part"].ablates == "whole"
+    assert list(mini.arms["plain"].plays) == ["long", "brief"]
+
+
+def test_an_arm_comes_after_the_one_whose_weights_it_goes_on_from(load):
+    assert list(load().preset("mini").arms) == ["plain", "fine", "whole", "part"]
+
+
+def test_preset_arm_play_and_the_arms_own_play_are_laid_over_each_other(load):
+    arms = load().preset("mini").arms
+
+    assert words(arms["fine"].settings) == {"train.batch_scenes=4", "train.steps=1"}
+    assert words(arms["fine"].plays["long"]) == {
+        "train.batch_scenes=4",
+        "train.steps=1",
+        "rollout.mode=long",
+        "rollout.count=2",
+    }
+    assert "rollout.count=3" in words(arms["plain"].plays["long"])
+
+
+def test_arms_are_picked_by_name_and_bring_those_that_they_start_from(load):
+    mini = load().preset("mini")
+    picked = mini.chosen(["fine", "whole"])
+
+    assert [arm.name for arm in picked] == ["fine", "whole"]
+    assert [arm.name for arm in mini.starts_of(picked)] == ["plain"]
+    assert len(mini.chosen([])) == 4
+    with pytest.raises(ConfigError, match="no arm 'fin' in mini; did you mean 'fine'"):
+        mini.chosen(["fin"])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("seeds: 2", "seed: 2", "stages.yaml:11: mini: no entry 'seed'.*'seeds'"),
+        ("seeds: 2", "seeds: 0", "stages.yaml:11: seeds is 0; expected 1 or more"),
+        ("seeds: 2", "seeds: true", "stages.yaml:11: seeds is True"),
+        ("profile: small", "profile: smal", "stages.yaml:10: no profile 'smal'; did"),
+        ("truth", "true", "stages.yaml:12: count_error is True; expected a word"),
+        ("truth", "trut", "stages.yaml:12: no count_error 'trut'; did you mean"),
+        ("scenes: 40, ", "", "stages.yaml:15: training needs scenes"),
+        ("scenes: 40,", "scenes: 4.5,", "stages.yaml:15: training.scenes is 4.5"),
+        ("scenes: 40,", "scenes: 40, sede: 1,", "stages.yaml:15: training: no setting"),
+        ("count: 2}", "count: [2]}", r"stages.yaml:17: rollout.count is \[2\]"),
+        ("count: 2}", "count: null}", "stages.yaml:17: rollout.count is None"),
+        ("long: {rollout", "long: {roll", "stages.yaml:17: long: no entry 'roll'"),
+        ("brief: {rollout", "a b: {rollout", "stages.yaml:18: play 'a b'; expected"),
+        ("start: plain", "start: plan", "stages.yaml:20: no start 'plan'; did you mean"),
+        ("start: plain", "start: fine", "stages.yaml:20: arm 'fine' names itself"),
+        ("train: {steps: 1}", "trian: {steps: 1}", "stages.yaml:20: fine: no entry"),
+        ("plays: [long]", "plays: [lang]", "stages.yaml:20: no play 'lang'; did you mean"),
+        ("plays: [long]", "plays: long", "stages.yaml:20: plays is 'long'"),
+        ("label: Plain", "label: 3", "stages.yaml:22: label is 3; expected a word"),
+        ("label: Plain", "start: fine", "arms start each other: fine -> plain -> fine"),
+        (", brief: {}", ", brif: {}", "stages.yaml:24: plays: no entry 'brif'"),
+        ("      whole:", "      who le:", "stages.yaml:25: arm 'who le'; expected"),
+        ("published: InfGen", "published: Infgen", "stages.yaml:25: no published 'Infg"),
+        ("ablates: whole", "ablates: hole", "stages.yaml:26: no ablates 'hole'; did"),
+        ("  mini:\n", "  mi.ni:\n", "stages.yaml:9: preset 'mi.ni'; expected letters"),
+        (GOOD[GOOD.index("    arms:") :], "", "stages.yaml:9: preset 'mini' has no arms"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_line(load, old, new, message):
+    assert old in GOOD
+    with pytest.raises(ConfigError, match=message):
+        load(GOOD.replace(old, new, 1))
+
+
+def test_a_preset_that_does_not_exist_is_refused_with_those_that_do(load):
+    with pytest.raises(ConfigError, match="no preset 'mni'; did you mean 'mini'"):
+        load().preset("mni")
+
+
+def test_the_packaged_presets_compare_all_methods_of_the_paper_and_all_ablations():
+    file = load_stages(DEFAULT_FILE, {})
+
+    for name in ("towns-benchmark", "womd-mini"):
+        preset = file.preset(name)
+        published = {arm.published for arm in preset.arms.values()}
+        assert published == {each.method for each in PAPER} | set(ABLATIONS)
+        assert preset.seeds == 3
+        methods = [arm for arm in preset.arms.values() if arm.ablates is None]
+        for arm in methods:
+            assert set(arm.plays) == {"long", "motion-only", "wosac"}
+            radius = "score.enter_radius_m=75" in arm.plays["long"].words
+            assert radius == (arm.published != "InfGen")
+        assert preset.arms["catk"].start == "smart"
+    assert file.preset("womd-mini").towns == {}
+    towns = file.preset("towns-benchmark").towns
+    assert {split: each.seconds for split, each in towns.items()} == {
+        "training": 9.1,
+        "tuning": 31.1,
+        "validation": 31.1,
+    }

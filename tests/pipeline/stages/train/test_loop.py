@@ -1,0 +1,120 @@
+"""The loop: what it says no to, what it keeps when it must stop, and that it learns."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.stages.train.loader import TokenScenes, train_batches
+from pipeline.stages.train.loop import train
+from pipeline.stages.train.setup import TrainingError, begin
+from pipeline.stages.train.train_log import TrainLog, read_log
+from pipeline.storage.checkpoint import load_checkpoint
+
+
+@pytest.fixture
+def spoilt(monkeypatch):
+    """``spoilt(step, part)``: agents of that part have no size that is a number."""
+
+    def spoil(step, part=0):
+        def batches(*arguments):
+            for number, parts in enumerate(train_batches(*arguments)):
+                if number == step:
+                    agents = parts[part].agents
+                    size = agents.size_lwh_m * torch.nan
+                    broken = replace(agents, size_lwh_m=size)
+                    parts[part] = replace(parts[part], agents=broken)
+                yield parts
+
+        monkeypatch.setattr("pipeline.stages.train.loop.train_batches", batches)
+
+    return spoil
+
+
+def test_a_loss_that_is_not_finite_names_its_terms_and_scenes_and_keeps_the_weights(
+    course, books, quiet, spoilt
+):
+    training = begin(course, *books)
+    spoilt(step=3)
+
+    with pytest.raises(
+        TrainingError, match=r"step 3: .*\(motion, .*training-\d, training-\d"
+    ):
+        train(course, training, quiet)
+
+    other = begin(course, *books)
+    assert load_checkpoint(course.folder, other) == 3
+    assert all(torch.isfinite(p).all() for p in other.network.parameters())
+
+
+def test_only_the_scenes_of_the_part_that_is_not_finite_are_named(
+    course, books, quiet, spoilt
+):
+    course = replace(course, train=replace(course.train, accumulate=2, steps=1))
+    spoilt(step=0, part=1)
+
+    with pytest.raises(TrainingError, match=r"its scenes: training-\d$"):
+        train(course, begin(course, *books), quiet)
+
+
+def test_noise_is_learned_from_if_it_is_asked_for(course, books, quiet, monkeypatch):
+    given = []
+
+    def batches(recipe, *others):
+        given.append(recipe.noise)
+        return train_batches(recipe, *others)
+
+    monkeypatch.setattr("pipeline.stages.train.loop.train_batches", batches)
+    how = replace(course.train, steps=1, noise_moves=3)
+
+    train(replace(course, train=how), begin(course, *books), quiet)
+
+    assert given[0].moves == 3
+    assert given[0].table.codebook.num_moves == books[0].num_moves
+
+
+def test_no_scenes_to_train_on_is_said(course, books, quiet):
+    empty = replace(course, scenes=TokenScenes([]))
+
+    with pytest.raises(TrainingError, match="no scenes of split 'training'"):
+        train(empty, begin(course, *books), quiet)
+
+
+def test_who_does_no_steps_needs_no_scenes_to_train_on(course, books, quiet):
+    idle = replace(course, scenes=TokenScenes([]), train=replace(course.train, steps=0))
+
+    found = train(idle, begin(idle, *books), quiet)
+
+    assert found.validation
+
+
+def test_without_held_out_scenes_there_is_no_validation(course, books, quiet):
+    found = train(replace(course, held_out=[]), begin(course, *books), quiet)
+
+    assert found.validation == {}
+
+
+def test_the_loss_goes_down(course, books, quiet):
+    how = replace(course.train, steps=30, learning_rate=1e-2, label_smoothing=0.0)
+    longer = replace(course, train=replace(how, checkpoint_every=0, validate_every=0))
+
+    train(longer, begin(longer, *books), quiet)
+
+    lines = read_log(course.folder / "train.jsonl")[:-1]
+    motion = [line["motion"] for line in lines]
+    assert len(motion) == 30
+    assert np.mean(motion[-5:]) < 0.7 * np.mean(motion[:5])
+    assert lines[-1]["motion_perplexity"] < lines[0]["motion_perplexity"]
+
+
+def test_a_log_forgets_what_lies_beyond_the_checkpoint(tmp_path):
+    path = tmp_path / "train.jsonl"
+    path.write_text('{"step": 1}\n{"step": 2}\n{"step": 3}\n{"ste')
+
+    log = TrainLog(path, first=2)
+    log.add({"step": 3, "motion": 1.0})
+    assert [line["step"] for line in read_log(path)] == [1, 2]
+    log.flush()
+
+    assert read_log(path)[-1] == {"step": 3, "motion": 1.0}

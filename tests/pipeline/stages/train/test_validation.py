@@ -1,0 +1,63 @@
+"""What is said of weights on scenes they were not trained on."""
+
+from dataclasses import replace
+
+import pytest
+
+from infgen.model.training.diagnostics import BIN_EDGES
+from pipeline.stages.train.loop import train
+from pipeline.stages.train.precision import Pass
+from pipeline.stages.train.setup import begin
+from pipeline.stages.train.train_log import read_log
+from pipeline.stages.train.validation import validate
+
+
+@pytest.fixture
+def found(course, books):
+    training = begin(course, *books)
+    return validate(course, training, Pass(training.network, course.train))
+
+
+@pytest.mark.parametrize("name", ["stay", "add"])
+def test_reliability_bins_add_up_to_the_overall_rates(found, name):
+    bins = found[f"{name}_bins"]
+
+    assert bins["edges"] == list(BIN_EDGES)
+    assert {len(bins[k]) for k in ("count", "predicted", "happened")} == {10}
+    count = found[f"{name}_count"]
+    assert sum(bins["count"]) == count > 0
+    assert sum(bins["predicted"]) / count == pytest.approx(found[f"{name}_predicted"])
+    assert sum(bins["happened"]) / count == pytest.approx(found[f"{name}_logged"])
+
+
+def test_fresh_weights_are_about_as_perplexed_as_there_are_moves(found, metre_moves):
+    assert 0.5 < found["motion_perplexity"] / metre_moves.num_moves < 2.5
+
+
+def test_smaller_parts_find_the_same(course, books, found):
+    alone = replace(course, train=replace(course.train, accumulate=2))
+    training = begin(alone, *books)
+
+    again = validate(alone, training, Pass(training.network, alone.train))
+
+    for name, value in found.items():
+        if isinstance(value, float):
+            assert again[name] == pytest.approx(value, rel=1e-4), name
+
+
+def test_the_log_holds_all_of_it(course, books, quiet):
+    trained = train(course, begin(course, *books), quiet)
+
+    lines = read_log(course.folder / "train.jsonl")
+    assert lines[-1] == {"step": 6, "validation": trained.validation}
+
+
+def test_scenes_are_played_before_they_are_learned_from(course, books, quiet):
+    how = replace(course.train, steps=2, closed_loop_top=4, checkpoint_every=0)
+    played = replace(course, train=how)
+
+    train(played, begin(played, *books), quiet)
+
+    lines = read_log(course.folder / "train.jsonl")
+    assert lines[0]["motion_count"] > 0
+    assert lines[0]["motion"] < 10

@@ -1,0 +1,216 @@
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import Float32, Int16
+
+from infgen.scene import Scene
+from pipeline.engine.atomic import StoreError
+from pipeline.storage.zarr_store import (
+    open_group,
+    read_group,
+    read_records,
+    write_group,
+    write_records,
+)
+
+SCHEMA = "infgen.walks/1"
+
+
+@dataclass(frozen=True, slots=True)
+class Walk:
+    name: str
+    path_m: Float32[np.ndarray, "step 2"]
+    mood: Int16[np.ndarray, " mood"]
+
+
+def walks(count=5):
+    rng = np.random.default_rng(0)
+    return [
+        Walk(f"walk {i}", rng.random((i, 2), np.float32), np.arange(3, dtype=np.int16))
+        for i in range(count)
+    ]
+
+
+def assert_same(read, written):
+    assert len(read) == len(written)
+    for one, other in zip(read, written, strict=True):
+        assert one.name == other.name
+        np.testing.assert_array_equal(one.path_m, other.path_m, strict=True)
+        np.testing.assert_array_equal(one.mood, other.mood, strict=True)
+
+
+@pytest.fixture
+def group(tmp_path):
+    path = tmp_path / "walks.zarr"
+    write_records(path, walks(), Walk, SCHEMA, compress=False)
+    return path
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_records_come_back_from_disk(tmp_path, compress):
+    write_records(tmp_path / "w.zarr", walks(), Walk, SCHEMA, compress=compress)
+
+    assert_same(read_records(tmp_path / "w.zarr", Walk, SCHEMA, whole=True), walks())
+
+
+def test_records_read_in_parts_are_the_same_and_not_to_be_written(group):
+    opened = read_records(group, Walk, SCHEMA, whole=False)
+
+    assert_same(opened, walks())
+    with pytest.raises(ValueError, match="read-only"):
+        opened[2].path_m[:] = 0
+
+
+def test_of_columns_on_disk_only_what_is_asked_for_is_read(group):
+    columns, _ = open_group(group)
+    everything = columns["mood"][:]
+    (group / "mood" / "c" / "0").write_bytes(everything[:6].tobytes())
+
+    np.testing.assert_array_equal(columns["mood"][2:6], [2, 0, 1, 2])
+    assert len(columns["mood"]) == len(everything) == 15
+    assert len(columns["mood"][6:3]) == 0
+    with pytest.raises(StoreError, match="mood/c/0 is cut short"):
+        columns["mood"][5:7]
+
+
+def test_nothing_of_an_open_group_is_kept_open(group):
+    before = os.listdir("/proc/self/fd")
+
+    kept = [read_records(group, Walk, SCHEMA, whole=False) for _ in range(20)]
+    records = [record for each in kept for record in each]
+
+    assert len(records) == 100
+    assert len(os.listdir("/proc/self/fd")) == len(before)
+    assert str(group) not in Path("/proc/self/maps").read_text()
+
+
+def test_a_group_that_is_gone_since_it_was_opened_is_an_error(group):
+    opened = read_records(group, Walk, SCHEMA, whole=False)
+    shutil.rmtree(group)
+
+    with pytest.raises(StoreError, match=r"walks\.zarr.*cannot be read"):
+        opened[2]
+
+
+@pytest.mark.parametrize("compress", [False, True])
+@pytest.mark.parametrize("whole", [True, False])
+def test_no_records_at_all_come_back_too(tmp_path, compress, whole):
+    if compress and not whole:
+        pytest.skip("compressed groups are not read in parts")
+    write_records(tmp_path / "w.zarr", [], Walk, SCHEMA, compress=compress)
+
+    assert len(read_records(tmp_path / "w.zarr", Walk, SCHEMA, whole=whole)) == 0
+
+
+def test_a_scene_comes_back_from_disk(tmp_path, crossing):
+    scene = crossing()
+    write_records(tmp_path / "s.zarr", [scene], Scene, "infgen.scenes/1", compress=True)
+
+    (read,) = read_records(tmp_path / "s.zarr", Scene, "infgen.scenes/1", whole=True)
+
+    np.testing.assert_array_equal(read.tracks.xyz_m, scene.tracks.xyz_m)
+    np.testing.assert_array_equal(read.road_map.xyz_m, scene.road_map.xyz_m)
+    assert read.scenario_id == scene.scenario_id
+
+
+def test_equal_records_are_equal_bytes(tmp_path):
+    for name in "ab":
+        write_records(tmp_path / name, walks(), Walk, SCHEMA, compress=True)
+    first, second = (
+        {
+            p.relative_to(tmp_path / n): p.read_bytes()
+            for p in (tmp_path / n).rglob("*")
+            if p.is_file()
+        }
+        for n in "ab"
+    )
+
+    assert first == second
+
+
+def test_an_uncompressed_chunk_is_the_array_and_its_checksum(group):
+    stored = (group / "mood" / "c" / "0").read_bytes()
+
+    assert stored[:-4] == np.tile(np.arange(3, dtype="<i2"), 5).tobytes()
+
+
+def test_zeros_are_written_so_that_absence_is_never_zeros(tmp_path):
+    write_group(tmp_path / "z.zarr", {"zero": np.zeros(9, np.int64)}, {}, compress=True)
+
+    assert (tmp_path / "z.zarr" / "zero" / "c" / "0").is_file()
+
+
+def test_another_schema_is_refused_by_name(group):
+    with pytest.raises(
+        StoreError, match=r"holds 'infgen.walks/1', expected 'infgen.runs/1'"
+    ):
+        read_records(group, Walk, "infgen.runs/1", whole=False)
+
+
+def test_a_compressed_group_cannot_be_read_in_parts(tmp_path):
+    write_records(tmp_path / "w.zarr", walks(), Walk, SCHEMA, compress=True)
+
+    with pytest.raises(StoreError, match="compressed and cannot be read in parts"):
+        open_group(tmp_path / "w.zarr")
+
+
+def flip(path, place):
+    data = bytearray(path.read_bytes())
+    data[place] ^= 1
+    path.write_bytes(data)
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:-5])
+
+
+CHUNK = "path_m/c/0"
+DAMAGES = {
+    "a chunk is missing": lambda group: (group / CHUNK).unlink(),
+    "a chunk is cut short": lambda group: truncate(group / CHUNK),
+    "a chunk is emptied": lambda group: (group / CHUNK).write_bytes(b""),
+    "a bit of a value is flipped": lambda group: flip(group / CHUNK, 3),
+    "a bit of a checksum is flipped": lambda group: flip(group / CHUNK, -1),
+    "an array is missing": lambda group: shutil.rmtree(group / "path_m"),
+    "sizes are missing": lambda group: shutil.rmtree(group / "dim.step"),
+    "an array's description is cut": lambda group: truncate(group / "path_m" / "zarr.json"),
+    "the group's description is missing": lambda group: (group / "zarr.json").unlink(),
+    "the group's description is cut": lambda group: truncate(group / "zarr.json"),
+    "the group is missing": shutil.rmtree,
+}
+ONLY_SEEN_WHEN_READ = {"a bit of a value is flipped", "a bit of a checksum is flipped"}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("compress", [False, True])
+def test_damage_is_an_error_when_read(tmp_path, damage, compress):
+    group = tmp_path / "walks.zarr"
+    write_records(group, walks(), Walk, SCHEMA, compress=compress)
+    DAMAGES[damage](group)
+
+    with pytest.raises(StoreError, match=r"walks\.zarr"):
+        read_records(group, Walk, SCHEMA, whole=True)
+
+
+@pytest.mark.parametrize("damage", sorted(DAMAGES.keys() - ONLY_SEEN_WHEN_READ))
+def test_damage_of_form_is_an_error_when_mapped(group, damage):
+    DAMAGES[damage](group)
+
+    with pytest.raises(StoreError, match=r"walks\.zarr"):
+        read_records(group, Walk, SCHEMA, whole=False)
+
+
+def test_a_group_is_never_written_over(group):
+    with pytest.raises(FileExistsError):
+        write_records(group, walks(), Walk, SCHEMA, compress=False)
+
+
+def test_read_group_gives_columns_and_attributes(group):
+    columns, attributes = read_group(group)
+
+    assert attributes == {"schema": SCHEMA, "count": 5}
+    assert columns["dim.step"].tolist() == [0, 1, 2, 3, 4]

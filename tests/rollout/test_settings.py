@@ -1,0 +1,77 @@
+import pytest
+
+from infgen.config import ConfigError, RolloutSettings, build
+from infgen.rollout.settings import MODES
+
+
+@pytest.mark.parametrize(
+    ("mode", "length_s", "everyone", "comes_and_goes"),
+    [
+        ("long", 30.0, False, True),
+        ("motion-only", 30.0, False, False),
+        ("wosac", 8.0, True, False),
+    ],
+)
+def test_one_word_says_what_is_played(mode, length_s, everyone, comes_and_goes):
+    settings = RolloutSettings(mode=mode)
+
+    assert settings.length_s == length_s
+    assert settings.plays_everyone == everyone
+    assert settings.inserts == settings.removes == comes_and_goes
+
+
+def test_what_a_mode_leaves_open_may_be_said():
+    settings = build(
+        RolloutSettings, {"mode": "motion-only", "seconds": "12", "everyone": "true"}, "-s"
+    )
+
+    assert settings.length_s == 12
+    assert settings.plays_everyone
+    assert not settings.inserts
+    assert not RolloutSettings(insert=False).inserts
+    assert RolloutSettings(insert=False).removes
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"mode": "wosac", "seconds": 30.0},
+        {"mode": "wosac", "insert": True},
+        {"mode": "wosac", "everyone": False},
+        {"mode": "motion-only", "remove": True},
+    ],
+)
+def test_what_contradicts_the_mode_is_refused_with_the_way_out(given):
+    name = next(name for name in given if name != "mode")
+
+    with pytest.raises(ConfigError, match=rf"rollout.{name} is .*mode={given['mode']}"):
+        RolloutSettings(**given)
+
+
+def test_saying_what_the_mode_says_is_no_contradiction():
+    mode = MODES["wosac"]
+
+    settings = RolloutSettings(mode="wosac", seconds=mode.seconds, insert=mode.insert)
+
+    assert settings.length_s == 8
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"mode": "short"}, "expected long or motion-only or wosac"),
+        ({"move_temperature": 0.0}, "more than 0"),
+        ({"heading_temperature": float("nan")}, "more than 0"),
+        ({"cell_nucleus": 1.5}, "up to 1"),
+        ({"move_nucleus": 0.0}, "above 0"),
+        ({"entry_tries": 0}, "1 or more"),
+        ({"leave_radius_m": -1.0}, "0 or more"),
+        ({"stay_on_road": True}, "say rollout.move_tries=32"),
+        ({"patience_s": 20.0}, "say rollout.move_tries=32"),
+        ({"patience_s": -1.0, "move_tries": 2}, "0 or more"),
+        ({"keep_count": -0.5}, "0 or more"),
+    ],
+)
+def test_nonsense_is_refused(given, said):
+    with pytest.raises(ConfigError, match=said):
+        RolloutSettings(**given)
