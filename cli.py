@@ -42,9 +42,9 @@ from pipeline.engine.garbage import sweep as remove_garbage
 from pipeline.engine.layout import find_root
 from pipeline.engine.manifest import verify as find_damage
 from pipeline.settings import described
-from pipeline.settings.request import OWN_FILE, find_file
+from pipeline.settings.request import OWN_FILE, find_file, named_weights
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
-from pipeline.stages.train import ranks
+from pipeline.stages.train.launch import run as run_command
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -232,7 +232,8 @@ def gc(
 
     Example: infgen gc --root R --yes
     """
-    garbage = (remove_garbage if yes else find_garbage)(find_root(root, made=True))
+    place = find_root(root, made=True)
+    garbage = (remove_garbage if yes else find_garbage)(place, named_weights(place))
     if json_:
         print_json({"removed": yes, "garbage": [asdict(each) for each in garbage]})
         return
@@ -355,7 +356,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         os.environ.setdefault(name, "1")
     words = sys.argv[1:] if arguments is None else arguments
     try:
-        ranks.run(lambda: app(args=arguments), os.environ)
+        run_command(lambda: app(args=arguments), os.environ)
     except (ValueError, OSError, signals.Stopped) as error:
         code = exit_code(error)
         typer.echo(f"infgen: {error}", err=True)

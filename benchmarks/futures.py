@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from infgen.metrics.long_term.placement import Events
 from infgen.metrics.motion import Motion
+from infgen.metrics.placement import Events
 from infgen.metrics.traffic import Traffic
 from infgen.metrics.wosac.logged import FUTURE_STEPS, HISTORY_STEPS, LoggedScene
 from infgen.metrics.wosac.rollouts import Rollouts

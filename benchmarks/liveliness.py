@@ -33,7 +33,7 @@ from infgen.clock import CLOCK
 from infgen.config import TokenSettings, build
 from infgen.metrics.intervals import Interval, bootstrap
 from infgen.metrics.kinematics import speed, speed_valid
-from infgen.metrics.long_term.placement import count_per_token
+from infgen.metrics.placement import count_per_token
 from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic, from_log, from_rollout, on_map
 from infgen.rollout.rules.off_road import Lanes, lane_pieces
@@ -42,7 +42,7 @@ from infgen.spatial.road_edges import RoadEdges, edges_of
 from infgen.tokens.tracks import TokensError
 from pipeline.commands.screen import show_table
 from pipeline.engine.manifest import read_manifest
-from pipeline.stages.rollout import read_rollouts
+from pipeline.storage.rollouts import read_rollouts
 from pipeline.storage.scene_lookup import open_logs, unit_folders
 
 DRIVING_MPS = 1.0

@@ -38,8 +38,8 @@ from infgen.metrics.long_term.reference import (
     no_counts,
 )
 from infgen.metrics.long_term.table import Against, LogCounts, make_row, named
-from infgen.metrics.long_term.windows import Windows, cut_windows
 from infgen.metrics.traffic import Traffic, from_log
+from infgen.metrics.windows import Windows, cut_windows
 from infgen.metrics.wosac import metric
 from infgen.metrics.wosac.logged import FUTURE_STEPS
 from infgen.scene import Scene

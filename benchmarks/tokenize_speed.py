@@ -28,8 +28,8 @@ from pipeline.engine.runner import Orders, run
 from pipeline.engine.stage import Inputs, Unit
 from pipeline.settings.request import Request
 from pipeline.settings.stages_file import DEFAULT_FILE
-from pipeline.stages.ingest import read_scenes
 from pipeline.stages.vocabulary import load_codebooks
+from pipeline.storage.scenes import read_scenes
 from pipeline.storage.source_files import BUILTIN
 
 SHARED = Path(__file__).parents[1] / "../shared/data/womd"

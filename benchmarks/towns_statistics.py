@@ -19,7 +19,7 @@ from records import BUILT_IN, SHARED
 from infgen.clock import CLOCK
 from infgen.config import TokenSettings
 from infgen.metrics.kinematics import measure_kinematics, speed_valid
-from infgen.metrics.long_term.placement import count_per_token
+from infgen.metrics.placement import count_per_token
 from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic, from_log
 from infgen.scene import AgentKind, FeatureKind, LaneType, Scene

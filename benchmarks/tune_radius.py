@@ -19,7 +19,7 @@ from infgen.metrics.long_term.protocols import PROTOCOLS
 from infgen.metrics.long_term.tune_radius import best_radius_m, placement_by_radius
 from pipeline.engine.manifest import read_manifest
 from pipeline.stages.reference_files import read_against
-from pipeline.stages.rollout import read_rollouts
+from pipeline.storage.rollouts import read_rollouts
 from pipeline.storage.scene_lookup import unit_folders
 
 

@@ -32,7 +32,7 @@ from infgen.rollout.simulator import Player
 from infgen.scene import FeatureKind, Scene
 from infgen.tokens.scene_tokens import Presence
 from infgen.tokens.tokenizer import tokenize_scene
-from pipeline.stages.ingest import read_scenes
+from pipeline.storage.scenes import read_scenes
 from pipeline.storage.weights import load_network
 
 FRESH = RolloutSettings(add_bias=-1.5, leave_bias=-4.0)

@@ -35,8 +35,8 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(HERE))
 
-from pipeline.engine.atomic import PARTIAL  # noqa: E402
-from pipeline.engine.layout import MANIFEST, Root  # noqa: E402
+from pipeline.engine.atomic import MANIFEST, PARTIAL  # noqa: E402
+from pipeline.engine.layout import Root  # noqa: E402
 from pipeline.engine.manifest import verify  # noqa: E402
 from tests.clusters import Cluster  # noqa: E402
 

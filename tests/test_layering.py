@@ -1,9 +1,11 @@
 """Data flows one way, so imports do too."""
 
 import ast
+from collections import Counter
 from pathlib import Path
 
 import pytest
+from importlinter import cli as import_linter
 
 from pipeline.engine.registry import MODULES
 
@@ -38,6 +40,7 @@ NUMPY_ONLY = [INFGEN, INFGEN / "tokens"]  # These folders, not what is below the
 UNSAFE = {"eval", "exec", "__import__"}
 VAGUE = {"utils", "util", "helpers", "common", "misc", "core", "base"}
 LONGEST_FILE = 400
+MOST_MODULES = 20
 LONGEST_FUNCTION = 60
 
 
@@ -91,6 +94,20 @@ def test_a_file_keeps_to_its_room(file, tree):
         assert not used & {"pipeline", "cli", "polars"}
     if file.parent in NUMPY_ONLY:
         assert "torch" not in used
+
+
+def test_imports_keep_the_contracts_of_pyproject_and_have_no_cycle(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+
+    broken = import_linter.lint_imports(no_cache=True)
+
+    assert not broken, capsys.readouterr().out
+
+
+def test_a_folder_has_about_twenty_modules_at_most():
+    folders = Counter(path.parent for path in FILES if path.name != "__init__.py")
+
+    assert {named(folder): n for folder, n in folders.items() if n > MOST_MODULES} == {}
 
 
 def test_a_package_is_imported_only_through_its_door(file, tree):

@@ -1,8 +1,8 @@
 """Submissions to the Waymo Open Sim Agents Challenge, written without protobuf.
 
-Inverse of ``infgen.metrics.wosac.submission``. What Waymo's own check asks of a scene: exactly 32
-rollouts, in each of them every track that the log shows at now (whatever its kind) and
-nobody else, each with 80 steps.
+Inverse of ``infgen.metrics.wosac.submission``. What Waymo's own check asks of a scene:
+exactly 32 rollouts, each with every track that the log shows at now (of any type), and no
+other, for 80 steps.
 
 Field numbers, facts of Waymo's published messages: ``SimAgentsChallengeSubmission``
 scenario_rollouts = 1, submission_type = 2, then the fields of ``About``;
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from infgen.clock import CLOCK
-from infgen.config import ConfigError
+from infgen.coerce import ConfigError
 from infgen.metrics.wosac.logged import FUTURE_STEPS
 from infgen.metrics.wosac.rollouts import Rollouts, RolloutsError, from_rollouts, list_ids
 from infgen.metrics.wosac.submission import NUM_ROLLOUTS

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int16
 
 from infgen.clock import CLOCK
-from infgen.metrics.long_term.windows import Windows
+from infgen.metrics.windows import Windows
 
 
 class CountErrors(NamedTuple):

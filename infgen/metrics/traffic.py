@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from infgen.clock import CLOCK
-from infgen.config import TokenSettings
-from infgen.metrics.long_term.placement import Events, logged_events, simulated_events
 from infgen.metrics.motion import Motion
+from infgen.metrics.placement import Events, logged_events, simulated_events
 from infgen.rollout.rollout import Rollout
 from infgen.rollout.rules.off_road import Lanes, lanes_distance_m
 from infgen.scene import AgentKind, Scene
+from infgen.tokens.settings import TokenSettings
 
 
 @dataclass(frozen=True, slots=True)

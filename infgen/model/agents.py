@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from infgen.clock import CLOCK
-from infgen.config import ModelSettings
 from infgen.model.layers import (
     Attention,
     FourierEmbedding,
@@ -24,6 +23,7 @@ from infgen.model.motion_head import MoveHead
 from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import Around, Reach, RoadFeatures
 from infgen.model.relations import Rows, direction, relation_embedding
+from infgen.model.settings import ModelSettings
 from infgen.model.signal_features import LightAhead
 from infgen.scene import AgentKind
 from infgen.tokens.grid import Grid

@@ -8,13 +8,13 @@ import math
 import torch
 from torch import Tensor, nn
 
-from infgen.config import ModelSettings
 from infgen.model.agents import KINDS
 from infgen.model.cell_features import Bearings, Ground, Lying
 from infgen.model.layers import Attention, Seen, embedding_mlp, mlp
 from infgen.model.logits import DetailOutputs, EntryOutputs
 from infgen.model.neighbours import Reach
 from infgen.model.relations import Rows, relation_embedding
+from infgen.model.settings import ModelSettings
 from infgen.tokens.grid import Grid
 
 OFFSET_REACH_STEPS = 2 / 3

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from infgen.config import ModelSettings
 from infgen.model.batching.batch import Roads
 from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.map_grid import RoadGrid
 from infgen.model.neighbours import Around, Lamps, Reach, RoadFeatures
 from infgen.model.relations import Rows, relation_embedding
+from infgen.model.settings import ModelSettings
 from infgen.model.signal_features import StopLines
 from infgen.tokens.map import LineKind, PointKind
 from infgen.tokens.scene_tokens import SignalClass

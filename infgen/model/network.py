@@ -7,7 +7,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from infgen.clock import CLOCK
-from infgen.config import ModelSettings, TokenSettings
 from infgen.model.agents import AgentEmbedding, AgentRows, MotionStack, Sight
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.cell_features import Lying
@@ -24,7 +23,9 @@ from infgen.model.map import RoadEncoder
 from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import RoadFeatures, cell_pose, look_around, see_roads
 from infgen.model.relations import Rows, relations
+from infgen.model.settings import ModelSettings
 from infgen.tokens.grid import Grid, make_grid
+from infgen.tokens.settings import TokenSettings
 from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
 
 EGO = 0

@@ -7,12 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from infgen.config import RolloutSettings, TokenSettings
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import Column
 from infgen.rollout.population import Population
 from infgen.rollout.random_streams import Purpose, Stream, uniforms
+from infgen.rollout.settings import RolloutSettings
 from infgen.tokens.grid import Grid, make_grid
+from infgen.tokens.settings import TokenSettings
 from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
 
 

@@ -13,9 +13,10 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float32, Int16, Int64
 
-from infgen.config import ConfigError, TokenSettings
+from infgen.coerce import ConfigError
 from infgen.geometry import rotate, wrap_angle
 from infgen.tokens.scene_tokens import NO_CELL
+from infgen.tokens.settings import TokenSettings
 
 _QUARTER_TURN_RAD = np.float32(np.pi / 2)
 

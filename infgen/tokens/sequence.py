@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from infgen.config import TokenSettings
 from infgen.tokens.agents import AgentMatrix, Anchors, replay
 from infgen.tokens.grid import make_grid
 from infgen.tokens.insertion import Entries
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_MOVE, Presence, SceneTokens, Word
+from infgen.tokens.settings import TokenSettings
 from infgen.tokens.vocabulary import MotionCodebook
 
 _NOBODY = -1

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 
 from infgen.clock import CLOCK, Clock
-from infgen.config import TokenSettings
 from infgen.scene import Scene
 from infgen.tokens.agents import match_agents
 from infgen.tokens.grid import make_grid
@@ -14,6 +13,7 @@ from infgen.tokens.motion_tokens import make_move_table
 from infgen.tokens.presence import makes_a_move, seen_tokens
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.sequence import write_words
+from infgen.tokens.settings import TokenSettings
 from infgen.tokens.signals import Lights, signal_lines, signals_at
 from infgen.tokens.tracks import Paths, read_paths
 from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook

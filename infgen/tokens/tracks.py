@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int32, Int64, UInt8
 
 from infgen.clock import CLOCK, Clock
-from infgen.config import TokenSettings
 from infgen.geometry import wrap_angle
 from infgen.scene import AgentKind, Scene, Tracks
+from infgen.tokens.settings import TokenSettings
 from infgen.tokens.validity_patterns import encode_patterns
 
 MAX_TURN_RAD = 1.5

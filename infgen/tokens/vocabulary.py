@@ -1,8 +1,8 @@
 """The two vocabularies: half-second moves of agents, five-metre pieces of map lines.
 
 A codebook is plain arrays. Which rows there are is decided by ``kdisks`` (from logs) and
-written and read by ``pipeline.stages.vocabulary``; everything that matches or decodes tokens needs
-only what is here.
+written and read by ``pipeline.stages.vocabulary``; everything that matches or decodes
+tokens needs only what is here.
 """
 
 from dataclasses import dataclass

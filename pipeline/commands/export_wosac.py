@@ -18,7 +18,7 @@ from infgen.config import ConfigError, settle
 from infgen.exports.wosac import HOW, About, complete, encode_about, encode_futures
 from infgen.metrics.wosac.rollouts import RolloutsError
 from infgen.metrics.wosac.submission import NUM_ROLLOUTS
-from pipeline.commands.export import (
+from pipeline.commands.export_job import (
     Exported,
     Order,
     Part,

@@ -18,6 +18,7 @@ from pipeline.engine.runner import Orders
 from pipeline.settings.request import Request, complete, find_file, recall
 from pipeline.settings.stages_file import load_stages
 from pipeline.storage.source_files import absolute
+from pipeline.workers.dask_cluster import choose_workers
 
 RootFolder = Annotated[
     Path, typer.Option("--root", metavar="DIR", help="Folder of the experiment.")
@@ -146,8 +147,7 @@ class Running:
             keep_going=self.keep_going,
             wait=self.wait,
             strict_code=self.strict_code,
-            workers=self.dask,
-            visible_devices=os.environ.get("CUDA_VISIBLE_DEVICES"),
+            workers=choose_workers(self.dask, os.environ.get("CUDA_VISIBLE_DEVICES")),
         )
 
 

@@ -11,13 +11,13 @@ from pipeline.commands.watch import Look, Row
 from pipeline.comparison.runs import PAGE, SHOWN
 from pipeline.engine.garbage import Garbage
 from pipeline.engine.layout import KEY_DIGITS, Root, read_json
+from pipeline.engine.plan import StageEntry
 from pipeline.engine.progress import amount, clock_time, rate
 from pipeline.engine.runner import Result
 from pipeline.engine.status import Standing
-from pipeline.settings.stages_file import StageEntry
 
 if TYPE_CHECKING:
-    from pipeline.commands.export import Exported
+    from pipeline.commands.export_job import Exported
     from pipeline.commands.wosac import Official
     from pipeline.comparison.dry_run import Outlook
     from pipeline.comparison.execution import Ran

@@ -17,7 +17,7 @@ from pipeline.engine.events import Event
 from pipeline.engine.layout import find_root
 
 if TYPE_CHECKING:
-    from pipeline.commands.export import Exported
+    from pipeline.commands.export_job import Exported
     from pipeline.commands.view import Shown
     from pipeline.commands.wosac import Official
     from pipeline.storage.towns import Written
@@ -95,7 +95,8 @@ class Exporting:
 
     def write(self, tell: Callable[[Event], None]) -> "Exported":
         """Export; tells how far it is."""
-        from pipeline.commands.export import Order, export  # noqa: PLC0415
+        from pipeline.commands.export import export  # noqa: PLC0415
+        from pipeline.commands.export_job import Order  # noqa: PLC0415
         from pipeline.commands.export_wosac import read_about  # noqa: PLC0415
         from pipeline.storage.scene_lookup import open_logs  # noqa: PLC0415
 

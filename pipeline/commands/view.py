@@ -4,7 +4,6 @@ Where nothing is named the obvious thing is shown: the first scene of the latest
 with the first of them and the log; without rollouts, the first log.
 """
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from glob import has_magic
@@ -23,6 +22,7 @@ from pipeline.commands.view_files import (
 from pipeline.engine.atomic import write_file
 from pipeline.engine.events import Event
 from pipeline.engine.layout import Root
+from pipeline.storage.scenes import file_name
 from pipeline.storage.source_files import BUILTIN, RECORDS_IN_FOLDER
 
 if TYPE_CHECKING:
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from infgen.views.video.layout import Format
 
 FPS, GIF_FPS = 25, 10
-
-_UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,8 +183,3 @@ def write_page(film: "Film", path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, player_page(film).encode())
     return path
-
-
-def file_name(scenario_id: str) -> str:
-    """Name a file after a scene, whatever signs its id has."""
-    return _UNSAFE.sub("-", scenario_id).strip(".-") or "scene"

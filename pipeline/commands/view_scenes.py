@@ -157,7 +157,7 @@ def _find_log(root: Root, prefix: str) -> Scene:
 def _read_rollouts(
     root: Root, made: Path, unit: str, scenario_id: str, asked: Sequence[int] | None
 ) -> "tuple[Rollout, ...]":
-    from pipeline.stages.rollout import read_rollouts  # noqa: PLC0415
+    from pipeline.storage.rollouts import read_rollouts  # noqa: PLC0415
 
     folder = _unit_folder(root, "rollout", made, unit)
     found: dict[int, Rollout] = {}

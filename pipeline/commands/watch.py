@@ -12,8 +12,8 @@ from socket import gethostname
 from typing import Any
 
 from infgen.config import ConfigError
-from pipeline.engine.atomic import PARTIAL, StoreError
-from pipeline.engine.layout import KEY_DIGITS, MANIFEST, Root, read_json
+from pipeline.engine.atomic import MANIFEST, PARTIAL, StoreError
+from pipeline.engine.layout import KEY_DIGITS, Root, read_json
 from pipeline.engine.locks import holder
 from pipeline.engine.manifest import read_manifest
 from pipeline.engine.plan import PlanError

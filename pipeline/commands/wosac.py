@@ -172,7 +172,7 @@ def _read_store(units: Sequence[Path]) -> Iterator[Future]:
     """Gather our rollouts scene by scene; all of a scene's are in one unit."""
     import polars as pl  # noqa: PLC0415
 
-    from pipeline.stages.rollout import read_rollouts  # noqa: PLC0415
+    from pipeline.storage.rollouts import read_rollouts  # noqa: PLC0415
 
     indices = [pl.read_parquet(unit / "index.parquet")["scenario_id"] for unit in units]
     total, done = sum(ids.n_unique() for ids in indices), 0

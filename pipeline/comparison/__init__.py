@@ -1,1 +1,1 @@
-"""Comparisons: several methods trained, simulated and scored alike, as in the paper's tables."""
+"""Comparisons: several methods trained, simulated and scored alike."""

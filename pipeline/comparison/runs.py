@@ -11,11 +11,11 @@ from pathlib import Path
 from infgen.config import ConfigError
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import Root
-from pipeline.engine.plan import Plan, make_plan, needed
+from pipeline.engine.plan import SOURCES, Plan, make_plan, needed
 from pipeline.settings.overlay import Overlay, Value, lay, read_words
 from pipeline.settings.presets import Arm, Preset
 from pipeline.settings.request import Request, recall, ref
-from pipeline.settings.stages_file import DEFAULT_FILE, SOURCES, StagesFile
+from pipeline.settings.stages_file import DEFAULT_FILE, StagesFile
 
 TRAIN, ROLLOUT, SCORE, REPORT = "train", "rollout", "score", "report"
 PRESET = "preset"

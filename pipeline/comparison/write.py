@@ -18,9 +18,9 @@ from pipeline.comparison.figures import figures as drawings
 from pipeline.comparison.result import Compared, compare
 from pipeline.comparison.runs import PAGE, PRESET, SHOWN, Comparison
 from pipeline.comparison.tables import caveats, standing_alone, tables
-from pipeline.engine.atomic import publish, remove_folder, write_file, write_json
+from pipeline.engine.atomic import MANIFEST, publish, remove_folder, write_file, write_json
 from pipeline.engine.code_hash import code_hash
-from pipeline.engine.layout import MANIFEST, link
+from pipeline.engine.layout import link
 from pipeline.engine.manifest import Run, package_versions, seal
 from pipeline.engine.plan import digest
 from pipeline.settings.presets import Preset

@@ -14,6 +14,8 @@ from typing import Any
 
 from pipeline.engine import signals
 
+MANIFEST = "manifest.json"
+"""Written last; a folder that has one is whole."""
 PARTIAL = ".partial"
 """Ending of the names of files and folders that are still being written."""
 TRASH = "trash."
@@ -78,8 +80,6 @@ def _check_own(handle: int, partial: Path) -> None:
 
 
 def _rename_first(partial: Path, target: Path) -> None:
-    from pipeline.engine.layout import MANIFEST  # noqa: PLC0415  # It needs this file.
-
     try:
         partial.rename(target)
     except OSError as error:

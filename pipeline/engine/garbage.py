@@ -1,19 +1,15 @@
 """Finding and removing what no remembered request needs any more."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from pipeline.engine.atomic import PARTIAL, TRASH, StoreError, remove_folder
-from pipeline.engine.layout import KEY_DIGITS, MANIFEST, Root, read_json
+from pipeline.engine.atomic import MANIFEST, PARTIAL, TRASH, StoreError, remove_folder
+from pipeline.engine.layout import KEY_DIGITS, Root, read_json
 from pipeline.engine.locks import locked
 from pipeline.engine.manifest import read_manifest
-from pipeline.settings.lined_yaml import Lined, inner, load
-from pipeline.settings.stages_file import DEFAULT_FILE
-from pipeline.storage.initial_weights import START
 
 PARTIAL_AGE_S = 24 * 3600.0
 WEIGHTS_STAGE = "train"
@@ -34,14 +30,18 @@ class Garbage:
     why: str
 
 
-def find_garbage(root: Root) -> list[Garbage]:
+def find_garbage(root: Root, initial_weights: Collection[str] = ()) -> list[Garbage]:
     """List what the latest stages of every profile, and their units, do not need.
 
     Units of an unfinished stage are kept: the next run goes on from them.
+
+    Args:
+        root: Of the experiment.
+        initial_weights: Keys and folders of weights that are needed besides.
     """
     found = []
     for stage in root.stages():
-        kept = _kept(root, stage)
+        kept = _kept(root, stage, initial_weights)
         for folder in _folders(root, stage):
             if folder.name.endswith(PARTIAL):
                 if folder.name.startswith(TRASH) or _age_s(folder) > PARTIAL_AGE_S:
@@ -52,8 +52,12 @@ def find_garbage(root: Root) -> list[Garbage]:
     return found
 
 
-def sweep(root: Root) -> list[Garbage]:
+def sweep(root: Root, initial_weights: Collection[str] = ()) -> list[Garbage]:
     """Remove the garbage while holding the locks of all stages.
+
+    Args:
+        root: Of the experiment.
+        initial_weights: Keys and folders of weights that are needed besides.
 
     Raises:
         LockedError: if a run is making one of them.
@@ -61,20 +65,20 @@ def sweep(root: Root) -> list[Garbage]:
     with ExitStack() as stack:
         for stage in root.stages():
             stack.enter_context(locked(root.lock(stage)))
-        found = find_garbage(root)
+        found = find_garbage(root, initial_weights)
         for garbage in found:
             remove_folder(garbage.path)
     return found
 
 
-def _kept(root: Root, stage: str) -> set[str]:
+def _kept(root: Root, stage: str, initial_weights: Collection[str]) -> set[str]:
     """Names of folders that are needed, of the stage itself and of its units."""
     folders = {key[:KEY_DIGITS] for key in _remembered(root, stage)}
     pointed = root.pointed(stage)
     if pointed is not None:
         folders.add(pointed.name)
     if stage == WEIGHTS_STAGE:
-        folders |= _started_from(root)
+        folders |= _named(root, initial_weights)
     units = set()
     for folder in folders:
         if (root.stage(stage) / folder / MANIFEST).is_file():
@@ -84,49 +88,23 @@ def _kept(root: Root, stage: str) -> set[str]:
 
 
 def _remembered(root: Root, stage: str) -> Iterator[str]:
-    for request in _requests(root):
+    for request in (read_json(path) for path in sorted(root.refs.glob("*.json"))):
         key = request.get("keys", {}).get(stage)
         if key is not None:
             yield key
 
 
-def _requests(root: Root) -> list[dict[str, Any]]:
-    return [read_json(path) for path in sorted(root.refs.glob("*.json"))]
-
-
-def _started_from(root: Root) -> set[str]:
-    """Names of the folders of weights that remembered requests go on from."""
+def _named(root: Root, initial_weights: Collection[str]) -> set[str]:
+    """Return the names of the folders of weights that are given by key or path."""
     stage = root.stage(WEIGHTS_STAGE)
     found = set()
-    for named in _starts(root):
+    for named in initial_weights:
         key = named[:KEY_DIGITS]
         found |= {path.name for path in stage.glob("*") if path.name.startswith(key)}
         place = Path(named).resolve()
         if place.is_relative_to(stage.resolve()):
             found.add(place.name)
     return found
-
-
-def _starts(root: Root) -> set[str]:
-    """All that remembered requests, and the files they are of, name as a start."""
-    requests, found = _requests(root), set()
-    for word in (word for request in requests for word in request.get("overrides", ())):
-        setting, _, value = word.partition("=")
-        if setting.endswith(f".{START}"):
-            found.add(value)
-    for path in {Path(request.get("file") or DEFAULT_FILE) for request in requests}:
-        file = load(path) if path.is_file() else Lined(path.name)
-        for part in ("params", "profiles"):
-            found |= set(_starts_in(inner(file, part)))
-    return found - {""}
-
-
-def _starts_in(settings: Mapping[str, Any]) -> Iterator[str]:
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _starts_in(value)
-        elif name == START:
-            yield str(value)
 
 
 def _under_way(root: Root, stage: str) -> set[str]:

@@ -23,12 +23,10 @@ from pathlib import Path
 from typing import Any
 
 from infgen.config import ConfigError
-from pipeline.engine.atomic import PARTIAL, StoreError, sync_folder
+from pipeline.engine.atomic import MANIFEST, PARTIAL, StoreError, sync_folder
 
-MANIFEST = "manifest.json"
-"""Written last; a folder that has one is whole."""
 RUN = "run.json"
-"""Beside it: what differs from run to run ..."""
+"""Beside the manifest: what differs from run to run ..."""
 RUN_FOLDER = "run"
 """... and, in this folder, more of that: no file in it is in the manifest."""
 KEY_DIGITS = 16

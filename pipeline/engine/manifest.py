@@ -16,8 +16,8 @@ from typing import Any
 import google_crc32c
 
 from pipeline.engine import machine
-from pipeline.engine.atomic import StoreError, write_json
-from pipeline.engine.layout import MANIFEST, RUN, RUN_FOLDER, Root, read_json
+from pipeline.engine.atomic import MANIFEST, StoreError, write_json
+from pipeline.engine.layout import RUN, RUN_FOLDER, Root, read_json
 from pipeline.engine.stage import Report
 
 BLOCK_BYTES = 1 << 22

@@ -9,19 +9,56 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, Protocol
 
-from infgen.config import decisive, settle
+from infgen.config import decisive
 from pipeline.engine.layout import Root
 from pipeline.engine.registry import load_stage
 from pipeline.engine.stage import Source, Stage, Unit
-from pipeline.settings.overlay import Overlay, Value
-from pipeline.settings.stages_file import SOURCES, StageEntry
-from pipeline.storage.source_files import find_sources
+
+SOURCES = "sources"
+"""Among ``deps``: the stage reads the source files."""
 
 
 class PlanError(ValueError):
     """A graph of stages that cannot be, or a stage that does not keep its word."""
+
+
+@dataclass(frozen=True, slots=True)
+class StageEntry:
+    """One stage of the graph.
+
+    Attributes:
+        name: As on the command line.
+        module: Where its code is.
+        deps: Stages that it reads, and ``sources``.
+        params: Sections of settings that it reads.
+        where: Its place in the file.
+    """
+
+    name: str
+    module: str
+    deps: tuple[str, ...]
+    params: tuple[str, ...]
+    where: str
+
+
+class Choice(Protocol):
+    """What was asked for: settings by section, and source files."""
+
+    def build(self, section: str, kind: Any) -> Any:
+        """Return the settings of a section, of the class that a stage names for it.
+
+        Raises:
+            ConfigError: for a setting that does not exist or cannot have its value.
+        """
+
+    def find_sources(self, root: Root) -> tuple[Source, ...]:
+        """Find the source files and their identities.
+
+        Raises:
+            ConfigError: if there are none.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +124,7 @@ class Plan:
 def make_plan(
     root: Root,
     entries: Mapping[str, StageEntry],
-    chosen: Overlay,
+    chosen: Choice,
     targets: Sequence[str],
 ) -> Plan:
     """Settle the settings and keys of the targets and of all they need.
@@ -99,7 +136,7 @@ def make_plan(
     """
     order = needed(entries, targets)
     reads_sources = any(SOURCES in entries[name].deps for name in order)
-    sources = find_sources(chosen.sources, root) if reads_sources else ()
+    sources = chosen.find_sources(root) if reads_sources else ()
     stages: dict[str, Planned] = {}
     for name in order:
         stages[name] = _settle(entries[name], chosen, sources, stages, root)
@@ -142,15 +179,14 @@ def _visit(
 
 def _settle(
     entry: StageEntry,
-    chosen: Overlay,
+    chosen: Choice,
     sources: tuple[Source, ...],
     before: Mapping[str, Planned],
     root: Root,
 ) -> Planned:
     stage = _load(entry)
     sections: Mapping[str, Any] = {
-        section: _build(kind, chosen.values.get(section, {}))
-        for section, kind in stage.settings.items()
+        section: chosen.build(section, kind) for section, kind in stage.settings.items()
     }
     if stage.narrow is not None:
         sections = stage.narrow(sections)
@@ -189,13 +225,6 @@ def _load(entry: StageEntry) -> Stage:
             f"code reads {sorted(stage.settings)}"
         )
     return stage
-
-
-def _build(kind: Any, values: Mapping[str, Value]) -> Any:
-    settled = {
-        name: settle(kind, name, given.value, given.where) for name, given in values.items()
-    }
-    return kind(**settled)
 
 
 def digest(value: Any) -> str:

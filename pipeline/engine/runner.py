@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.engine import signals
-from pipeline.engine.atomic import PARTIAL, publish, remove_folder, write_json
+from pipeline.engine.atomic import MANIFEST, PARTIAL, publish, remove_folder, write_json
 from pipeline.engine.events import Events
 from pipeline.engine.inputs import FinishedInputs, units_of
-from pipeline.engine.layout import KEY_DIGITS, MANIFEST, Root
+from pipeline.engine.layout import KEY_DIGITS, Root
 from pipeline.engine.locks import LockedError, locked
 from pipeline.engine.manifest import (
     Run,
@@ -30,9 +30,15 @@ from pipeline.engine.progress import figures
 from pipeline.engine.stage import Done, Progress, Report
 from pipeline.engine.status import has_other_code
 from pipeline.engine.tasks import about_stage, cut_tasks
-from pipeline.engine.units import Outcome, Task, failure
-from pipeline.workers.dask_cluster import Workers
-from pipeline.workers.scheduling import WorkersLostError
+from pipeline.engine.units import (
+    DriverWorkers,
+    Outcome,
+    Pool,
+    Task,
+    Workers,
+    WorkersLostError,
+    failure,
+)
 
 FINISH = "finish"
 """Stands for a stage's own last step among its failed units."""
@@ -48,16 +54,14 @@ class Orders:
             need it.
         wait: Queue behind a run that holds a lock.
         strict_code: Make again what other code made.
-        workers: Who does the units (``--dask``).
-        visible_devices: ``CUDA_VISIBLE_DEVICES`` of this process, if it is set.
+        workers: Where the units are done (``--dask``).
     """
 
     force: frozenset[str] = frozenset()
     keep_going: bool = False
     wait: bool = False
     strict_code: bool = False
-    workers: str = "none"
-    visible_devices: str | None = None
+    workers: Workers = field(default_factory=DriverWorkers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +103,7 @@ def run(plan: Plan, orders: Orders, events: Events) -> list[Result]:
         StoreError: if what a stage should read is damaged.
         WorkersLostError: if the workers are gone, with what they had under way.
     """
-    events.emit("run-started", stages=list(plan.stages), workers=orders.workers)
+    events.emit("run-started", stages=list(plan.stages), workers=orders.workers.words)
     try:
         results = _make_all(plan, orders, events)
     except (signals.Stopped, LockedError, WorkersLostError) as error:
@@ -113,7 +117,7 @@ def run(plan: Plan, orders: Orders, events: Events) -> list[Result]:
 def _make_all(plan: Plan, orders: Orders, events: Events) -> list[Result]:
     force = plan.after(orders.force | _made_by_other_code(plan, orders))
     results: list[Result] = []
-    with Workers(orders.workers, orders.visible_devices) as workers:
+    with orders.workers.open() as pool:
         for planned in plan.stages.values():
             unmet = {result.stage for result in results if result.state in _NOT_MADE}
             if unmet and (not orders.keep_going or unmet & planned.inputs.keys()):
@@ -121,7 +125,7 @@ def _make_all(plan: Plan, orders: Orders, events: Events) -> list[Result]:
                 events.emit("stage-skipped", stage=planned.name)
                 continue
             making = _Making(plan, planned, orders, events, planned.name in force)
-            results.append(making.ensure(workers))
+            results.append(making.ensure(pool))
     return results
 
 
@@ -156,7 +160,7 @@ class _Making:
     def folder(self) -> Path:
         return self.root.folder(self.name, self.planned.key)
 
-    def ensure(self, workers: Workers) -> Result:
+    def ensure(self, pool: Pool) -> Result:
         """Find the stage whole, or make it, alone."""
         begun = time.monotonic()
         if self._is_whole():
@@ -164,7 +168,7 @@ class _Making:
         with locked(self.root.lock(self.name), wait=self.orders.wait):
             if self._is_whole():
                 return self._cached()
-            result = self._make(workers)
+            result = self._make(pool)
         taken = time.monotonic() - begun
         return replace(result, seconds=round(taken, 3))
 
@@ -179,7 +183,7 @@ class _Making:
         report = manifest["report"]
         return Result(self.name, "cached", self.planned.key, units, report=report)
 
-    def _make(self, workers: Workers) -> Result:
+    def _make(self, pool: Pool) -> Result:
         inputs = FinishedInputs(self.root, self.planned)
         units = self.planned.stage.plan(inputs, self.planned.settings)
         tasks = cut_tasks(self.root, self.planned, units)
@@ -195,7 +199,7 @@ class _Making:
             units=len(tasks),
             made=len(tasks) - len(todo),
         )
-        outcomes = self._do(todo, workers)
+        outcomes = self._do(todo, pool)
         errors = {outcome.name: outcome.error for outcome in outcomes if outcome.error}
         report: Report = {}
         if not errors:
@@ -215,7 +219,7 @@ class _Making:
             self.name, state, self.planned.key, len(tasks), made, 0.0, report, errors
         )
 
-    def _do(self, todo: Sequence[Task], workers: Workers) -> list[Outcome]:
+    def _do(self, todo: Sequence[Task], pool: Pool) -> list[Outcome]:
         outcomes: list[Outcome] = []
         if not todo:
             return outcomes
@@ -224,7 +228,7 @@ class _Making:
             return self.orders.keep_going or not any(outcome.error for outcome in outcomes)
 
         self.root.units(self.name).mkdir(parents=True, exist_ok=True)
-        executor = workers.executor(here=self.planned.stage.in_driver)
+        executor = pool.executor(here=self.planned.stage.in_driver)
         for outcome in executor.run(todo, go_on, self._progress(), self._tell_more):
             outcomes.append(outcome)
             self._tell(outcome)

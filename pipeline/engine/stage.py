@@ -1,7 +1,8 @@
 """What a stage is: how it cuts its work into units, does one, and gathers them.
 
-The engine knows stages only through this file. A stage module (``pipeline/stages/ingest.py`` ...)
-ends in one ``STAGE = Stage(...)``; ``pipeline.engine.registry`` lists them.
+The engine knows stages only through this file. A stage module, such as
+``pipeline/stages/ingest.py``, ends in one ``STAGE = Stage(...)``;
+``pipeline.engine.registry`` lists them.
 
 ``infgen status`` and dry runs import every stage module, so a stage module imports torch,
 zarr, dask and polars inside its functions only, and ``plan`` uses none of them: it cuts by

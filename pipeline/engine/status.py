@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pipeline.engine.atomic import StoreError
+from pipeline.engine.atomic import MANIFEST, StoreError
 from pipeline.engine.code_hash import code_hash
 from pipeline.engine.inputs import FinishedInputs, are_made
-from pipeline.engine.layout import MANIFEST, read_json
+from pipeline.engine.layout import read_json
 from pipeline.engine.locks import holder, is_locked
 from pipeline.engine.manifest import read_manifest
 from pipeline.engine.plan import Plan, PlanError, Planned

@@ -3,18 +3,24 @@
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from pipeline.engine import signals
-from pipeline.engine.atomic import publish
-from pipeline.engine.layout import MANIFEST
+from pipeline.engine.atomic import MANIFEST, publish
 from pipeline.engine.manifest import Run, read_manifest, seal, split_report
 from pipeline.engine.registry import load_stage
 from pipeline.engine.stage import Progress, Report, Unit
+
+
+class WorkersLostError(OSError):
+    """The workers are gone, and nobody can tell how far they came.
+
+    What they have finished is on disk; the next run goes on from there.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +94,42 @@ class InProcess:
             if not go_on():
                 return
             yield attempt(task, progress)
+
+
+class Pool(Protocol):
+    """Workers that are there while a run goes on."""
+
+    def executor(self, *, here: bool) -> Executor:
+        """Return who does the units of a stage; ``here`` if it must be this process."""
+
+
+class Workers(Protocol):
+    """Where the units of a run are done (``--dask``).
+
+    Attributes:
+        words: As on the command line.
+    """
+
+    @property
+    def words(self) -> str:
+        """As on the command line."""
+
+    def open(self) -> AbstractContextManager[Pool]:
+        """Have the workers for as long as the context lasts."""
+
+
+class DriverWorkers:
+    """This process does every unit (``--dask none``)."""
+
+    words = "none"
+
+    def open(self) -> AbstractContextManager["DriverWorkers"]:
+        """Return what there is already."""
+        return nullcontext(self)
+
+    def executor(self, *, here: bool) -> Executor:
+        """Do units here, whatever the stage."""
+        return InProcess()
 
 
 def attempt(task: Task, progress: Progress) -> Outcome:

@@ -8,8 +8,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from infgen.config import ConfigError
+from infgen.config import ConfigError, settle
+from pipeline.engine.layout import Root
+from pipeline.engine.stage import Source
 from pipeline.settings.lined_yaml import Lined, hint, inner, known
+from pipeline.storage.source_files import find_sources
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +33,28 @@ class Overlay:
     def with_sources(self, sources: tuple[str, ...]) -> "Overlay":
         """Replace the source files."""
         return Overlay(sources, self.values)
+
+    def build(self, section: str, kind: Any) -> Any:
+        """Return the settings of a section, of the class that a stage names for it.
+
+        Raises:
+            ConfigError: for a setting that does not exist or cannot have its value.
+        """
+        given = self.values.get(section, {})
+        return kind(
+            **{
+                name: settle(kind, name, each.value, each.where)
+                for name, each in given.items()
+            }
+        )
+
+    def find_sources(self, root: Root) -> tuple[Source, ...]:
+        """Find the source files and their identities.
+
+        Raises:
+            ConfigError: if there are none.
+        """
+        return find_sources(self.sources, root)
 
     @property
     def words(self) -> tuple[str, ...]:

@@ -15,7 +15,9 @@ from infgen.config import ConfigError
 from pipeline.engine.atomic import StoreError, write_file, write_json
 from pipeline.engine.layout import Root, link, read_json
 from pipeline.engine.plan import Plan, PlanError, make_plan
+from pipeline.settings.lined_yaml import Lined, inner, load
 from pipeline.settings.stages_file import DEFAULT_FILE, StagesFile, load_stages
+from pipeline.storage.initial_weights import START
 from pipeline.storage.source_files import absolute
 
 NO_PROFILE = "default"
@@ -186,3 +188,26 @@ def recall(root: Root, name: str) -> dict[str, Any]:
     except StoreError:
         return {}
     return about if isinstance(about, dict) else {}
+
+
+def named_weights(root: Root) -> set[str]:
+    """Return what remembered requests, and their files, name as initial weights."""
+    requests = [read_json(path) for path in sorted(root.refs.glob("*.json"))]
+    found = set()
+    for word in (word for request in requests for word in request.get("overrides", ())):
+        setting, _, value = word.partition("=")
+        if setting.endswith(f".{START}"):
+            found.add(value)
+    for path in {Path(request.get("file") or DEFAULT_FILE) for request in requests}:
+        file = load(path) if path.is_file() else Lined(path.name)
+        for part in ("params", "profiles"):
+            found |= set(_named_in(inner(file, part)))
+    return found - {""}
+
+
+def _named_in(settings: Mapping[str, Any]) -> Iterator[str]:
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _named_in(value)
+        elif name == START:
+            yield str(value)

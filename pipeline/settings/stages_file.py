@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from infgen.config import ConfigError
+from pipeline.engine.plan import SOURCES, StageEntry
 from pipeline.engine.registry import MODULES
 from pipeline.settings.lined_yaml import Lined, hint, inner, known, load, words
 from pipeline.settings.overlay import Overlay, lay, read_values, read_words
@@ -30,28 +31,7 @@ from pipeline.settings.presets import Preset
 
 FILE_VERSION = 1
 DEFAULT_FILE = Path(__file__).with_name("default_stages.yaml")
-SOURCES = "sources"
-"""Among ``deps``: the stage reads the source files."""
 _ENTRIES = ("version", SOURCES, "stages", "params", "profiles", "presets")
-
-
-@dataclass(frozen=True, slots=True)
-class StageEntry:
-    """One stage of the graph.
-
-    Attributes:
-        name: As on the command line.
-        module: Where its code is.
-        deps: Stages that it reads, and ``sources``.
-        params: Sections of settings that it reads.
-        where: Its place in the file.
-    """
-
-    name: str
-    module: str
-    deps: tuple[str, ...]
-    params: tuple[str, ...]
-    where: str
 
 
 @dataclass(frozen=True, slots=True)

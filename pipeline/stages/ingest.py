@@ -5,7 +5,7 @@ in groups of bounded size as they come. A record that cannot be used is a named 
 ``quarantine.parquet``; it never stops the file, and the file never stops the stage.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,12 +19,12 @@ from infgen.sources.womd import scene_or_fault
 from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
 from pipeline.storage.duplicates import mark_duplicates, tell_left_out
 from pipeline.storage.parquet import joined, table
+from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.splits import split_of
 
 if TYPE_CHECKING:
     import polars as pl
 
-SCHEMA = "infgen.scenes/1"
 GROUP_BYTES = 96 << 20
 """Columns of one group in memory; a worker holds about three times as much."""
 
@@ -46,20 +46,6 @@ _INDEX = {
 _QUARANTINE = {"source": str, "record": int, "offset": int, "reason": str}
 _DUPLICATES = {**_QUARANTINE, "scenario_id": str, "first_source": str, "first_record": int}
 _MARKED = ("scenario_id", "split", "duplicate", "source", "record", "offset")
-
-
-def read_scenes(unit_folder: Path) -> Iterator[Scene]:
-    """Stream the scenes of one ingested file, in the order of its records.
-
-    One group is in memory at a time.
-
-    Raises:
-        StoreError: if a group is damaged.
-    """
-    from pipeline.storage.zarr_store import read_records  # noqa: PLC0415
-
-    for path in sorted(unit_folder.glob("scenes-*.zarr")):
-        yield from read_records(path, Scene, SCHEMA, whole=True)
 
 
 def plan(inputs: Inputs, settings: IngestSettings) -> Sequence[Unit]:
@@ -186,7 +172,7 @@ class _Shard:
         if not self._pending:
             return
         path = self._target / self._group_name
-        write_records(path, self._pending, Scene, SCHEMA, compress=True)
+        write_records(path, self._pending, Scene, SCENES_SCHEMA, compress=True)
         self._pending, self._pending_bytes = [], 0
         self._groups += 1
 

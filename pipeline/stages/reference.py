@@ -70,8 +70,8 @@ def _measure(
     """Count one log, and bin it; or say why it cannot be."""
     from infgen.metrics.long_term.binned import bin_traffic  # noqa: PLC0415
     from infgen.metrics.long_term.reference import count_log  # noqa: PLC0415
-    from infgen.metrics.long_term.windows import cut_windows  # noqa: PLC0415
     from infgen.metrics.traffic import from_log  # noqa: PLC0415
+    from infgen.metrics.windows import cut_windows  # noqa: PLC0415
     from infgen.spatial.road_edges import edges_of  # noqa: PLC0415
 
     after = scene.tracks.num_steps - scene.now - 1

@@ -9,7 +9,7 @@ from infgen.config import ReferenceSettings
 from infgen.metrics.agent_count import mean_counts
 from infgen.metrics.long_term.reference import add_up
 from infgen.metrics.long_term.table import make_row
-from infgen.metrics.long_term.windows import cut_windows
+from infgen.metrics.windows import cut_windows
 from pipeline.engine.stage import Progress
 from pipeline.stages import reference_files as files
 from pipeline.stages.score_summary import Tally

@@ -6,7 +6,7 @@ overhead. What a rollout does depends on its scene, its index and the seed alone
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
@@ -17,6 +17,7 @@ from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
 from pipeline.stages.calibration import Biases, read_found
 from pipeline.stages.simulation import begin, load_player, play_all, read_some
 from pipeline.storage.parquet import Fields, joined, table
+from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
 from pipeline.storage.splits import files_of, spread
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from infgen.rollout.rollout import Rollout
     from infgen.rollout.simulator import Player
 
-SCHEMA = "infgen.rollouts/1"
 INDEX: Fields = {
     "scenario_id": str,
     "rollout": int,
@@ -118,7 +118,7 @@ def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
     rows: list[dict[str, Any]] = []
     for group, rollouts in enumerate(play_all(player, starts, weights, tell)):
         path = target / f"rollouts-{group:03d}.zarr"
-        write_records(path, rollouts, Rollout, SCHEMA, compress=True)
+        write_records(path, rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True)
         rows += [_row(unit.name, group, at, done) for at, done in enumerate(rollouts)]
     table(rows, INDEX).write_parquet(target / "index.parquet")
     pace = {"rollouts_per_s": round(_rate(len(rows), begun), 4)}
@@ -128,15 +128,6 @@ def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
 
 def _rate(played: float | int, begun: float) -> float:
     return played / max(time.monotonic() - begun, 1e-9)
-
-
-def read_rollouts(folder: Path) -> "Iterator[Rollout]":
-    """Read the rollouts of one unit, a group in memory at a time."""
-    from infgen.rollout.rollout import Rollout  # noqa: PLC0415
-    from pipeline.storage.zarr_store import read_records  # noqa: PLC0415
-
-    for path in sorted(folder.glob("rollouts-*.zarr")):
-        yield from read_records(path, Rollout, SCHEMA, whole=True)
 
 
 def finish(

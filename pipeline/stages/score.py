@@ -76,9 +76,9 @@ def work(
         read_logged,
         write_counts,
     )
-    from pipeline.stages.rollout import read_rollouts  # noqa: PLC0415
     from pipeline.stages.score_tables import WOSAC  # noqa: PLC0415
     from pipeline.stages.score_write import ROWS, write_part, write_tally  # noqa: PLC0415
+    from pipeline.storage.rollouts import read_rollouts  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
     folder, logs = Path(unit.task["rollouts"]), unit.task["logs"]
@@ -178,7 +178,7 @@ def _scenario_ids(folder: Path) -> list[str]:
 
 def _scenes(folder: str, wanted: Sequence[str]) -> "Iterator[tuple[str, Scene]]":
     """Find scenes of an ingested file by id; stops with the last of them."""
-    from pipeline.stages.ingest import read_scenes  # noqa: PLC0415
+    from pipeline.storage.scenes import read_scenes  # noqa: PLC0415
 
     left = set(wanted)
     for scene in read_scenes(Path(folder)) if folder else ():

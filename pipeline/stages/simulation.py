@@ -51,7 +51,7 @@ def load_player(
 
 def read_some(folder: Path, rows: Sequence[int]) -> "Iterator[Scene]":
     """Read some scenes of an ingested file; rows are ascending."""
-    from pipeline.stages.ingest import read_scenes  # noqa: PLC0415
+    from pipeline.storage.scenes import read_scenes  # noqa: PLC0415
 
     wanted = set(rows)
     scenes = islice(read_scenes(folder), max(rows, default=-1) + 1)

@@ -57,7 +57,7 @@ def read_scenes_of(task: Mapping[str, Any]) -> "Iterator[Scene]":
     Raises:
         StoreError: if a group of them is damaged.
     """
-    from pipeline.stages.ingest import read_scenes  # noqa: PLC0415
+    from pipeline.storage.scenes import read_scenes  # noqa: PLC0415
 
     left_out = _rows(task)
     scenes = enumerate(read_scenes(Path(task["scenes"])))

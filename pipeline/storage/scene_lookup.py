@@ -12,7 +12,8 @@ from infgen.config import ConfigError
 from infgen.scene import Scene
 from infgen.sources.tfrecord import BadRecord, RecordError, iter_records, read_record
 from infgen.sources.womd import decode_scene, read_scenario_id
-from pipeline.engine.layout import KEY_DIGITS, MANIFEST
+from pipeline.engine.atomic import MANIFEST
+from pipeline.engine.layout import KEY_DIGITS
 from pipeline.engine.manifest import read_manifest
 from pipeline.storage.source_files import find_urls
 
@@ -143,13 +144,13 @@ class StoreLogs:
         return self._group(path)[row]
 
     def _group(self, path: Path) -> "Unpacked[Scene]":
-        from pipeline.stages.ingest import SCHEMA  # noqa: PLC0415
+        from pipeline.storage.scenes import SCENES_SCHEMA  # noqa: PLC0415
         from pipeline.storage.zarr_store import read_records  # noqa: PLC0415
 
         if path not in self._open:
             while len(self._open) >= OPEN_GROUPS:
                 self._open.pop(next(iter(self._open)))
-            self._open[path] = read_records(path, Scene, SCHEMA, whole=True)
+            self._open[path] = read_records(path, Scene, SCENES_SCHEMA, whole=True)
         return self._open[path]
 
 

@@ -26,8 +26,8 @@ import google_crc32c
 from infgen.config import ConfigError
 from infgen.sources.remote import file_system
 from infgen.sources.tfrecord import Record, read_record
-from pipeline.engine.atomic import StoreError, write_json
-from pipeline.engine.layout import MANIFEST, Root, read_json
+from pipeline.engine.atomic import MANIFEST, StoreError, write_json
+from pipeline.engine.layout import Root, read_json
 from pipeline.engine.stage import Source
 
 BUILTIN = "builtin"

@@ -12,13 +12,23 @@ import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from importlib import import_module
 from queue import SimpleQueue
 from typing import Any
 
 from infgen.config import ConfigError
 from pipeline.engine.stage import Progress
-from pipeline.engine.units import Executor, InProcess, Outcome, Task, do
+from pipeline.engine.units import (
+    DriverWorkers,
+    Executor,
+    InProcess,
+    Outcome,
+    Task,
+    Workers,
+    WorkersLostError,
+    do,
+)
 from pipeline.workers.scheduling import (
     RETRIES,
     Broken,
@@ -28,7 +38,6 @@ from pipeline.workers.scheduling import (
     Lost,
     News,
     Share,
-    WorkersLostError,
 )
 
 HELP = "none | local[:N] | gpu[:0,1] | tcp://HOST:PORT | file:scheduler.json"
@@ -53,33 +62,65 @@ COMING_TOPIC, MEMORY_TOPIC = "all", "worker-restart-memory"
 SHARE_TOPIC = "infgen-share"
 
 
-class Workers:
-    """Whoever does the units. A cluster starts only when the first unit needs it.
+def choose_workers(words: str, visible_devices: str | None = None) -> Workers:
+    """Return where units are done.
 
     Args:
-        words: Who (``--dask``).
-        visible: ``CUDA_VISIBLE_DEVICES`` of this process, if it is set.
+        words: As on the command line (``--dask``).
+        visible_devices: ``CUDA_VISIBLE_DEVICES`` of this process, if it is set.
+
+    Raises:
+        ConfigError: for words that name no kind of workers.
+    """
+    return DriverWorkers() if words == "none" else DaskWorkers(words, visible_devices)
+
+
+@dataclass(frozen=True, slots=True)
+class DaskWorkers:
+    """Workers of a Dask cluster: on this machine, on its GPUs, or anywhere.
+
+    Attributes:
+        words: As on the command line.
+        visible_devices: ``CUDA_VISIBLE_DEVICES`` of this process, if it is set.
     """
 
-    def __init__(self, words: str, visible: str | None = None) -> None:
-        self._words, self._visible = words, visible
-        self._stack = ExitStack()
-        self._executor: Executor | None = InProcess() if words == "none" else None
-        if words != "none":
-            parse(words)
+    words: str
+    visible_devices: str | None = None
 
-    def __enter__(self) -> "Workers":
-        return self
+    def __post_init__(self) -> None:
+        """Refuse words that name no kind of workers.
 
-    def __exit__(self, *error: object) -> None:
-        self._stack.close()
+        Raises:
+            ConfigError: naming the words and those there are.
+        """
+        parse(self.words)
+
+    @contextmanager
+    def open(self) -> Iterator["DaskPool"]:
+        """Have the cluster from the first unit that needs it to the end of the context."""
+        with ExitStack() as stack:
+            yield DaskPool(self, stack)
+
+
+class DaskPool:
+    """A cluster that starts only when the first unit needs it.
+
+    Args:
+        workers: Which cluster.
+        stack: Closes it.
+    """
+
+    def __init__(self, workers: DaskWorkers, stack: ExitStack) -> None:
+        self._workers, self._stack = workers, stack
+        self._executor: Executor | None = None
 
     def executor(self, *, here: bool) -> Executor:
         """Return who does the units of a stage; ``here`` if it must be this process."""
         if here:
             return InProcess()
         if self._executor is None:
-            client = self._stack.enter_context(_client(self._words, self._visible))
+            words, visible = self._workers.words, self._workers.visible_devices
+            client = self._stack.enter_context(_client(words, visible))
             crew = DaskCrew(client)
             self._stack.callback(crew.close)
             self._executor = ByCrew(crew)

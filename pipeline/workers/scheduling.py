@@ -13,7 +13,7 @@ from queue import Empty, SimpleQueue
 from typing import Protocol, runtime_checkable
 
 from pipeline.engine.stage import Progress
-from pipeline.engine.units import Outcome, Task, Tell, failure
+from pipeline.engine.units import Outcome, Task, Tell, WorkersLostError, failure
 
 RETRIES = 2
 """A unit that fails is tried so often again before it counts as failed."""
@@ -22,13 +22,6 @@ LOOK_S = 5.0
 """Without news for so long, the crew is asked how many it still is."""
 NOBODY_S = 600.0
 """Without any worker for so long, a run gives up."""
-
-
-class WorkersLostError(OSError):
-    """The workers are gone, and nobody can tell how far they came.
-
-    What they have finished is on disk; the next run goes on from there.
-    """
 
 
 @dataclass(frozen=True, slots=True)

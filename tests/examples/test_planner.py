@@ -8,7 +8,7 @@ import pytest
 
 from infgen.config import RolloutSettings
 from infgen.scene import Scene
-from pipeline.stages.ingest import SCHEMA
+from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.weights import save_network, state_of
 from pipeline.storage.zarr_store import write_records
 
@@ -71,7 +71,9 @@ def test_the_planner_plays_a_logged_scene_with_given_weights(
 ):
     network = street.fresh_network(seed=3)
     save_network(tmp_path, network, state_of(network), step=1)
-    write_records(tmp_path / "scenes-000.zarr", [crossing()], Scene, SCHEMA, compress=True)
+    write_records(
+        tmp_path / "scenes-000.zarr", [crossing()], Scene, SCENES_SCHEMA, compress=True
+    )
     words = f"--weights {tmp_path} --scenes {tmp_path} --seconds 1"
 
     planner.main(words.split())

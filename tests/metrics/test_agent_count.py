@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from infgen.metrics.agent_count import count_errors, mean_counts, truth
-from infgen.metrics.long_term.windows import cut_windows
+from infgen.metrics.windows import cut_windows
 
 
 def counts_of(*per_second):

@@ -12,11 +12,11 @@ from infgen.metrics.interaction import nearest_object_m, time_to_collision_s
 from infgen.metrics.kinematics import measure_kinematics
 from infgen.metrics.long_term.binned import Binned, bin_traffic
 from infgen.metrics.long_term.metric import score_binned
-from infgen.metrics.long_term.placement import Events
 from infgen.metrics.long_term.protocols import FEATURES, MAX_BINS, NUM_FEATURES, ROW
-from infgen.metrics.long_term.windows import cut_windows
 from infgen.metrics.motion import Motion
+from infgen.metrics.placement import Events
 from infgen.metrics.traffic import Traffic
+from infgen.metrics.windows import cut_windows
 from tests.metrics.golden import GOLDEN
 
 FOLDER = GOLDEN.parent / "long_term_reference"

@@ -9,11 +9,13 @@ from infgen.metrics.wosac.submission import read_submission
 from infgen.model.network import Network
 from infgen.sources.tfrecord import iter_records
 from infgen.sources.womd import decode_scene
-from pipeline.commands.export import Order, export
+from pipeline.commands.export import export
+from pipeline.commands.export_job import Order
 from pipeline.commands.wosac import score_files
 from pipeline.engine.stage import Unit
 from pipeline.stages import ingest
-from pipeline.stages.rollout import STAGE, read_rollouts
+from pipeline.stages.rollout import STAGE
+from pipeline.storage.rollouts import read_rollouts
 from pipeline.storage.scene_lookup import open_logs
 from pipeline.storage.weights import save_network, state_of
 from tests.exports.test_wosac import ABOUT

@@ -23,7 +23,7 @@ from infgen.metrics.long_term.protocols import (
     Scoring,
 )
 from infgen.metrics.long_term.reference import event_bins, happened, token_bins
-from infgen.metrics.long_term.windows import Windows
+from infgen.metrics.windows import Windows
 
 BUCKETS = tuple(COMPOSITE_WEIGHTS)
 

@@ -11,7 +11,6 @@ from jaxtyping import Float64, Int64
 
 from infgen.metrics.likelihood import bin_of
 from infgen.metrics.long_term.binned import NO_BIN, Binned, in_range
-from infgen.metrics.long_term.placement import count_per_token
 from infgen.metrics.long_term.protocols import (
     FEATURES,
     MAX_BINS,
@@ -22,7 +21,8 @@ from infgen.metrics.long_term.protocols import (
     Protocol,
     Scoring,
 )
-from infgen.metrics.long_term.windows import Windows
+from infgen.metrics.placement import count_per_token
+from infgen.metrics.windows import Windows
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from infgen.metrics.long_term.binned import Binned
 from infgen.metrics.long_term.metric import BUCKETS, bucket_scores, composite, score_binned
 from infgen.metrics.long_term.protocols import FEATURES, PROTOCOLS, ROW
 from infgen.metrics.long_term.reference import events_per_token, happened
-from infgen.metrics.long_term.windows import Windows, cut_windows
+from infgen.metrics.windows import Windows, cut_windows
 
 COMPOSITE, WITHOUT_PLACEMENT = "composite", "composite_without_placement"
 

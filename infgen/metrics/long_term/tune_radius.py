@@ -11,7 +11,6 @@ import numpy as np
 from infgen.metrics.intervals import scene_mean
 from infgen.metrics.long_term.binned import Binned
 from infgen.metrics.long_term.metric import BUCKETS, bucket_scores, score_binned
-from infgen.metrics.long_term.placement import simulated_events
 from infgen.metrics.long_term.protocols import (
     NUM_FEATURES,
     PLACEMENT,
@@ -21,6 +20,7 @@ from infgen.metrics.long_term.protocols import (
 )
 from infgen.metrics.long_term.radius import live_within
 from infgen.metrics.long_term.table import Against
+from infgen.metrics.placement import simulated_events
 from infgen.rollout.rollout import NEVER, Rollout
 
 RADII_M = tuple(float(radius_m) for radius_m in range(20, 125, 5))

@@ -18,14 +18,16 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from infgen.config import ModelSettings, TokenSettings, TrainSettings
 from infgen.model.batching.crop import SceneWindow, cut_window, disturb, hide_far, look_away
 from infgen.model.batching.insertion_targets import detail_arrays, entry_arrays, turns_of
 from infgen.model.batching.padding import Arrays, pad
+from infgen.model.batching.perturbation import Noise, exchange_roads
+from infgen.model.settings import ModelSettings
 from infgen.model.tensors import map_tensors
+from infgen.model.training_settings import TrainSettings
 from infgen.tokens.grid import make_grid
-from infgen.tokens.perturbation import Noise, exchange_roads
 from infgen.tokens.scene_tokens import Presence, SceneTokens
+from infgen.tokens.settings import TokenSettings
 from infgen.tokens.signals import Lights, remember
 
 T = TypeVar("T")

@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int16, Int64, UInt8
 
-from infgen.config import TokenSettings
+from infgen.model.batching.perturbation import Noise, lead_astray
 from infgen.tokens.grid import Grid, encode_cell, to_grid
 from infgen.tokens.insertion import entry_key
-from infgen.tokens.perturbation import Noise, lead_astray
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, Presence, SceneTokens
+from infgen.tokens.settings import TokenSettings
 from infgen.tokens.signals import remember
 
 

@@ -7,9 +7,9 @@ can divide every part by the weights of the whole before any of it is computed.
 import torch
 from torch import Tensor
 
-from infgen.config import TrainSettings
 from infgen.model.batching.batch import Batch, Roads
 from infgen.model.training.losses import motion_mask, pattern_mask, stay_mask
+from infgen.model.training_settings import TrainSettings
 from infgen.tokens.scene_tokens import Presence
 
 TERMS = (

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from infgen.config import TrainSettings
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.logits import (
     DetailOutputs,
@@ -24,6 +23,7 @@ from infgen.model.logits import (
 from infgen.model.neighbours import grid_place
 from infgen.model.network import EGO
 from infgen.model.relations import Rows, wrap_angle
+from infgen.model.training_settings import TrainSettings
 from infgen.tokens.scene_tokens import Presence
 
 

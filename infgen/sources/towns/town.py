@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from infgen.clock import CLOCK
 from infgen.scene import RoadMap
+from infgen.sources.towns.road_users import Body
 from infgen.sources.towns.streets.boxes import clear_way
 from infgen.sources.towns.streets.layouts import draw_layout
 from infgen.sources.towns.streets.markings import (
@@ -28,7 +29,6 @@ from infgen.sources.towns.streets.surroundings import Surroundings, surround
 from infgen.sources.towns.streets.topology import draw_skeleton
 from infgen.sources.towns.traffic.demand import Trip, draw_level, draw_trips, write_routes
 from infgen.sources.towns.traffic.motion import Bodies, follow
-from infgen.sources.towns.traffic.road_users import Body
 from infgen.sources.towns.traffic.simulation import play
 
 WARM_UP_S = 35.0

@@ -11,16 +11,17 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int64
 
 from infgen.clock import CLOCK
-from infgen.config import TokenSettings, VocabSettings
 from infgen.scene import AgentKind
 from infgen.tokens.agents import match_agents
 from infgen.tokens.clustering.kdisks import Items, Space, gap_m
 from infgen.tokens.clustering.motion_samples import NUM_KINDS
 from infgen.tokens.clustering.physical_limits import limits_of, within
+from infgen.tokens.clustering.settings import VocabSettings
 from infgen.tokens.clustering.vocabularies import MoveSpace, Origin, RoadSpace
 from infgen.tokens.grid import make_grid
 from infgen.tokens.map import match_curves
 from infgen.tokens.motion_tokens import make_move_table
+from infgen.tokens.settings import TokenSettings
 from infgen.tokens.tracks import Paths
 from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
 

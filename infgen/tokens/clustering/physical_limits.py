@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from infgen.clock import CLOCK
-from infgen.config import VocabSettings
 from infgen.geometry import rotate, wrap_angle
 from infgen.scene import AgentKind
+from infgen.tokens.clustering.settings import VocabSettings
 
 PEDESTRIAN_MAX_YAW_RATE_RAD_S = 2 * np.pi
 """A pedestrian turns round on the spot within one move; others obey the setting."""

@@ -11,13 +11,13 @@ from enum import IntEnum
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8
 
-from infgen.config import VocabSettings
 from infgen.geometry import box_corners
 from infgen.tokens.clustering.kdisks import Items, Space, gap_m, lay_disks
 from infgen.tokens.clustering.made_map_samples import line_arcs
 from infgen.tokens.clustering.made_motion_samples import fan
 from infgen.tokens.clustering.motion_samples import NUM_KINDS, Segments
 from infgen.tokens.clustering.physical_limits import MotionLimits, limits_of, within
+from infgen.tokens.clustering.settings import VocabSettings
 from infgen.tokens.vocabulary import BOX_LW_M, ROAD_SAMPLES, MotionCodebook, RoadCodebook
 
 ANCHOR_M = 0.5

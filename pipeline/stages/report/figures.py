@@ -73,8 +73,8 @@ def score_charts(summary: Mapping[str, Any], curves: Curves) -> list[str]:
 
 def first_played(inputs: Inputs) -> Played | None:
     """Read the first rollout there is, and its scene."""
-    from pipeline.stages.ingest import read_scenes  # noqa: PLC0415
-    from pipeline.stages.rollout import read_rollouts  # noqa: PLC0415
+    from pipeline.storage.rollouts import read_rollouts  # noqa: PLC0415
+    from pipeline.storage.scenes import read_scenes  # noqa: PLC0415
 
     logs = {done.name: done for done in inputs.units("ingest")}
     for done in inputs.units("rollout"):

@@ -35,7 +35,7 @@ def write_players(
     """
     from infgen.views.player import player_page  # noqa: PLC0415
     from infgen.views.scene.view_model import make_film  # noqa: PLC0415
-    from pipeline.commands.view import file_name  # noqa: PLC0415
+    from pipeline.storage.scenes import file_name  # noqa: PLC0415
 
     places = dict(_places(inputs)) if most and lowest else {}
     pages: list[str] = []
@@ -65,8 +65,8 @@ def _places(inputs: Inputs) -> Iterator[tuple[str, Place]]:
 
 
 def _read(place: Place, scenario_id: str, index: int) -> "tuple[Scene, Rollout]":
-    from pipeline.stages.ingest import read_scenes  # noqa: PLC0415
-    from pipeline.stages.rollout import read_rollouts  # noqa: PLC0415
+    from pipeline.storage.rollouts import read_rollouts  # noqa: PLC0415
+    from pipeline.storage.scenes import read_scenes  # noqa: PLC0415
 
     rollout = next(
         one

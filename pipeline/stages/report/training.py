@@ -2,8 +2,9 @@
 
 On its own: ``python -m pipeline.stages.report.training RUN... --out curves.svg`` compares
 runs. A run is a log, a folder that holds one (a stage's, or a unit's that is still
-training), or the root of an experiment, with a name before it if wanted: ``SMART=work/smart``. The suffix
-of ``--out`` says what is written: one drawing (``.svg``) or a page (``.html``).
+training), or the root of an experiment, with a name before it if
+wanted: ``SMART=work/smart``. The suffix of ``--out`` says what is written: one drawing
+(``.svg``) or a page (``.html``).
 """
 
 import sys

@@ -20,8 +20,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from infgen.model.batching.batch import Batch, Limits, collate
+from infgen.model.batching.perturbation import Noise
 from infgen.model.tensors import map_tensors
-from infgen.tokens.perturbation import Noise
 from infgen.tokens.scene_tokens import SceneTokens
 from pipeline.stages.tokenize import open_tokens
 from pipeline.stages.train.sampler import Order

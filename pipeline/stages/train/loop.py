@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from infgen.tokens.perturbation import Noise, make_noise
+from infgen.model.batching.perturbation import Noise, make_noise
 from pipeline.engine import signals
 from pipeline.engine.signals import Stopped
 from pipeline.engine.stage import Progress

@@ -7,7 +7,7 @@ but sums of numbers.
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -135,15 +135,16 @@ def called_together(work: Mapping[str, Any], timeout_s: float) -> Iterator[Team]
         yield team
 
 
-def follow() -> None:
+def follow(take_part: Callable[[Mapping[str, Any], Team], None]) -> None:
     """Take part in whatever the first process calls for, until it is done.
+
+    Args:
+        take_part: Does one piece of work with the others.
 
     Raises:
         PeerError: if the first process is gone.
         Stopped: if the run is stopped.
     """
-    from pipeline.stages.train.stage import take_part  # noqa: PLC0415
-
     with signals.listening():
         while (call := _next_call()) is not None:
             with signals.patient(), _team(call["timeout_s"]) as team:

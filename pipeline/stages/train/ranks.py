@@ -1,13 +1,6 @@
-"""Several processes of one training run: which one this is, and what the others do.
+"""The rank of this process among those that train together."""
 
-``torchrun -m infgen train ...`` starts the same command several times. The first process
-does as it is told; the others know nothing of stages, locks or logs: they wait until the
-first one trains, take part in that, and leave when it does. Light to import: without
-``torchrun`` none of this costs anything.
-"""
-
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 
@@ -41,32 +34,11 @@ def own_rank() -> Rank:
     return _STATE.rank
 
 
-def run(command: Callable[[], None], environ: Mapping[str, str]) -> None:
-    """Run a command in the first process; any other takes part where it is called."""
-    with joined(environ) as first:
-        if first:
-            command()
-
-
-@contextmanager
-def joined(environ: Mapping[str, str]) -> Iterator[bool]:
-    """Find this process's place among others, as ``torchrun`` tells it.
-
-    Yields:
-        True for the first process, or the only one: it does what it is told. Any other has
-        by then taken part in all there was.
-    """
+def find_rank(environ: Mapping[str, str]) -> Rank:
+    """Read this process's rank from the variables that ``torchrun`` sets, and keep it."""
     number, count, local = (
         int(environ.get(name, default))
         for name, default in (("RANK", "0"), ("WORLD_SIZE", "1"), ("LOCAL_RANK", "0"))
     )
     _STATE.rank = Rank(number, count, local)
-    if count == 1:
-        yield True
-        return
-    from pipeline.stages.train import process_group  # noqa: PLC0415
-
-    with process_group.met():
-        if number:
-            process_group.follow()
-        yield number == 0
+    return _STATE.rank

@@ -9,8 +9,8 @@ from infgen.metrics.long_term.metric import score_binned
 from infgen.metrics.long_term.protocols import PROTOCOLS, ROW, STEP_FEATURES
 from infgen.metrics.long_term.reference import count_log, log_probabilities
 from infgen.metrics.long_term.table import Against, LogCounts, make_row
-from infgen.metrics.long_term.windows import cut_windows
 from infgen.metrics.traffic import LOGGED, from_log
+from infgen.metrics.windows import cut_windows
 from infgen.scene import FeatureKind, Tracks
 from infgen.spatial.road_edges import edges_of
 

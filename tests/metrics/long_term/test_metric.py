@@ -25,7 +25,7 @@ from infgen.metrics.long_term.reference import (
     log_probabilities,
     no_counts,
 )
-from infgen.metrics.long_term.windows import cut_windows
+from infgen.metrics.windows import cut_windows
 
 PAPER, CORRECTED = range(2)
 ONE = cut_windows(80, 8.0, 0.5)

@@ -14,8 +14,8 @@ from infgen.metrics.long_term.tune_radius import (
     best_radius_m,
     placement_by_radius,
 )
-from infgen.metrics.long_term.windows import cut_windows
 from infgen.metrics.traffic import from_log, from_rollout
+from infgen.metrics.windows import cut_windows
 from infgen.spatial.road_edges import edges_of
 from tests.pipeline.stages.test_score import as_rollout
 

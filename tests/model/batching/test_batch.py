@@ -11,9 +11,9 @@ from infgen.model.batching.batch import collate, collate_roads, to_device
 from infgen.model.batching.crop import cut_window, hide_far
 from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.batching.padding import NOBODY
+from infgen.model.batching.perturbation import make_noise
 from infgen.tokens.grid import decode_cell, encode_cell, from_grid, make_grid, to_grid
 from infgen.tokens.motion_tokens import advance, make_move_table, nearest_moves
-from infgen.tokens.perturbation import make_noise
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
 from infgen.tokens.signals import REMEMBERED
 

@@ -23,14 +23,16 @@ from infgen.scene import AgentKind, Scene, Signals, SignalState
 from infgen.sources.tfrecord import iter_records
 from infgen.sources.womd import decode_scene
 from infgen.sources.womd_write import encode_scenario, write_tfrecord
-from pipeline.commands.export import FORMATS, ExportError, Order, export
+from pipeline.commands.export import FORMATS, export
+from pipeline.commands.export_job import ExportError, Order
 from pipeline.commands.export_wosac import read_about
 from pipeline.commands.wosac import score_files
 from pipeline.engine.atomic import StoreError, write_json
 from pipeline.engine.layout import Root
 from pipeline.engine.locks import PATIENCE_S, LockedError, locked
 from pipeline.engine.stage import Unit
-from pipeline.stages import ingest, rollout
+from pipeline.stages import ingest
+from pipeline.storage.rollouts import ROLLOUTS_SCHEMA, read_rollouts
 from pipeline.storage.scene_lookup import open_logs
 from pipeline.storage.zarr_store import write_records
 from tests.exports.replays import replay, with_newcomer, without
@@ -65,7 +67,7 @@ def keep(folder: Path, rollouts) -> Path:
     """Write rollouts as a unit of our store."""
     folder.mkdir(parents=True)
     path = folder / "rollouts-000.zarr"
-    write_records(path, rollouts, Rollout, rollout.SCHEMA, compress=True)
+    write_records(path, rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True)
     index = {
         "scenario_id": [one.scenario_id for one in rollouts],
         "rollout": [one.index for one in rollouts],
@@ -289,7 +291,7 @@ def test_a_unit_that_lost_rollouts_is_damaged_and_nothing_is_exported(
     unit = keep(tmp_path / "unit", many(scenes[0]))
     shutil.rmtree(unit / "rollouts-000.zarr")
     kept = many(scenes[0])[:31]
-    write_records(unit / "rollouts-001.zarr", kept, Rollout, rollout.SCHEMA, compress=True)
+    write_records(unit / "rollouts-001.zarr", kept, Rollout, ROLLOUTS_SCHEMA, compress=True)
 
     with pytest.raises(StoreError, match=f"rollouts of scene {scenes[0].scenario_id}"):
         export(replace(order, to=to, rollouts=unit))
@@ -311,7 +313,7 @@ def test_parquet_has_a_partition_per_scene_and_all_rows(few, logs, scenes, tmp_p
     names = {str(p.relative_to(order.out)) for p in order.out.rglob("*") if p.is_file()}
     assert names == {f"scenario_id={s.scenario_id}/rollouts.parquet" for s in scenes}
     table = pl.scan_parquet(order.out, hive_partitioning=True).collect()
-    rollouts = list(rollout.read_rollouts(few))
+    rollouts = list(read_rollouts(few))
     assert len(table) == sum(int(one.valid.sum()) for one in rollouts)
     one = rollouts[3]
     rows = table.filter(

@@ -10,11 +10,12 @@ from cli import main
 from infgen.config import ConfigError
 from infgen.rollout.rollout import Rollout
 from infgen.views.player.payload import unpack
-from pipeline.commands.view import Wanted, file_name, find_film, view
+from pipeline.commands.view import Wanted, find_film, view
 from pipeline.commands.view_scenes import choose
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import Root, link
-from pipeline.stages import rollout
+from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
+from pipeline.storage.scenes import file_name
 from pipeline.storage.zarr_store import write_records
 from tests.exports.replays import replay, with_newcomer
 
@@ -48,7 +49,7 @@ def played(ingested, scenes, tmp_path_factory):
         folder.mkdir(parents=True)
         rollouts = [with_newcomer(replay(scene, i), 30 + i) for i in range(COUNT)]
         write_records(
-            folder / "rollouts-000.zarr", rollouts, Rollout, rollout.SCHEMA, compress=True
+            folder / "rollouts-000.zarr", rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True
         )
         units.append((name, key, scene.scenario_id))
     made = root.folder("rollout", KEY)

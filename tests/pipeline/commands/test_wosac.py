@@ -15,7 +15,8 @@ from infgen.metrics.wosac.submission import Refused
 from infgen.rollout.rollout import Rollout
 from pipeline.commands.wosac import score_files
 from pipeline.engine.stage import Unit
-from pipeline.stages import ingest, rollout
+from pipeline.stages import ingest
+from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
 from pipeline.storage.zarr_store import write_records
 from tests.metrics.golden import GOLDEN, golden_metrics, needs_goldens
 from tests.metrics.wosac.test_submission import scenario, submission
@@ -52,7 +53,7 @@ def keep(folder, rollouts):
     """Write rollouts as a unit of our store."""
     folder.mkdir(parents=True)
     path = folder / "rollouts-000.zarr"
-    write_records(path, rollouts, Rollout, rollout.SCHEMA, compress=True)
+    write_records(path, rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True)
     index = pl.DataFrame({"scenario_id": [one.scenario_id for one in rollouts]})
     index.write_parquet(folder / "index.parquet")
     return folder

@@ -11,8 +11,9 @@ from pipeline.comparison.execution import Ran, run_legs
 from pipeline.comparison.records import find_records
 from pipeline.comparison.runs import Comparison, legs_of
 from pipeline.comparison.write import write_comparison
+from pipeline.engine.atomic import MANIFEST
 from pipeline.engine.events import Events
-from pipeline.engine.layout import MANIFEST, Root, read_json
+from pipeline.engine.layout import Root, read_json
 from pipeline.engine.runner import Orders
 from pipeline.settings.request import LAST, recall
 from pipeline.settings.stages_file import load_stages

@@ -7,13 +7,13 @@ import time
 import pytest
 
 from pipeline.engine.atomic import (
+    MANIFEST,
     StoreError,
     publish,
     remove_folder,
     write_file,
     write_json,
 )
-from pipeline.engine.layout import MANIFEST
 
 
 def test_a_folder_appears_only_when_all_is_written(tmp_path):

@@ -8,6 +8,7 @@ from pipeline.engine.atomic import remove_folder
 from pipeline.engine.garbage import PARTIAL_AGE_S, find_garbage, sweep
 from pipeline.engine.locks import LockedError, locked
 from pipeline.engine.runner import Orders
+from pipeline.settings.request import named_weights
 
 
 def kinds(garbage):
@@ -125,7 +126,7 @@ def test_weights_that_a_request_starts_from_are_kept(trainer):
     start = f"train.start={first[:16]}"
     trainer.run(start)
 
-    assert sweep(trainer.root) == []
+    assert sweep(trainer.root, named_weights(trainer.root)) == []
 
     assert trainer.run(start)["train"].state == "cached"
 
@@ -139,7 +140,7 @@ def test_weights_that_only_a_profile_starts_from_are_kept(trainer):
     request.remember(request.plan((), {}))
     trainer.run("train.seed=3")
 
-    assert sweep(trainer.root) == []
+    assert sweep(trainer.root, named_weights(trainer.root)) == []
 
     assert request.plan((), {})["train"].sources
 
@@ -151,7 +152,7 @@ def test_weights_are_kept_by_their_folder_and_for_a_stage_not_made_yet(trainer):
     plan = trainer.plan("train.seed=3")
     trainer.request(f"build-vocab.start={folder}").remember(plan)
 
-    assert sweep(trainer.root) == []
+    assert sweep(trainer.root, named_weights(trainer.root)) == []
 
 
 def test_weights_that_nothing_starts_from_any_more_are_garbage(trainer):
@@ -159,6 +160,6 @@ def test_weights_that_nothing_starts_from_any_more_are_garbage(trainer):
     trainer.run(f"train.start={first}")
     trainer.run("train.seed=3")
 
-    found = {each.path.name for each in sweep(trainer.root)}
+    found = {each.path.name for each in sweep(trainer.root, named_weights(trainer.root))}
 
     assert first in found

@@ -3,9 +3,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from infgen.config import ConfigError
-from pipeline.engine.plan import PlanError, digest, needed, placeless
+from pipeline.engine.plan import PlanError, StageEntry, digest, needed, placeless
 from pipeline.engine.stage import Unit
-from pipeline.settings.stages_file import StageEntry
 
 
 def graph(**deps):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.engine.layout import MANIFEST
+from pipeline.engine.atomic import MANIFEST
 from pipeline.engine.locks import LockedError, locked
 from pipeline.engine.manifest import read_manifest, verify
 from pipeline.engine.plan import PlanError

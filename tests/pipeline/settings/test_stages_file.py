@@ -11,9 +11,9 @@ from infgen.config import (
     decisive,
 )
 from infgen.model.network import Network
-from pipeline.engine.plan import needed
+from pipeline.engine.plan import SOURCES, needed
 from pipeline.engine.registry import MODULES, load_stage
-from pipeline.settings.stages_file import DEFAULT_FILE, SOURCES, load_stages
+from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
 
 OWN_FILE = Path(__file__).parents[3] / "stages.yaml"
 GOOD = """\

@@ -11,9 +11,9 @@ from infgen.scene import Scene
 from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import Done
 from pipeline.stages import calibrate as stage
-from pipeline.stages import ingest
 from pipeline.stages.calibration import Biases, read_found
 from pipeline.stages.flow_response import DESIGN
+from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.zarr_store import write_records
 from tests.conftest import straight_road
 from tests.pipeline.finished import Finished
@@ -46,7 +46,7 @@ def inputs(tmp_path, weights, drive, crossing, parked):
         folder = tmp_path / name
         folder.mkdir()
         path = folder / "scenes-000.zarr"
-        write_records(path, scenes, Scene, ingest.SCHEMA, compress=True)
+        write_records(path, scenes, Scene, SCENES_SCHEMA, compress=True)
         done.append(Done(name, f"key of {name}", folder, {"scenes": len(scenes)}))
     return Finished(done, weights)
 
@@ -146,7 +146,7 @@ def test_a_rollout_counts_until_its_ego_leaves_the_map(inputs, drive, tmp_path, 
     folder.mkdir()
     scene = drive(road_map=straight_road(10.0))
     path = folder / "scenes-000.zarr"
-    write_records(path, [scene], Scene, ingest.SCHEMA, compress=True)
+    write_records(path, [scene], Scene, SCENES_SCHEMA, compress=True)
     short = Done("training.tfrecord-9", "key", folder, {"scenes": 1})
     every = stage.narrow(with_settings("calibrate", scenes=0, scenes_per_task=99))
     unit = stage.plan(Finished([short], inputs.weights), every)[0]

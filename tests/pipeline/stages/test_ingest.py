@@ -12,7 +12,8 @@ from infgen.sources.tfrecord import frame
 from infgen.sources.womd import decode_scene
 from pipeline.engine.stage import Done, Inputs, Source, Unit
 from pipeline.stages import ingest
-from pipeline.stages.ingest import STAGE, read_scenes
+from pipeline.stages.ingest import STAGE
+from pipeline.storage.scenes import read_scenes
 from tests.sources.records import changed, small_scenario, write_tfrecord
 from tests.sources.test_womd import differences, twin_tracks
 

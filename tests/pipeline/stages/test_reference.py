@@ -9,8 +9,8 @@ from infgen.config import ReferenceSettings, TokenSettings
 from infgen.metrics.agent_count import mean_counts
 from infgen.metrics.long_term.binned import bin_traffic
 from infgen.metrics.long_term.reference import add_up, count_log
-from infgen.metrics.long_term.windows import cut_windows
 from infgen.metrics.traffic import from_log
+from infgen.metrics.windows import cut_windows
 from infgen.spatial.road_edges import edges_of
 from pipeline.stages import reference
 from pipeline.stages.reference_files import (

@@ -9,9 +9,10 @@ from infgen.config import RolloutSettings, TokenSettings
 from infgen.model.network import Network
 from infgen.scene import Scene
 from pipeline.engine.stage import Done
-from pipeline.stages import ingest
 from pipeline.stages import rollout as stage
 from pipeline.stages.calibration import Biases, write_found
+from pipeline.storage.rollouts import read_rollouts
+from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.weights import save_network, state_of
 from pipeline.storage.zarr_store import write_records
 from tests.pipeline.finished import TINY, Finished
@@ -38,7 +39,7 @@ def inputs(tmp_path, weights, drive, crossing, parked):
     ):
         folder = tmp_path / name
         folder.mkdir()
-        write_records(folder / "scenes-000.zarr", part, Scene, ingest.SCHEMA, compress=True)
+        write_records(folder / "scenes-000.zarr", part, Scene, SCENES_SCHEMA, compress=True)
         done.append(Done(name, f"key of {name}", folder, {"scenes": len(part)}))
     return Finished(done, weights)
 
@@ -46,7 +47,7 @@ def inputs(tmp_path, weights, drive, crossing, parked):
 def play(unit, folder, settings=SETTINGS):
     folder.mkdir()
     report = stage.STAGE.work(unit, folder, settings, no_progress)
-    return report, list(stage.read_rollouts(folder))
+    return report, list(read_rollouts(folder))
 
 
 def test_the_split_is_cut_into_units_of_a_few_scenes(inputs):
@@ -200,7 +201,7 @@ def test_agents_far_away_are_played_where_everyone_is_asked_for(
     folder = tmp_path / "validation.tfrecord-0"
     folder.mkdir()
     scene = build_scene(path, [0, 0])
-    write_records(folder / "scenes-000.zarr", [scene], Scene, ingest.SCHEMA, compress=True)
+    write_records(folder / "scenes-000.zarr", [scene], Scene, SCENES_SCHEMA, compress=True)
     inputs = Finished([Done(folder.name, "key", folder, {"scenes": 1})], weights)
     settings = dataclasses.replace(SETTINGS, everyone=everyone, insert=False, remove=False)
 

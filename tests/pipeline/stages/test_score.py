@@ -11,7 +11,9 @@ from infgen.metrics.long_term.protocols import FEATURES, PROTOCOLS
 from infgen.rollout.rollout import NEVER, Rollout
 from infgen.scene import Scene
 from pipeline.engine.stage import Done
-from pipeline.stages import ingest, reference, rollout, score
+from pipeline.stages import reference, score
+from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
+from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.zarr_store import write_records
 
 STEPS = 91
@@ -95,14 +97,14 @@ def as_rollout(scene: Scene, index: int = 0, shift_m: float = 0.0, steps=None) -
 
 def ingested(folder: Path, scenes, name=SOURCE) -> Done:
     folder.mkdir(parents=True)
-    write_records(folder / "scenes-000.zarr", scenes, Scene, ingest.SCHEMA, compress=True)
+    write_records(folder / "scenes-000.zarr", scenes, Scene, SCENES_SCHEMA, compress=True)
     return Done(name, f"key of {name}", folder, {"scenes": len(scenes)})
 
 
 def played(folder: Path, rollouts, name=f"{SOURCE}-00000") -> Done:
     folder.mkdir(parents=True)
     path = folder / "rollouts-000.zarr"
-    write_records(path, rollouts, Rollout, rollout.SCHEMA, compress=True)
+    write_records(path, rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True)
     index = pl.DataFrame({"scenario_id": [one.scenario_id for one in rollouts]})
     index.write_parquet(folder / "index.parquet")
     return Done(name, f"key of {name}", folder, {"rollouts": len(rollouts)})

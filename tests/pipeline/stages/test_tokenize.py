@@ -13,8 +13,9 @@ from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
 from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
 from pipeline.engine.stage import Done, Unit
-from pipeline.stages import ingest, vocabulary
 from pipeline.stages import tokenize as stage
+from pipeline.stages import vocabulary
+from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.zarr_store import open_group, write_records
 
 SETTINGS = TokenSettings()
@@ -76,7 +77,7 @@ def ingested(tmp_path, scenes):
     ):
         folder = tmp_path / name
         folder.mkdir()
-        write_records(folder / "scenes-000.zarr", part, Scene, ingest.SCHEMA, compress=True)
+        write_records(folder / "scenes-000.zarr", part, Scene, SCENES_SCHEMA, compress=True)
         done.append(Done(name, f"key of {name}", folder, {"scenes": len(part)}))
     return done
 

@@ -14,6 +14,7 @@ from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import Done, Unit
 from pipeline.stages import ingest, vocabulary
 from pipeline.stages.vocabulary import load_codebooks
+from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.weights import vocabulary_fingerprint
 from pipeline.storage.zarr_store import write_records
 
@@ -55,7 +56,7 @@ def ingested(folder, files):
     for name, scenes in files.items():
         path = folder / name
         path.mkdir(parents=True)
-        write_records(path / "scenes-000.zarr", scenes, Scene, ingest.SCHEMA, compress=True)
+        write_records(path / "scenes-000.zarr", scenes, Scene, SCENES_SCHEMA, compress=True)
         done.append(Done(name, f"key of {name}", path, {"scenes": len(scenes)}))
     return Ingested(done)
 

@@ -19,8 +19,8 @@ from pipeline.engine.runner import Orders, run
 from pipeline.engine.stage import Done
 from pipeline.settings.request import Request
 from pipeline.settings.stages_file import DEFAULT_FILE
-from pipeline.stages import ingest
 from pipeline.storage.duplicates import read_scenes_of, rows_that_count, scenes_of
+from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.splits import spread
 from pipeline.storage.zarr_store import write_records
 from tests.sources.records import write_tfrecord
@@ -40,7 +40,7 @@ def ingested(tmp_path, scenes):
     """A file of three scenes in two groups."""
     for at, part in enumerate((scenes[:2], scenes[2:])):
         path = tmp_path / f"scenes-00{at}.zarr"
-        write_records(path, part, Scene, ingest.SCHEMA, compress=True)
+        write_records(path, part, Scene, SCENES_SCHEMA, compress=True)
     return tmp_path
 
 

@@ -13,8 +13,9 @@ from infgen.scene import Scene
 from pipeline.engine.atomic import StoreError, write_json
 from pipeline.engine.layout import Root
 from pipeline.engine.stage import Done
-from pipeline.stages import ingest, vocabulary
+from pipeline.stages import vocabulary
 from pipeline.storage.initial_weights import ABOUT, WEIGHTS, find_start
+from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.weights import load_codebooks, load_network, read_about, take_weights
 from pipeline.storage.weights import vocabulary_fingerprint as fingerprint
 from pipeline.storage.zarr_store import write_records
@@ -112,7 +113,7 @@ def test_codebooks_are_those_of_the_weights_and_measured_on_the_records(tmp_path
         path = tmp_path / f"{split}.tfrecord-0"
         path.mkdir()
         scenes = [drive(speed_mps=speed_mps)]
-        write_records(path / "scenes-000.zarr", scenes, Scene, ingest.SCHEMA, compress=True)
+        write_records(path / "scenes-000.zarr", scenes, Scene, SCENES_SCHEMA, compress=True)
         files.append(Done(path.name, "key", path, {"scenes": 1}))
     inputs = Files(files, vocabulary.reads(tmp_path, settings))
     units = []

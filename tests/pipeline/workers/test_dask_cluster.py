@@ -12,9 +12,8 @@ import pytest
 from infgen.config import ConfigError
 from pipeline.engine.locks import LockedError
 from pipeline.engine.runner import Orders
-from pipeline.engine.units import InProcess
-from pipeline.workers.dask_cluster import Workers, gpu_workers, parse, pick_gpus
-from pipeline.workers.scheduling import WorkersLostError
+from pipeline.engine.units import InProcess, WorkersLostError
+from pipeline.workers.dask_cluster import DaskWorkers, gpu_workers, parse, pick_gpus
 from tests.clusters import Cluster
 
 # Dask leaves sockets and child processes to the garbage collector when it closes.
@@ -44,11 +43,11 @@ def test_words_name_a_kind_of_workers(words, parts):
 )
 def test_other_words_are_refused_before_anything_runs(words):
     with pytest.raises(ConfigError, match=r"expected none \| local"):
-        Workers(words)
+        DaskWorkers(words)
 
 
 def test_no_cluster_is_started_for_a_stage_that_must_run_here():
-    with Workers("tcp://127.0.0.1:1") as workers:
+    with DaskWorkers("tcp://127.0.0.1:1").open() as workers:
         assert isinstance(workers.executor(here=True), InProcess)
 
 
@@ -56,7 +55,10 @@ def test_without_a_device_gpu_workers_are_refused():
     torch = pytest.importorskip("torch")
     if torch.cuda.is_available():
         pytest.skip("this machine has a CUDA device")
-    with Workers("gpu") as workers, pytest.raises(ConfigError, match="no CUDA device"):
+    with (
+        DaskWorkers("gpu").open() as workers,
+        pytest.raises(ConfigError, match="no CUDA device"),
+    ):
         workers.executor(here=False)
 
 
@@ -110,7 +112,9 @@ def test_workers_write_the_same_bytes_as_this_process(workshop):
         workshop.text(f"{number}.txt", "word " * number)
     workshop.run()
     here = workshop.files()
-    results = workshop.run(orders=Orders(force=frozenset({"count"}), workers="local:2"))
+    results = workshop.run(
+        orders=Orders(force=frozenset({"count"}), workers=DaskWorkers("local:2"))
+    )
 
     assert {result.state for result in results.values()} == {"made"}
     assert results["count"].made == 8
@@ -121,7 +125,7 @@ def test_workers_write_the_same_bytes_as_this_process(workshop):
 def test_a_unit_that_fails_or_kills_its_worker_is_recorded_and_the_rest_goes_on(workshop):
     workshop.text("c.txt", "fail")
     workshop.text("d.txt", "die")
-    orders = Orders(workers="local:2", keep_going=True)
+    orders = Orders(workers=DaskWorkers("local:2"), keep_going=True)
 
     results = workshop.run(orders=orders, targets=("count",))
 
@@ -182,7 +186,7 @@ def done_units(workshop):
 def test_a_cluster_that_is_already_there_is_used(workshop, cluster):
     words, _ = cluster()
 
-    results = workshop.run(orders=Orders(workers=words))
+    results = workshop.run(orders=Orders(workers=DaskWorkers(words)))
 
     assert results["count"].made == 2
 
@@ -192,7 +196,10 @@ def test_a_killed_worker_is_told_of_and_its_unit_begins_again(workshop, cluster)
     words, started = cluster(workers=1)
     events = []
     job = functools.partial(
-        workshop.run, "count.sleep_s=3", orders=Orders(workers=words), events=events
+        workshop.run,
+        "count.sleep_s=3",
+        orders=Orders(workers=DaskWorkers(words)),
+        events=events,
     )
 
     running, found = in_background(job)
@@ -212,7 +219,7 @@ def test_a_worker_that_fills_its_memory_is_restarted_and_told_of(workshop, clust
     workshop.text("c.txt", "hoard")
     workshop.text("d.txt", "after it")
     events = []
-    orders = Orders(workers=words, keep_going=True)
+    orders = Orders(workers=DaskWorkers(words), keep_going=True)
 
     results = workshop.run(orders=orders, targets=("count",), events=events)
 
@@ -240,7 +247,7 @@ def test_a_scheduler_that_is_not_there_ends_the_run(workshop, monkeypatch, words
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
         pytest.raises(WorkersLostError, match=says),
     ):
-        workshop.run(orders=Orders(workers=words))
+        workshop.run(orders=Orders(workers=DaskWorkers(words)))
 
 
 @pytest.mark.slow
@@ -248,7 +255,7 @@ def test_a_lost_scheduler_ends_the_run_and_the_next_one_goes_on(workshop, cluste
     for number in range(4):
         workshop.text(f"{number}.txt", "word " * number)
     words, started = cluster(workers=2)
-    orders = Orders(workers=words, keep_going=True)
+    orders = Orders(workers=DaskWorkers(words), keep_going=True)
     running, found = in_background(
         functools.partial(
             workshop.run, "count.sleep_s=2", orders=orders, targets=("count",)
@@ -280,7 +287,9 @@ def test_a_scheduler_that_hangs_ends_the_run(workshop, cluster, monkeypatch):
     monkeypatch.setattr("pipeline.workers.dask_cluster.CLOSE_S", 2.0)
     words, started = cluster()
     running, found = in_background(
-        functools.partial(workshop.run, "count.sleep_s=3", orders=Orders(workers=words))
+        functools.partial(
+            workshop.run, "count.sleep_s=3", orders=Orders(workers=DaskWorkers(words))
+        )
     )
     wait_for(lambda: list(workshop.root.units("count").glob("*.partial")))
 

@@ -11,7 +11,7 @@ from queue import SimpleQueue
 import pytest
 
 from pipeline.engine.stage import Unit
-from pipeline.engine.units import Outcome, Task
+from pipeline.engine.units import Outcome, Task, WorkersLostError
 from pipeline.workers import scheduling
 from pipeline.workers.scheduling import (
     Broken,
@@ -20,7 +20,6 @@ from pipeline.workers.scheduling import (
     Full,
     Lost,
     Share,
-    WorkersLostError,
 )
 
 

@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from infgen.geometry import to_local
+from infgen.sources.towns.road_users import MOTOR_SHARES, Body, draw_size
 from infgen.sources.towns.streets import curves
 from infgen.sources.towns.streets.boxes import Boxes, meet
 from infgen.sources.towns.streets.curves import Points
 from infgen.sources.towns.streets.network import Edge
 from infgen.sources.towns.streets.street_types import Rank, Street
-from infgen.sources.towns.traffic.road_users import MOTOR_SHARES, Body, draw_size
 
 CLEAR_M = 1.0
 """Nothing stands nearer to a kerb, but what is parked along it."""

@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from infgen.scene import AgentKind
+from infgen.sources.towns.road_users import Body, draw_size
 from infgen.sources.towns.streets import curves
 from infgen.sources.towns.streets.boxes import Boxes
 from infgen.sources.towns.streets.curves import Points
 from infgen.sources.towns.streets.network import Edge, Network, Use
 from infgen.sources.towns.streets.plots import Plenty, Site, build_on, cut_plots
 from infgen.sources.towns.streets.street_types import Street
-from infgen.sources.towns.traffic.road_users import Body, draw_size
 
 _KERB_SPACING_M = 3.0
 _FREE_ENDS_M = 9.0

@@ -7,14 +7,14 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
-from infgen.sources.towns.streets.network import Network
-from infgen.sources.towns.traffic.road_users import (
+from infgen.sources.towns.road_users import (
     Body,
     Person,
     draw_cyclist,
     draw_motorist,
     draw_walker,
 )
+from infgen.sources.towns.streets.network import Network
 from infgen.sources.towns.traffic.trips import Ways, find_walks, find_ways
 
 FASTEST_MPS = 14.0

@@ -24,9 +24,11 @@ from infgen.sources.towns import builtin_records
 from infgen.sources.womd import iter_scenes
 from pipeline.engine.atomic import write_json
 from pipeline.engine.stage import Done, Stage
-from pipeline.stages import ingest, reference, rollout, score
+from pipeline.stages import reference, score
 from pipeline.stages.reference_files import read_counts
 from pipeline.stages.report import stage as report
+from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
+from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.zarr_store import write_records
 
 SECONDS, SCENES = 12, 2
@@ -136,10 +138,10 @@ def finished(root: Path) -> Inputs:
     for done in (logs, played):
         done.path.mkdir(parents=True)
     write_records(
-        logs.path / "scenes-000.zarr", scenes, Scene, ingest.SCHEMA, compress=True
+        logs.path / "scenes-000.zarr", scenes, Scene, SCENES_SCHEMA, compress=True
     )
     write_records(
-        played.path / "rollouts-000.zarr", rollouts, Rollout, rollout.SCHEMA, compress=True
+        played.path / "rollouts-000.zarr", rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True
     )
     ids = pl.DataFrame({"scenario_id": [one.scenario_id for one in rollouts]})
     ids.write_parquet(played.path / "index.parquet")

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from infgen.model.batching.perturbation import make_noise
 from infgen.model.tensors import map_tensors
-from infgen.tokens.perturbation import make_noise
 from pipeline.stages.train.loader import (
     TokenScenes,
     draw_of_step,

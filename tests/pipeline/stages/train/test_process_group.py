@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from pipeline.stages.train.launch import joined
 from pipeline.stages.train.process_group import PeerError, Team
-from pipeline.stages.train.ranks import Rank, joined, own_rank
+from pipeline.stages.train.ranks import Rank, own_rank
 from pipeline.stages.train.stage import work
 from pipeline.stages.train.train_log import read_log
 from pipeline.storage.checkpoint import POINTER
@@ -26,8 +27,8 @@ SCRIPT = """
 import json, os, sys
 from pathlib import Path
 from infgen.config import build
-from pipeline import stopping
-from pipeline.stages.train.ranks import joined
+from pipeline.engine import signals
+from pipeline.stages.train.launch import joined
 from pipeline.engine.stage import Unit
 from pipeline.stages.train.stage import STAGE, work
 
@@ -37,12 +38,12 @@ settings = {k: build(STAGE.settings[k], v, k) for k, v in settings.items()}
 
 def tell(done, total, note=""):
     print(done, flush=True)
-    stopping.check()
+    signals.check()
 
 
-with joined(os.environ) as first, stopping.listening():
+with joined(os.environ) as first, signals.listening():
     if first and task:
-        with stopping.patient():
+        with signals.patient():
             work(Unit("weights", {}, task), Path(target), settings, tell)
 """
 

@@ -18,8 +18,8 @@ import torch
 
 from infgen.config import ConfigError
 from pipeline.engine import signals
-from pipeline.engine.atomic import StoreError
-from pipeline.engine.layout import MANIFEST, RUN_FOLDER
+from pipeline.engine.atomic import MANIFEST, StoreError
+from pipeline.engine.layout import RUN_FOLDER
 from pipeline.engine.manifest import list_files
 from pipeline.engine.signals import Stopped
 from pipeline.engine.stage import Done, Source

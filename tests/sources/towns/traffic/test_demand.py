@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from infgen.scene import AgentKind
+from infgen.sources.towns.road_users import (
+    Body,
+    draw_hesitation,
+    draw_motorist,
+    draw_size,
+)
 from infgen.sources.towns.traffic.demand import (
     NUM_WANDERERS,
     Level,
     draw_level,
     draw_trips,
     write_routes,
-)
-from infgen.sources.towns.traffic.road_users import (
-    Body,
-    draw_hesitation,
-    draw_motorist,
-    draw_size,
 )
 from infgen.sources.towns.traffic.trips import Ways, find_walks, find_ways
 

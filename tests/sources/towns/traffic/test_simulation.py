@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from infgen.sources.towns.road_users import draw_motorist
 from infgen.sources.towns.traffic.demand import Trip, write_routes
-from infgen.sources.towns.traffic.road_users import draw_motorist
 from infgen.sources.towns.traffic.simulation import play
 from tests.sources.towns.conftest import needs_sumo
 

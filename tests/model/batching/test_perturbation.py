@@ -10,8 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from infgen.config import ConfigError, TrainSettings
+from infgen.model.batching.perturbation import (
+    Noise,
+    exchange_roads,
+    lead_astray,
+    make_noise,
+)
 from infgen.tokens.motion_tokens import advance, make_move_table, nearest_moves
-from infgen.tokens.perturbation import Noise, exchange_roads, lead_astray, make_noise
 from infgen.tokens.scene_tokens import NO_MOVE
 from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook, RoadCodebook
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int8, Int16
 
-from infgen.config import TrainSettings
+from infgen.model.training_settings import TrainSettings
 from infgen.tokens.motion_tokens import (
     MoveTable,
     advance,

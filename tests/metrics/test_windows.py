@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infgen.metrics.long_term.windows import Windows, cut_windows
+from infgen.metrics.windows import Windows, cut_windows
 
 
 def test_thirty_seconds_hold_forty_five_windows():

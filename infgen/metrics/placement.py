@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float32, Int16, Int64
 
 from infgen.clock import CLOCK
-from infgen.config import TokenSettings
 from infgen.rollout.rollout import NEVER, Rollout
 from infgen.scene import Scene
 from infgen.tokens.presence import live, makes_a_move, seen_tokens
 from infgen.tokens.scene_tokens import Presence
+from infgen.tokens.settings import TokenSettings
 from infgen.tokens.tracks import read_paths
 
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from infgen.config import TokenSettings
-from infgen.metrics.long_term.placement import (
+from infgen.metrics.long_term.radius import live_within
+from infgen.metrics.placement import (
     count_per_token,
     logged_events,
     simulated_events,
 )
-from infgen.metrics.long_term.radius import live_within
 from infgen.rollout.rollout import NEVER, Rollout
 
 STEPS = 91

@@ -1,0 +1,41 @@
+"""Several processes of one training run: which one this is, and what the others do.
+
+``torchrun -m infgen train ...`` starts the same command several times. The first process
+does as it is told; the others know nothing of stages, locks or logs: they wait until the
+first one trains, take part in that, and leave when it does. Light to import: without
+``torchrun`` none of this costs anything.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+
+from pipeline.stages.train.ranks import find_rank
+
+
+def run(command: Callable[[], None], environ: Mapping[str, str]) -> None:
+    """Run a command in the first process; any other takes part where it is called."""
+    with joined(environ) as first:
+        if first:
+            command()
+
+
+@contextmanager
+def joined(environ: Mapping[str, str]) -> Iterator[bool]:
+    """Find this process's place among others, as ``torchrun`` tells it.
+
+    Yields:
+        True for the first process, or the only one: it does what it is told. Any other has
+        by then taken part in all there was.
+    """
+    rank = find_rank(environ)
+    if rank.count == 1:
+        yield True
+        return
+    # Imported late: torch takes a second, which single processes need not wait for.
+    from pipeline.stages.train import process_group  # noqa: PLC0415
+    from pipeline.stages.train.stage import take_part  # noqa: PLC0415
+
+    with process_group.met():
+        if rank.number:
+            process_group.follow(take_part)
+        yield rank.number == 0
