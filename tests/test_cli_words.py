@@ -58,7 +58,7 @@ def test_a_root_that_is_a_file_is_told_so(infgen, words):  # noqa: F811
 def test_words_that_are_refused_do_not_come_back(infgen):  # noqa: F811
     words = ("-s", "total.times=3", "--dask", "lokal")
     assert infgen(*RUN, *words)[0] == 2
-    assert not list(Path("R/refs").iterdir())
+    assert not list(Path("R").glob("refs/*"))
 
     infgen(*RUN)
     assert infgen("run", "--root", "R", *words)[0] == 2

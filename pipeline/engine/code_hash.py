@@ -1,8 +1,8 @@
 """Hash of the code that decides the bytes of an artefact.
 
 That is the modules a stage names, and whatever these import of the library, and so on: a
-list of all would be wrong after the next import. ``infgen.config`` alone does not count,
-since settings are in every key by their values.
+list of all would be wrong after the next import. Modules of settings do not count, since
+settings are in every key by their values.
 """
 
 import ast
@@ -15,8 +15,8 @@ from pathlib import Path
 from pipeline.engine.atomic import StoreError
 
 LIBRARY = "infgen"
-SETTINGS = "infgen.config"
-"""All settings, and how the files begin that they are in."""
+SETTINGS = ("settings", "config", "coerce")
+"""How the names of modules of settings end."""
 
 
 def code_hash(modules: Sequence[str]) -> str:
@@ -72,7 +72,7 @@ def _imports(path: Path) -> frozenset[str]:
             named |= {node.module, *(f"{node.module}.{one.name}" for one in node.names)}
     parts = [name.split(".") for name in named if name.split(".")[0] == LIBRARY]
     every = {".".join(some[:upto]) for some in parts for upto in range(1, len(some) + 1)}
-    return frozenset(name for name in every if not name.startswith(SETTINGS))
+    return frozenset(name for name in every if not name.endswith(SETTINGS))
 
 
 def _files(module: str) -> Iterator[tuple[str, Path]]:

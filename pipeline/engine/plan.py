@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from infgen.config import decisive
 from pipeline.engine.layout import Root
@@ -43,6 +43,7 @@ class StageEntry:
     where: str
 
 
+@runtime_checkable
 class Choice(Protocol):
     """What was asked for: settings by section, and source files."""
 

@@ -32,8 +32,8 @@ from pipeline.engine.status import has_other_code
 from pipeline.engine.tasks import about_stage, cut_tasks
 from pipeline.engine.units import (
     DriverWorkers,
+    OpenWorkers,
     Outcome,
-    Pool,
     Task,
     Workers,
     WorkersLostError,
@@ -117,7 +117,7 @@ def run(plan: Plan, orders: Orders, events: Events) -> list[Result]:
 def _make_all(plan: Plan, orders: Orders, events: Events) -> list[Result]:
     force = plan.after(orders.force | _made_by_other_code(plan, orders))
     results: list[Result] = []
-    with orders.workers.open() as pool:
+    with orders.workers.open() as workers:
         for planned in plan.stages.values():
             unmet = {result.stage for result in results if result.state in _NOT_MADE}
             if unmet and (not orders.keep_going or unmet & planned.inputs.keys()):
@@ -125,7 +125,7 @@ def _make_all(plan: Plan, orders: Orders, events: Events) -> list[Result]:
                 events.emit("stage-skipped", stage=planned.name)
                 continue
             making = _Making(plan, planned, orders, events, planned.name in force)
-            results.append(making.ensure(pool))
+            results.append(making.ensure(workers))
     return results
 
 
@@ -160,7 +160,7 @@ class _Making:
     def folder(self) -> Path:
         return self.root.folder(self.name, self.planned.key)
 
-    def ensure(self, pool: Pool) -> Result:
+    def ensure(self, workers: OpenWorkers) -> Result:
         """Find the stage whole, or make it, alone."""
         begun = time.monotonic()
         if self._is_whole():
@@ -168,7 +168,7 @@ class _Making:
         with locked(self.root.lock(self.name), wait=self.orders.wait):
             if self._is_whole():
                 return self._cached()
-            result = self._make(pool)
+            result = self._make(workers)
         taken = time.monotonic() - begun
         return replace(result, seconds=round(taken, 3))
 
@@ -183,7 +183,7 @@ class _Making:
         report = manifest["report"]
         return Result(self.name, "cached", self.planned.key, units, report=report)
 
-    def _make(self, pool: Pool) -> Result:
+    def _make(self, workers: OpenWorkers) -> Result:
         inputs = FinishedInputs(self.root, self.planned)
         units = self.planned.stage.plan(inputs, self.planned.settings)
         tasks = cut_tasks(self.root, self.planned, units)
@@ -199,7 +199,7 @@ class _Making:
             units=len(tasks),
             made=len(tasks) - len(todo),
         )
-        outcomes = self._do(todo, pool)
+        outcomes = self._do(todo, workers)
         errors = {outcome.name: outcome.error for outcome in outcomes if outcome.error}
         report: Report = {}
         if not errors:
@@ -219,7 +219,7 @@ class _Making:
             self.name, state, self.planned.key, len(tasks), made, 0.0, report, errors
         )
 
-    def _do(self, todo: Sequence[Task], pool: Pool) -> list[Outcome]:
+    def _do(self, todo: Sequence[Task], workers: OpenWorkers) -> list[Outcome]:
         outcomes: list[Outcome] = []
         if not todo:
             return outcomes
@@ -228,7 +228,7 @@ class _Making:
             return self.orders.keep_going or not any(outcome.error for outcome in outcomes)
 
         self.root.units(self.name).mkdir(parents=True, exist_ok=True)
-        executor = pool.executor(here=self.planned.stage.in_driver)
+        executor = workers.executor(here=self.planned.stage.in_driver)
         for outcome in executor.run(todo, go_on, self._progress(), self._tell_more):
             outcomes.append(outcome)
             self._tell(outcome)

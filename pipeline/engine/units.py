@@ -96,13 +96,15 @@ class InProcess:
             yield attempt(task, progress)
 
 
-class Pool(Protocol):
+@runtime_checkable
+class OpenWorkers(Protocol):
     """Workers that are there while a run goes on."""
 
     def executor(self, *, here: bool) -> Executor:
         """Return who does the units of a stage; ``here`` if it must be this process."""
 
 
+@runtime_checkable
 class Workers(Protocol):
     """Where the units of a run are done (``--dask``).
 
@@ -114,7 +116,7 @@ class Workers(Protocol):
     def words(self) -> str:
         """As on the command line."""
 
-    def open(self) -> AbstractContextManager[Pool]:
+    def open(self) -> AbstractContextManager[OpenWorkers]:
         """Have the workers for as long as the context lasts."""
 
 

@@ -96,13 +96,13 @@ class DaskWorkers:
         parse(self.words)
 
     @contextmanager
-    def open(self) -> Iterator["DaskPool"]:
+    def open(self) -> Iterator["OpenDaskWorkers"]:
         """Have the cluster from the first unit that needs it to the end of the context."""
         with ExitStack() as stack:
-            yield DaskPool(self, stack)
+            yield OpenDaskWorkers(self, stack)
 
 
-class DaskPool:
+class OpenDaskWorkers:
     """A cluster that starts only when the first unit needs it.
 
     Args:

@@ -81,7 +81,7 @@ def test_whoever_is_stopped_leaves_nothing(film, tmp_path, monkeypatch):
     def stop():
         raise Stopped(15)
 
-    monkeypatch.setattr(view_files.stopping, "check", stop)
+    monkeypatch.setattr(view_files.signals, "check", stop)
 
     with pytest.raises(Stopped):
         write_video(film, tmp_path / "film.mp4", FORM, workers=0)

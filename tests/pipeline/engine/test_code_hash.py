@@ -1,12 +1,8 @@
-import importlib
-
 import pytest
 
 from pipeline.engine.atomic import StoreError
 from pipeline.engine.code_hash import code_hash, modules_of
-
-STAGES = ("ingest", "vocabulary", "tokenize", "train", "calibrate", "rollout", "reference",
-          "score", "report")  # fmt: skip
+from pipeline.engine.registry import MODULES, load_stage
 
 
 def test_the_hash_of_code_sees_every_file_of_a_package():
@@ -51,9 +47,9 @@ def test_imports_are_followed_into_functions_and_from_module_to_module(
                         "made_library.far"}  # fmt: skip
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", MODULES)
 def test_stages_name_modules_of_the_pipeline_alone(stage):
-    named = importlib.import_module(f"pipeline.{stage}").STAGE.modules
+    named = load_stage(MODULES[stage]).modules
 
     assert named
     assert all(name.startswith("pipeline.") for name in named)
