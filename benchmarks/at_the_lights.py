@@ -27,7 +27,7 @@ from torch import Tensor
 from infgen.model.batching.batch import Agents, Limits, collate
 from infgen.model.network import Network
 from infgen.model.signal_features import CLASSES, LONG_SINCE, StopLines
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import SceneTokens, SignalClass
 from pipeline.commands.screen import show_table
 from pipeline.engine.manifest import read_manifest
@@ -70,7 +70,7 @@ class Stood:
 
 def look(network: Network, scene: SceneTokens) -> Stood:
     """Find who stood at a line in a log, and ask the network about each."""
-    roads = max(1, scene.num_roads)
+    roads = max(1, scene.num_map_tokens)
     limits = Limits(scene.num_agents, roads, 1, scene.num_tokens, network.grid_settings)
     batch = collate([scene], limits, draw=0)
     shown = torch.from_numpy(scene.signal_state.astype(np.int64))[None]
@@ -101,7 +101,7 @@ def _who_stood(agents: Agents) -> tuple[Bool[Tensor, "token agent"], ...]:
     step_m = (pose[1:, :, :2] - pose[:-1, :, :2]).norm(dim=-1)  # [token - 1, agent]
     both = seen[1:] & seen[:-1]
     still, moved = both & (step_m < STILL_M), both & (step_m >= STILL_M)
-    vehicle = agents.kind[0] == AgentKind.VEHICLE
+    vehicle = agents.kind[0] == AgentType.VEHICLE
     stood = torch.zeros_like(seen)
     stood[2:-1] = still[1:-1] & still[:-2] & both[2:] & vehicle
     went = torch.zeros_like(seen)

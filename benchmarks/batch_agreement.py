@@ -88,7 +88,7 @@ def follow(
     together, all_say = session(starts)
     alone = {at: session([start]) for at, start in enumerate(starts)}
     gaps = dict.fromkeys(alone, 0.0)
-    steps = CLOCK.tokens_in(settings.length_s)
+    steps = CLOCK.tokens_in(settings.duration_s)
     for step in range(steps):
         together.step()
         for at, (single, says) in list(alone.items()):

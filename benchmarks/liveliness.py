@@ -37,7 +37,7 @@ from infgen.metrics.placement import count_per_token
 from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic, from_log, from_rollout, on_map
 from infgen.rollout.rules.off_road import Lanes, lane_pieces
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.spatial.road_edges import RoadEdges, edges_of
 from infgen.tokens.tracks import TokensError
 from pipeline.commands.screen import show_table
@@ -134,7 +134,7 @@ def take(side: Side, whole: Traffic, place: Place, look: Look) -> None:
     others = np.arange(len(valid)) != traffic.ego
     away_m = np.hypot(x_m - x_m[traffic.ego], y_m - y_m[traffic.ego])
     near = valid & (away_m < look.radius_m) & others[:, None]
-    vehicle = (motion.kind == AgentKind.VEHICLE)[:, None]
+    vehicle = (motion.kind == AgentType.VEHICLE)[:, None]
     speed_mps = speed(x_m, y_m)
     known = speed_valid(valid)
 

@@ -40,7 +40,7 @@ from pipeline.stages.train.setup import Course
 
 SECONDS = 6.0
 """How long each figure is measured."""
-FEW_MOVES = ("build-vocab.num_moves=256", "build-vocab.num_roads=128")
+FEW_MOVES = ("build-vocab.num_motion_tokens=256", "build-vocab.num_map_tokens=128")
 
 
 def tokenized(records: Sequence[str], folder: Path) -> Path:
@@ -112,7 +112,7 @@ def padding(recipe: Recipe, limits: Limits, pool: int) -> tuple[float, float]:
         scenes = [recipe.scenes[row] for row in order.scenes(step)]
         agents = np.array([min(s.num_agents, limits.agents) for s in scenes])
         tokens = np.array([min(s.num_tokens, limits.tokens) for s in scenes])
-        roads = np.array([min(s.num_roads, limits.roads) for s in scenes])
+        roads = np.array([min(s.num_map_tokens, limits.roads) for s in scenes])
         real += [(agents * tokens).sum(), roads.sum()]
         padded += [len(scenes) * agents.max() * tokens.max(), len(scenes) * roads.max()]
     agents_share, roads_share = 1 - real / padded

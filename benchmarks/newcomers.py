@@ -13,7 +13,7 @@ from infgen.metrics.interaction import nearest_object_m
 from infgen.metrics.long_term.reference import divergence_bits
 from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.spatial.road_edges import RoadEdges
 
 STEPS_PER_S = round(1 / CLOCK.step_s)
@@ -34,7 +34,7 @@ class Newcomers:
         off_road: Whether vehicles are off the road when first near.
         overlaps: Whether who is first near overlaps somebody there.
         bearing_rad: Where from, as the ego sees it: 0 is ahead, left is positive.
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
     """
 
     first_mps: list[Float64[np.ndarray, " newcomer"]] = field(default_factory=list)
@@ -76,7 +76,7 @@ class Newcomers:
         self.kind.append(motion.kind[rows].astype(np.int64))
         self.bearing_rad.append(_bearing_rad(traffic, rows, first[rows]))
         self.overlaps.append(_overlaps_at(traffic, rows, first[rows]))
-        vehicles = rows[motion.kind[rows] == AgentKind.VEHICLE]
+        vehicles = rows[motion.kind[rows] == AgentType.VEHICLE]
         if edges is not None and len(vehicles):
             self.off_road.append(_off_at(traffic, vehicles, first[vehicles], edges))
 
@@ -93,8 +93,8 @@ class Newcomers:
             "90 % m/s": float(np.percentile(mps, 90)),
             "vehicles off-road": float(off.mean()) if len(off) else None,
             "overlap somebody": float(overlaps.mean()),
-            "pedestrians": float((kind == AgentKind.PEDESTRIAN).mean()),
-            "cyclists": float((kind == AgentKind.CYCLIST).mean()),
+            "pedestrians": float((kind == AgentType.PEDESTRIAN).mean()),
+            "cyclists": float((kind == AgentType.CYCLIST).mean()),
         }
 
     def speed_counts(self) -> Float64[np.ndarray, " bin"]:

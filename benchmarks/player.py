@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from infgen.clock import CLOCK
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import SignalClass
 from infgen.views.player import player_page
 from infgen.views.scene.drawn_map import DrawnMap, Lights, RoadLook
@@ -89,7 +89,7 @@ def _crowd(name: str, rng: np.random.Generator) -> Showing:
     ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     xy_m = start + np.cumsum(step_m * ahead, axis=1)
     kind = rng.choice(
-        [AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST],
+        [AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST],
         AGENTS,
         p=[0.7, 0.2, 0.1],
     )

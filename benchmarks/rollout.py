@@ -48,7 +48,7 @@ from infgen.rollout.simulator import Player
 from infgen.scene import Scene
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
-from infgen.tokens.vocabulary import MotionCodebook
+from infgen.tokens.vocabulary import MotionVocabulary
 from pipeline.commands.screen import show_table
 
 LENGTH_S = 30.0
@@ -57,13 +57,13 @@ SWEEP_S = 10.0
 SLOW_M = 0.5
 """Moves so much longer are less likely by a factor of e."""
 PLAYED: dict[str, dict[str, Any]] = {
-    "plain": {"entry_mask": False},
+    "plain": {"insertion_mask": False},
     "masked": {},
     "careful": {
-        "move_tries": 32,
-        "stay_on_road": True,
-        "patience_s": 20.0,
-        "keep_count": 1.0,
+        "max_motion_samples": 32,
+        "reject_off_road": True,
+        "max_stall_s": 20.0,
+        "density_control": 1.0,
     },
 }
 """Settings by word: the paper's; newcomers kept off other boxes and near lanes; and as
@@ -142,7 +142,7 @@ def _always(head: nn.Module, logit: float) -> None:
     nn.init.constant_(last.bias, logit)
 
 
-def _slowly(head: nn.Module, codebook: MotionCodebook) -> None:
+def _slowly(head: nn.Module, codebook: MotionVocabulary) -> None:
     """Make long moves of vehicles less likely; the kinds share their outputs."""
     length_m = np.linalg.norm(codebook.path[:, :, -1, :2], axis=-1).max(axis=0)
     last = _last_layer(head)
@@ -182,7 +182,9 @@ def _near(scene: Scene, agents: int, tokens: TokenSettings) -> TokenSettings:
     xy_m = tracks.xyz_m[:, now, :2]
     away_m = np.linalg.norm(xy_m - xy_m[scene.ego], axis=1)[tracks.valid[:, now]]
     farthest_m = float(np.sort(away_m)[min(agents, len(away_m)) - 1])
-    return replace(tokens, max_distance_m=min(farthest_m + 0.1, tokens.max_distance_m))
+    return replace(
+        tokens, max_ego_distance_m=min(farthest_m + 0.1, tokens.max_ego_distance_m)
+    )
 
 
 def _cropped(history: SceneTokens, roads: int) -> SceneTokens:
@@ -210,7 +212,7 @@ def measure(case: Case) -> dict[str, float]:
     peak = peak_flops(case.device, bf16=bf16)
     return {
         "agents": float(np.mean([(frame.life >= 0).sum(axis=1) for frame in frames])),
-        "roads": float(history.num_roads),
+        "roads": float(history.num_map_tokens),
         "entered": float(np.mean([_entered(frame) for frame in frames]) * len(frames)),
         "begin_s": begin_s,
         "used_s_per_rollout": spent_s / case.batch,

@@ -22,7 +22,7 @@ from infgen.metrics.kinematics import measure_kinematics, speed_valid
 from infgen.metrics.placement import count_per_token
 from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic, from_log
-from infgen.scene import AgentKind, FeatureKind, LaneType, Scene
+from infgen.scene import AgentType, FeatureKind, LaneType, Scene
 from infgen.sources.womd import iter_scenes
 from infgen.spatial.road_edges import edges_of
 from infgen.tokens.map import road_pieces
@@ -52,7 +52,7 @@ def _count_agents(traffic: Traffic) -> Column:
     near = valid & (_apart_m(traffic) < NEAR_M)
     others = np.arange(len(kind)) != traffic.ego
     counts: Column = {"agents ever": len(kind)}
-    for each in (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST):
+    for each in (AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST):
         counts[f"{each.name.lower()}s now"] = float(
             (traffic.there_now & (kind == each)).sum()
         )
@@ -107,13 +107,13 @@ def _motion_of(scene: Scene, traffic: Traffic) -> Values:
     changing = speed_valid(known)
     stands = _stands(traffic)
     values: Values = {
-        "vehicles that stand, share": stands[motion.kind == AgentKind.VEHICLE],
-        "pedestrians that stand, share": stands[motion.kind == AgentKind.PEDESTRIAN],
+        "vehicles that stand, share": stands[motion.kind == AgentType.VEHICLE],
+        "pedestrians that stand, share": stands[motion.kind == AgentType.PEDESTRIAN],
         "off-road vehicles, share": _off_road(scene, traffic, ~stands & ~stands | stands),
         "off-road moving vehicles, share": _off_road(scene, traffic, ~stands),
         "speed of the ego": found.speed_mps[0, traffic.ego][known[traffic.ego]],
     }
-    for kind in (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST):
+    for kind in (AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST):
         goes = (~stands & (motion.kind == kind))[:, None]
         name = kind.name.lower()
         values[f"speed of {name}s that move"] = found.speed_mps[0][goes & known]
@@ -140,7 +140,7 @@ def _off_road(scene: Scene, traffic: Traffic, which: np.ndarray) -> np.ndarray:
     """Whether some vehicles are off the road now."""
     edges = edges_of(scene)
     rows = np.flatnonzero(
-        which & (traffic.motion.kind == AgentKind.VEHICLE) & traffic.there_now
+        which & (traffic.motion.kind == AgentType.VEHICLE) & traffic.there_now
     )
     if edges is None or not len(rows):
         return np.zeros(0, bool)

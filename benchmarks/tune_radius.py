@@ -6,7 +6,7 @@ Reads the finished stages of a root whose rollouts were made on the validation s
     python benchmarks/tune_radius.py ROOT [--protocol corrected]
 
 Prints placement by radius; the last line is one JSON object with the best, to be given as
-``-s score.enter_radius_m=R``.
+``-s score.presence_radius_m=R``.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for radius_m, value in placement.items():
         print(f"{radius_m:6.1f} m  {value:.4f}")
     best_m = best_radius_m(placement)
-    print(json.dumps({"enter_radius_m": best_m, "placement": placement[best_m]}))
+    print(json.dumps({"presence_radius_m": best_m, "placement": placement[best_m]}))
 
 
 if __name__ == "__main__":

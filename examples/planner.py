@@ -35,7 +35,7 @@ from infgen.tokens.tokenizer import tokenize_scene
 from pipeline.storage.scenes import read_scenes
 from pipeline.storage.weights import load_network
 
-FRESH = RolloutSettings(add_bias=-1.5, leave_bias=-4.0)
+FRESH = RolloutSettings(add_bias=-1.5, remove_bias=-4.0)
 """What has learned nothing says yes and no alike: too many would come and go."""
 MAX_ACCEL_MPS2, COMFORT_BRAKE_MPS2 = 1.5, 2.0
 HEADWAY_S, STANDING_GAP_M = 1.5, 2.0

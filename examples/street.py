@@ -6,10 +6,10 @@ import torch
 from infgen.clock import CLOCK
 from infgen.config import ModelSettings, TokenSettings, VocabSettings
 from infgen.model.network import Network
-from infgen.scene import AgentKind, FeatureKind, LaneType, RoadMap, Scene, Signals, Tracks
+from infgen.scene import AgentType, FeatureKind, LaneType, RoadMap, Scene, Signals, Tracks
 from infgen.tokens.clustering.made_motion_samples import fan
 from infgen.tokens.clustering.physical_limits import limits_of
-from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import BOX_LW_M, MapVocabulary, MotionVocabulary
 
 SMALL = ModelSettings(width=32, heads=4, map_blocks=1, motion_blocks=1, scene_blocks=1)
 STREET_M = 600.0
@@ -48,7 +48,7 @@ def street(
         interest_id=np.empty(0, dtype=np.int32),
         tracks=Tracks(
             id=number.astype(np.int32),
-            kind=np.full(cars, AgentKind.VEHICLE, dtype=np.int8),
+            kind=np.full(cars, AgentType.VEHICLE, dtype=np.int8),
             xyz_m=xyz_m,
             heading_rad=np.zeros((cars, steps), dtype=np.float32),
             velocity_mps=velocity_mps,
@@ -110,7 +110,7 @@ def fresh_network(seed: int = 0) -> Network:
     torch.manual_seed(seed)
     return Network(
         SMALL,
-        MotionCodebook(BOX_LW_M, path, np.zeros(path.shape[:2], dtype=bool)),
-        RoadCodebook(curve_m, np.zeros(len(curve_m), dtype=bool)),
+        MotionVocabulary(BOX_LW_M, path, np.zeros(path.shape[:2], dtype=bool)),
+        MapVocabulary(curve_m, np.zeros(len(curve_m), dtype=bool)),
         TokenSettings(),
     )

@@ -17,7 +17,7 @@ class SceneError(ValueError):
     """A log whose parts contradict each other."""
 
 
-class AgentKind(IntEnum):
+class AgentType(IntEnum):
     """Road users. WOMD's object type less one."""
 
     VEHICLE = 0
@@ -107,7 +107,7 @@ class Tracks:
 
     Attributes:
         id: Track id, unique within the scene.
-        kind: ``AgentKind`` of each agent.
+        kind: ``AgentType`` of each agent.
         xyz_m: Box centres.
         heading_rad: Counter-clockwise from +x.
         velocity_mps: Velocity along world x and y.

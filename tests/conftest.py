@@ -7,7 +7,7 @@ import pytest
 from hypothesis import settings
 
 from infgen.scene import (
-    AgentKind,
+    AgentType,
     FeatureKind,
     LaneType,
     RoadEdgeType,
@@ -17,17 +17,17 @@ from infgen.scene import (
     SignalState,
     Tracks,
 )
-from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import BOX_LW_M, MapVocabulary, MotionVocabulary
 
 settings.register_profile("infgen", deadline=None)
 settings.load_profile("infgen")  # How long an example takes is a matter of the machine.
 
 STEP_S = 0.1
 BOX_LWH_M = {
-    AgentKind.VEHICLE: (4.8, 2.0, 1.6),
-    AgentKind.PEDESTRIAN: (1.0, 1.0, 1.7),
-    AgentKind.CYCLIST: (2.0, 1.0, 1.7),
-    AgentKind.OTHER: (1.0, 1.0, 1.0),
+    AgentType.VEHICLE: (4.8, 2.0, 1.6),
+    AgentType.PEDESTRIAN: (1.0, 1.0, 1.7),
+    AgentType.CYCLIST: (2.0, 1.0, 1.7),
+    AgentType.OTHER: (1.0, 1.0, 1.0),
 }
 LANE_ID, EDGE_ID, CROSSWALK_ID = 1, 2, 3
 
@@ -52,7 +52,7 @@ def make_tracks(path, kind, valid=None) -> Tracks:
     velocity = (
         np.gradient(path[..., :2], STEP_S, axis=1) if steps > 1 else 0 * path[..., :2]
     )
-    size = np.array([BOX_LWH_M[AgentKind(k)] for k in kind]).reshape(agents, 1, 3)
+    size = np.array([BOX_LWH_M[AgentType(k)] for k in kind]).reshape(agents, 1, 3)
     xyz = np.concatenate(
         [path[..., :2], np.broadcast_to(size[..., 2:] / 2, (agents, steps, 1))], -1
     )
@@ -179,7 +179,7 @@ def build_signals() -> Callable[..., Signals]:
 def drive() -> Callable[..., Scene]:
     """One agent, the ego, straight ahead at constant speed."""
 
-    def build(speed_mps=10.0, heading_rad=0.0, kind=AgentKind.VEHICLE, steps=91, **more):
+    def build(speed_mps=10.0, heading_rad=0.0, kind=AgentType.VEHICLE, steps=91, **more):
         path = straight_path((0.0, 0.0), heading_rad, speed_mps, steps)
         return make_scene(path[None], [kind], **more)
 
@@ -205,10 +205,10 @@ def crossing() -> Callable[..., Scene]:
         valid[2, :30] = False
         valid[3, 61:] = False
         kinds = [
-            AgentKind.VEHICLE,
-            AgentKind.VEHICLE,
-            AgentKind.PEDESTRIAN,
-            AgentKind.CYCLIST,
+            AgentType.VEHICLE,
+            AgentType.VEHICLE,
+            AgentType.PEDESTRIAN,
+            AgentType.CYCLIST,
         ]
         return make_scene(np.stack(paths), kinds, valid, **more)
 
@@ -224,13 +224,13 @@ def parked() -> Callable[..., Scene]:
             straight_path((8.0 * i, -2.0 * (i > 0)), 0.0, 0.0, steps)
             for i in range(count + 1)
         ]
-        return make_scene(np.stack(paths), [AgentKind.VEHICLE] * (count + 1), **more)
+        return make_scene(np.stack(paths), [AgentType.VEHICLE] * (count + 1), **more)
 
     return build
 
 
 @pytest.fixture(scope="session")
-def metre_moves() -> MotionCodebook:
+def metre_moves() -> MotionVocabulary:
     """Moves of whole metres, the same for each kind.
 
     Row ``i`` up to 20 goes ``i`` metres straight ahead; rows 21 to 40 the same with a turn
@@ -242,7 +242,7 @@ def metre_moves() -> MotionCodebook:
     path = np.stack(
         [np.outer(ahead_m, share), np.zeros((61, 6)), np.outer(turn_rad, share)], axis=-1
     )
-    return MotionCodebook(
+    return MotionVocabulary(
         size_lw_m=BOX_LW_M,
         path=np.broadcast_to(path, (3, 61, 6, 3)).astype(np.float32),
         real=np.ones((3, 61), bool),
@@ -250,7 +250,7 @@ def metre_moves() -> MotionCodebook:
 
 
 @pytest.fixture(scope="session")
-def dense_moves() -> MotionCodebook:
+def dense_moves() -> MotionVocabulary:
     """Moves close together: every 0.1 m ahead up to 18 m, along arcs, and small side steps.
 
     Good enough for real logs: most are followed within a few decimetres.
@@ -260,7 +260,7 @@ def dense_moves() -> MotionCodebook:
     end = [(x * np.cos(c / 2), x * np.sin(c / 2), c) for c in curve for x in ahead_m]
     end += [(x, y, 0.0) for x in (-0.4, -0.1, 0.1, 0.3, 1.0) for y in (-0.15, 0.15)]
     path = np.array(end)[:, None] * np.linspace(0, 1, 6)[:, None]
-    return MotionCodebook(
+    return MotionVocabulary(
         size_lw_m=BOX_LW_M,
         path=np.broadcast_to(path, (3, *path.shape)).astype(np.float32),
         real=np.ones((3, len(path)), bool),
@@ -268,10 +268,10 @@ def dense_moves() -> MotionCodebook:
 
 
 @pytest.fixture(scope="session")
-def bent_roads() -> RoadCodebook:
+def bent_roads() -> MapVocabulary:
     """Five-metre arcs that end 0, 5, ... 40 degrees to the left, then to the right."""
     bend_rad = np.deg2rad([0, 5, 10, 20, 40, -5, -10, -20, -40])
     headings = np.outer(bend_rad, np.arange(10) / 9)
     steps_m = 0.5 * np.stack([np.cos(headings), np.sin(headings)], axis=-1)
     curve = np.concatenate([np.zeros((9, 1, 2)), np.cumsum(steps_m, axis=1)], axis=1)
-    return RoadCodebook(curve_m=curve.astype(np.float32), real=np.ones(9, bool))
+    return MapVocabulary(curve_m=curve.astype(np.float32), real=np.ones(9, bool))

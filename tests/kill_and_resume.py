@@ -177,7 +177,7 @@ def kill_stage(
     """
     root = trial.folder / f"killed-{stage}-{victim}"
     shutil.copytree(quiet, root, symlinks=True)
-    expected, length_s = digest(quiet, (stage,)), trial.seconds(stage, quiet)
+    expected, duration_s = digest(quiet, (stage,)), trial.seconds(stage, quiet)
     draw = random.Random(f"{seed} {stage} {victim}")
     in_time = number = kept = 0
     while in_time < kills:
@@ -185,7 +185,7 @@ def kill_stage(
         if number > TRIES * kills:
             raise SystemExit(f"{stage}: only {in_time} of {number} kills came in time")
         shutil.rmtree(Root(root).stage(stage))
-        delay_s = draw.uniform(0, length_s)
+        delay_s = draw.uniform(0, duration_s)
         in_time += trial.kill_once(stage, root, victim, delay_s, number)
         what = f"{stage}, kill {number} of a {victim} after {delay_s:.3f} s"
         damage = list(verify(Root(root), full=True))

@@ -31,12 +31,23 @@ NUMBERS = [
 TYPES = {(section, name): kind for section, name, kind in NUMBERS}
 ZERO_SAYS = {
     "ingest": ("limit",),
-    "tokenize": ("max_gap_s", "enter_distance_m"),
+    "tokenize": ("max_gap_s", "insertion_distance_m"),
     "train": (
         *("steps", "learning_rate", "warmup_steps", "weight_decay", "ema_decay"),
-        *("label_smoothing", "motion_weight", "map_weight", "first_move_weight"),
-        *("max_roads", "noise_moves", "noise_roads", "noise_share", "closed_loop_top"),
-        *("loader_workers", "checkpoint_every", "checkpoint_minutes", "validate_every"),
+        *("label_smoothing", "motion_weight", "map_weight", "first_motion_weight"),
+        *(
+            "max_map_tokens",
+            "motion_noise_neighbours",
+            "map_noise_neighbours",
+            "motion_noise_share",
+            "closed_loop_top_k",
+        ),
+        *(
+            "loader_workers",
+            "checkpoint_every_steps",
+            "checkpoint_minutes",
+            "validate_every_steps",
+        ),
         *("validation_scenes", "seed"),
     ),
     "reference": ("count_radius_m",),
@@ -67,14 +78,14 @@ def test_zero_may_be_said_where_it_has_a_meaning(section, name):
     ("section", "name", "value", "expected"),
     [
         ("ingest", "max_scenes_per_shard", 0, "1 or more"),
-        ("tokenize", "heading_step_deg", 0.0, "0.1 to 360"),
-        ("tokenize", "heading_step_deg", 720.0, "0.1 to 360"),
-        ("tokenize", "grid_step_m", 0.0, "0.1 or more"),
-        ("tokenize", "max_distance_m", 0.0, "1 or more"),
+        ("tokenize", "heading_bin_deg", 0.0, "0.1 to 360"),
+        ("tokenize", "heading_bin_deg", 720.0, "0.1 to 360"),
+        ("tokenize", "grid_cell_m", 0.0, "0.1 or more"),
+        ("tokenize", "max_ego_distance_m", 0.0, "1 or more"),
         ("train", "batch_scenes", 0, "1 or more"),
         ("train", "max_agents", 0, "1 or more"),
-        ("train", "max_tokens", 1, "2 or more"),
-        ("train", "clip_norm", 0.0, "1e-06 or more"),
+        ("train", "max_token_steps", 1, "2 or more"),
+        ("train", "max_gradient_norm", 0.0, "1e-06 or more"),
         ("train", "label_smoothing", 1.1, "0 to 1"),
         ("train", "ema_decay", 1.5, "0 to 1"),
         ("train", "seed", 2**63, "0 to 9223372036854775807"),
@@ -108,10 +119,10 @@ def test_the_largest_seed_is_one():
 @pytest.mark.parametrize(
     "word",
     [
-        *("tokenize.heading_step_deg=0", "reference.stride_s=0", "ingest.limit=-1"),
+        *("tokenize.heading_bin_deg=0", "reference.stride_s=0", "ingest.limit=-1"),
         *(
-            "train.checkpoint_every=-1",
-            "train.validate_every=-1",
+            "train.checkpoint_every_steps=-1",
+            "train.validate_every_steps=-1",
             "train.learning_rate=inf",
         ),
     ],

@@ -23,7 +23,7 @@ PRESETS = """
       smart:
         published: SMART-7M
         profile: smart
-        plays: {long: {score: {enter_radius_m: 75}}}
+        plays: {long: {score: {presence_radius_m: 75}}}
 
   odd:
     profile: small,benchmark,tiny
@@ -48,7 +48,7 @@ SETTINGS = (
         "-s",
         "train.batch_scenes=1",
         "-s",
-        "train.checkpoint_every=0",
+        "train.checkpoint_every_steps=0",
     ),
     *("-s", "train.validation_scenes=1", "-s", "ingest.limit=1"),
     *("-s", "score.resamples=20", "--root", "R"),

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from infgen.scene import (
-    AgentKind,
+    AgentType,
     FeatureKind,
     LaneType,
     LinkKind,
@@ -82,7 +82,7 @@ def womd_name(feature: Feature) -> str:
 
 def agent_name(kind: int) -> str:
     """Name a kind of agent in capitals."""
-    return AgentKind(kind).name
+    return AgentType(kind).name
 
 
 def light_name(state: int) -> str:

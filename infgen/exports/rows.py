@@ -15,7 +15,7 @@ Columns = Mapping[str, np.ndarray]
 def rows_of(rollouts: Sequence[Rollout], scene: Scene) -> Columns:
     """Lay the rollouts of one scene end to end, in order of rollout, agent and step.
 
-    Columns: ``rollout``; ``agent`` (track id); ``kind`` (``AgentKind``); ``step`` and
+    Columns: ``rollout``; ``agent`` (track id); ``kind`` (``AgentType``); ``step`` and
     ``time_s`` (0 is now); ``x_m``, ``y_m``, ``z_m`` (world frame, float64);
     ``heading_rad``; ``velocity_x_mps`` and ``velocity_y_mps``; ``length_m``, ``width_m``,
     ``height_m``; ``is_ego``; ``is_logged`` (False: inserted); ``is_history`` (not played).

@@ -16,7 +16,7 @@ class States:
 
     Attributes:
         id: Track ids; inserted agents count on from the log's largest.
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         size_lwh_m: One box per agent.
         xyz_m: Box centres.
         heading_rad: Counter-clockwise from +x.

@@ -24,7 +24,7 @@ from infgen.metrics.wosac.logged import FUTURE_STEPS
 from infgen.metrics.wosac.rollouts import Rollouts, RolloutsError, from_rollouts, list_ids
 from infgen.metrics.wosac.submission import NUM_ROLLOUTS
 from infgen.rollout.rollout import Rollout
-from infgen.scene import AgentKind, Scene
+from infgen.scene import AgentType, Scene
 from infgen.sources.wire import BYTES, VARINT
 from infgen.sources.wire_write import integer, key, message, text, varint
 
@@ -144,7 +144,7 @@ def complete(scene: Scene, rollouts: Sequence[Rollout]) -> Futures:
     shown = np.flatnonzero(scene.tracks.valid[:, scene.now])
     expected = scene.tracks.id[shown].astype(np.int64)
     there = np.isin(expected, played.object_id)
-    unplayed = ~there & (scene.tracks.kind[shown] == AgentKind.OTHER)
+    unplayed = ~there & (scene.tracks.kind[shown] == AgentType.OTHER)
     _check_objects(where, expected[there | unplayed], expected, played.object_id)
     joined = _join(played, _keep_velocity(scene, shown[unplayed]), expected)
     _check_finite(where, joined)

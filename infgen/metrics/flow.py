@@ -49,20 +49,22 @@ class Turnover:
 
 
 def count_turnover(
-    traffic: Traffic, radius_m: float, window_tokens: int | None = None
+    traffic: Traffic, radius_m: float, temporal_window_tokens: int | None = None
 ) -> Turnover:
     """Count who is around the ego, comes and goes after now, but in the last second.
 
     Args:
         traffic: A log or a rollout.
         radius_m: Whoever is nearer to the ego is around it.
-        window_tokens: Count as if there were so many half seconds after now, and as much
-            before as there is, in as many such windows as there is room for. Whoever is
-            away for a while has gone for good in a log that ends before, so long rollouts
-            are compared to short logs in windows as long as these.
+        temporal_window_tokens: Count as if there were so many half seconds after now, and
+            as much before as there is, in as many such windows as there is room for.
+            Whoever is away for a while has gone for good in a log that ends before, so long
+            rollouts are compared to short logs in windows as long as these.
     """
     motion, now, tokens = traffic.motion, traffic.now, traffic.future_tokens
-    length = tokens if window_tokens is None else min(tokens, window_tokens)
+    length = (
+        tokens if temporal_window_tokens is None else min(tokens, temporal_window_tokens)
+    )
     x_m, y_m = motion.x_m[0], motion.y_m[0]
     away_m = np.hypot(x_m - x_m[traffic.ego], y_m - y_m[traffic.ego])
     near = motion.valid[0] & (away_m < radius_m)

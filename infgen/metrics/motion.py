@@ -16,7 +16,7 @@ class Motion:
         z_m: Box centres.
         heading_rad: Counter-clockwise from +x, not necessarily wrapped.
         size_lwh_m: Length, width and height of each box.
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         valid: Whether the box is there.
     """
 

@@ -42,14 +42,15 @@ class ScoreSettings:
     """How rollouts are scored (METRICS.md).
 
     Attributes:
-        enter_radius_m: For models that neither insert nor remove: who crosses this distance
-            to the ego enters or leaves, and who is beyond it is not there; 0 for never.
+        presence_radius_m: For models that neither insert nor remove: who crosses this
+            distance to the ego enters or leaves, and who is beyond it is not there; 0 for
+            never.
         wosac: Version of the Waymo metric, for the first eight seconds.
         resamples: Bootstrap resamples of the scenes behind the 95 % intervals.
         seed: Of the bootstrap.
     """
 
-    enter_radius_m: float = 0.0
+    presence_radius_m: float = 0.0
     wosac: str = "wosac-2025"
     resamples: int = 1000
     seed: int = 0

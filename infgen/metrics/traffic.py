@@ -10,7 +10,7 @@ from infgen.metrics.motion import Motion
 from infgen.metrics.placement import Events, logged_events, simulated_events
 from infgen.rollout.rollout import Rollout
 from infgen.rollout.rules.off_road import Lanes, lanes_distance_m
-from infgen.scene import AgentKind, Scene
+from infgen.scene import AgentType, Scene
 from infgen.tokens.settings import TokenSettings
 
 
@@ -66,7 +66,7 @@ def from_log(scene: Scene, settings: TokenSettings) -> Traffic:
     """
     events = logged_events(scene, settings)
     tracks = scene.tracks
-    rows = np.flatnonzero((tracks.kind >= 0) & (tracks.kind < AgentKind.OTHER))
+    rows = np.flatnonzero((tracks.kind >= 0) & (tracks.kind < AgentType.OTHER))
     valid = tracks.valid[rows]
     share = valid / np.maximum(1, valid.sum(axis=1, keepdims=True))
     size_lwh_m = np.einsum("as,asc->ac", share, tracks.size_lwh_m[rows])

@@ -25,13 +25,13 @@ from infgen.model.neighbours import Around, Reach, RoadFeatures
 from infgen.model.relations import Rows, direction, relation_embedding
 from infgen.model.settings import ModelSettings
 from infgen.model.signal_features import LightAhead
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.grid import Grid
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
-from infgen.tokens.vocabulary import MotionCodebook
+from infgen.tokens.vocabulary import MotionVocabulary
 
 NUM_PATTERNS = 1 << CLOCK.steps_per_token
-KINDS = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST)
+KINDS = (AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST)
 MAX_SPEED_MPS = 50.0
 """Faster past displacements are not told apart."""
 
@@ -46,7 +46,7 @@ class AgentRows:
     """Agents to embed, one per row.
 
     Attributes:
-        kind: ``AgentKind`` [row].
+        kind: ``AgentType`` [row].
         size_lwh_m: Boxes [row, 3].
         pose: Poses [row, 3].
         before: Poses half a second earlier [row, 3] ...
@@ -91,11 +91,11 @@ class AgentEmbedding(nn.Module):
     centre_m: Tensor
 
     def __init__(
-        self, settings: ModelSettings, codebook: MotionCodebook, grid: Grid
+        self, settings: ModelSettings, codebook: MotionVocabulary, grid: Grid
     ) -> None:
         super().__init__()
-        width, life = settings.width, settings.life_cycle
-        self.num_moves = codebook.num_moves
+        width, life = settings.width, settings.insertion_and_removal
+        self.num_motion_tokens = codebook.num_motion_tokens
         self.num_cells = grid.num_cells
         corners_m = torch.from_numpy(codebook.end_corners_m.copy())
         self.register_buffer("corners_m", corners_m.flatten(2), persistent=False)
@@ -108,7 +108,7 @@ class AgentEmbedding(nn.Module):
         self.motion = FourierEmbedding(2, settings.fourier_bands, width)
         self.kind = nn.Embedding(len(KINDS), width)
         self.size = embedding_mlp(3, width)
-        self.ego = nn.Parameter(torch.zeros(width)) if settings.tell_ego else None
+        self.ego = nn.Parameter(torch.zeros(width)) if settings.ego_embedding else None
         self.presence = nn.Embedding(len(Presence), width) if life else None
         self.fuse = embedding_mlp((4 if life else 2) * width, width)
 
@@ -122,8 +122,8 @@ class AgentEmbedding(nn.Module):
 
     def forward(self, agents: AgentRows, tables: AgentTables) -> Tensor:
         """Embed agents: [N, D]."""
-        move = agents.kind * self.num_moves + agents.move
-        special = len(KINDS) * self.num_moves
+        move = agents.kind * self.num_motion_tokens + agents.move
+        special = len(KINDS) * self.num_motion_tokens
         move = torch.where(agents.move == FIRST_MOVE, special, move)
         move = torch.where(agents.move == NO_MOVE, special + 1, move)
         what = self.kind(agents.kind) + self.size(agents.size_lwh_m)
@@ -194,19 +194,19 @@ class MotionStack(nn.Module):
     """What every agent does next, all at once (SPEC 4.5)."""
 
     def __init__(
-        self, settings: ModelSettings, codebook: MotionCodebook, token_s: float
+        self, settings: ModelSettings, codebook: MotionVocabulary, token_s: float
     ) -> None:
         super().__init__()
         width, bands = settings.width, settings.fourier_bands
-        window = settings.window_tokens
+        window = settings.temporal_window_tokens
         far_m = MAX_SPEED_MPS * token_s * window
         self.settings = settings
         self.past_relation = relation_embedding(far_m, bands, width, window)
         self.roads_relation = relation_embedding(
-            settings.map_agent_radius_m + settings.map_agent_ahead_m,
+            settings.map_agent_radius_m + settings.map_agent_lookahead_m,
             bands,
             width,
-            across=settings.map_agent_across,
+            across=settings.map_agent_lateral_offset,
         )
         self.agents_relation = relation_embedding(
             settings.agent_agent_radius_m, bands, width
@@ -214,14 +214,14 @@ class MotionStack(nn.Module):
         self.blocks = nn.ModuleList(
             MotionBlock(settings) for _ in range(settings.motion_blocks)
         )
-        shaped = settings.move_width
-        self.move = None if shaped else mlp(width, width, codebook.num_moves)
+        shaped = settings.motion_feature_width
+        self.move = None if shaped else mlp(width, width, codebook.num_motion_tokens)
         self.shaped = MoveHead(width, shaped, codebook) if shaped else None
-        leaves = settings.life_cycle and settings.leave_token
+        leaves = settings.insertion_and_removal and settings.remove_token
         self.leave = mlp(width, width, 1) if leaves else None
-        patterns = settings.pattern_tokens
+        patterns = settings.validity_pattern_tokens
         self.pattern = mlp(width, width, NUM_PATTERNS) if patterns else None
-        ahead_m = settings.light_ahead_m
+        ahead_m = settings.signal_ahead_m
         self.light = LightAhead(width, ahead_m) if ahead_m else None
 
     def roads_reach(self) -> Reach:
@@ -231,8 +231,8 @@ class MotionStack(nn.Module):
             s.map_agent_radius_m,
             s.map_agent_neighbours,
             self.roads_relation,
-            ahead_m=s.map_agent_ahead_m,
-            across=s.map_agent_across,
+            ahead_m=s.map_agent_lookahead_m,
+            across=s.map_agent_lateral_offset,
         )
 
     def agents_reach(self) -> Reach:
@@ -271,7 +271,7 @@ class MotionStack(nn.Module):
         Args:
             rows: The visible agents.
             x_ND: Their updated features.
-            kind: ``AgentKind`` of each.
+            kind: ``AgentType`` of each.
             shapes: ``move_shapes``.
         """
         return MotionOutputs(

@@ -67,7 +67,7 @@ class Ground(nn.Module):
     lattice: Tensor
     centre_m: Tensor
 
-    def __init__(self, width: int, ground_width: int, grid: Grid) -> None:
+    def __init__(self, width: int, cell_feature_width: int, grid: Grid) -> None:
         super().__init__()
         self.step_m = grid.step_m
         self.side = len(grid.cell_at)
@@ -77,13 +77,15 @@ class Ground(nn.Module):
         self.register_buffer("lattice", torch.from_numpy(lattice), persistent=False)
         centre_m = torch.from_numpy(grid.centre_m.copy())
         self.register_buffer("centre_m", centre_m, persistent=False)
-        self.road = nn.Linear(width, ground_width)
-        self.agent = nn.Linear(width, ground_width)
-        self.turned = nn.Linear(2, ground_width, bias=False)
-        self.place = embedding_mlp(2, ground_width)
-        self.beside = nn.Conv2d(ground_width, ground_width, 3, padding=1, bias=False)
-        self.key = nn.Linear(ground_width, ground_width)
-        self.ask = nn.Linear(width, ground_width)
+        self.road = nn.Linear(width, cell_feature_width)
+        self.agent = nn.Linear(width, cell_feature_width)
+        self.turned = nn.Linear(2, cell_feature_width, bias=False)
+        self.place = embedding_mlp(2, cell_feature_width)
+        self.beside = nn.Conv2d(
+            cell_feature_width, cell_feature_width, 3, padding=1, bias=False
+        )
+        self.key = nn.Linear(cell_feature_width, cell_feature_width)
+        self.ask = nn.Linear(width, cell_feature_width)
 
     def forward(self, ego_pose: Tensor, roads: Lying, agents: Lying) -> Tensor:
         """Describe the cells around egos [N, 3]: features [N, cell, C]."""
@@ -130,15 +132,15 @@ class Ground(nn.Module):
 class Bearings(nn.Module):
     """Logits of headings, from the headings of the roads around a query."""
 
-    def __init__(self, width: int, ground_width: int, num_headings: int) -> None:
+    def __init__(self, width: int, cell_feature_width: int, num_headings: int) -> None:
         super().__init__()
         self.num_headings = num_headings
-        self.road = nn.Linear(width, ground_width)
-        self.apart = nn.Linear(2, ground_width)
-        self.asked = nn.Linear(width, ground_width)
+        self.road = nn.Linear(width, cell_feature_width)
+        self.apart = nn.Linear(2, cell_feature_width)
+        self.asked = nn.Linear(width, cell_feature_width)
         size = 2 * BIN_REACH + 1
-        self.beside = nn.Conv1d(ground_width, ground_width, size, bias=False)
-        self.say = nn.Conv1d(ground_width, 1, size, bias=False)
+        self.beside = nn.Conv1d(cell_feature_width, cell_feature_width, size, bias=False)
+        self.say = nn.Conv1d(cell_feature_width, 1, size, bias=False)
 
     def forward(self, x: Tensor, pose: Tensor, roads: Lying) -> Tensor:
         """Say how much queries [N, ..., D] at poses [N, 3] are for each heading."""

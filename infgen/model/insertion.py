@@ -51,26 +51,32 @@ class CellStack(nn.Module):
         self.radius_m = grid.radius_m
         self.query = nn.Embedding(1, width)
         self.occupancy = mlp(grid.num_cells, width, width)
-        self.roads_relation = relation_embedding(settings.query_radius_m, bands, width)
-        self.agents_relation = relation_embedding(settings.query_radius_m, bands, width)
+        self.roads_relation = relation_embedding(
+            settings.position_query_radius_m, bands, width
+        )
+        self.agents_relation = relation_embedding(
+            settings.position_query_radius_m, bands, width
+        )
         self.blocks = nn.ModuleList(
             QueryBlock(settings) for _ in range(settings.scene_blocks)
         )
         self.add = mlp(width, width, 1)
-        by_cell = settings.cell_token
+        by_cell = settings.position_token
         self.cell = mlp(width, width, grid.num_cells) if by_cell else None
         self.place = None if by_cell else mlp(width, width, 2)
-        features = settings.ground_width if by_cell else 0
+        features = settings.cell_feature_width if by_cell else 0
         self.ground = Ground(width, features, grid) if features else None
 
     def roads_reach(self) -> Reach:
         """How the query sees roads."""
         s = self.settings
-        return Reach.of(s.query_radius_m, s.query_map_neighbours, self.roads_relation)
+        return Reach.of(
+            s.position_query_radius_m, s.position_query_map_neighbours, self.roads_relation
+        )
 
     def agents_reach(self, agents: int) -> Reach:
         """How the query sees agents: all of them within its radius."""
-        return Reach.of(self.settings.query_radius_m, agents, self.agents_relation)
+        return Reach.of(self.settings.position_query_radius_m, agents, self.agents_relation)
 
     def forward(self, occupied: Tensor, roads: Seen, agents: Seen) -> Tensor:
         """Answer queries: features [N, S, D].
@@ -136,8 +142,12 @@ class DetailStack(nn.Module):
         self.register_buffer("centre_m", centre_m, persistent=False)
         self.query = nn.Embedding(1, width)
         self.cells = embedding_mlp(2, width)
-        self.roads_relation = relation_embedding(settings.heading_radius_m, bands, width)
-        self.agents_relation = relation_embedding(settings.heading_radius_m, bands, width)
+        self.roads_relation = relation_embedding(
+            settings.heading_query_radius_m, bands, width
+        )
+        self.agents_relation = relation_embedding(
+            settings.heading_query_radius_m, bands, width
+        )
         self.blocks = nn.ModuleList(
             QueryBlock(settings) for _ in range(settings.scene_blocks)
         )
@@ -147,20 +157,22 @@ class DetailStack(nn.Module):
         by_bin = settings.heading_token
         self.heading = mlp(width, width, grid.num_headings) if by_bin else None
         self.turn = None if by_bin else mlp(width, width, 1)
-        self.offset = mlp(width, width, 2) if settings.cell_token else None
-        features = settings.ground_width if by_bin else 0
+        self.offset = mlp(width, width, 2) if settings.position_token else None
+        features = settings.cell_feature_width if by_bin else 0
         self.bearings = Bearings(width, features, grid.num_headings) if features else None
 
     def roads_reach(self) -> Reach:
         """How the query sees roads."""
         s = self.settings
-        return Reach.of(s.heading_radius_m, s.heading_map_neighbours, self.roads_relation)
+        return Reach.of(
+            s.heading_query_radius_m, s.heading_query_map_neighbours, self.roads_relation
+        )
 
     def agents_reach(self) -> Reach:
         """How the query sees agents."""
         s = self.settings
         return Reach.of(
-            s.heading_radius_m, s.heading_agent_neighbours, self.agents_relation
+            s.heading_query_radius_m, s.heading_query_agent_neighbours, self.agents_relation
         )
 
     def forward(self, cell: Tensor, roads: Seen, agents: Seen) -> Tensor:
@@ -183,7 +195,7 @@ class DetailStack(nn.Module):
         Args:
             rows: What the features are of.
             x: Updated features [N, ..., D].
-            kind: ``AgentKind`` of each.
+            kind: ``AgentType`` of each.
             pose: Where it was asked [N, 3] ...
             roads: ... and the road tokens seen from there.
         """

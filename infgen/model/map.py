@@ -15,7 +15,7 @@ from infgen.model.signal_features import StopLines
 from infgen.tokens.map import LineKind, PointKind
 from infgen.tokens.scene_tokens import SignalClass
 from infgen.tokens.signals import REMEMBERED
-from infgen.tokens.vocabulary import RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,26 +38,26 @@ class RoadEncoder(nn.Module):
 
     curve_m: Tensor
 
-    def __init__(self, settings: ModelSettings, codebook: RoadCodebook) -> None:
+    def __init__(self, settings: ModelSettings, codebook: MapVocabulary) -> None:
         super().__init__()
         width = settings.width
         self.radius_m = settings.map_map_radius_m
-        self.step_lights = settings.step_lights
-        self.stop_lines = settings.light_ahead_m > 0
+        self.signals_each_step = settings.signals_each_step
+        self.stop_lines = settings.signal_ahead_m > 0
         self.neighbours = settings.map_map_neighbours
         curve_m = torch.from_numpy(codebook.curve_m.copy())
         self.register_buffer("curve_m", curve_m, persistent=False)
         self.curve = embedding_mlp(codebook.curve_m[0].size, width)
         self.point_kind = nn.Embedding(len(PointKind), width)
         self.line_kind = nn.Embedding(len(LineKind), width)
-        looks = len(SignalClass) + (REMEMBERED if self.step_lights else 0)
+        looks = len(SignalClass) + (REMEMBERED if self.signals_each_step else 0)
         self.signal = nn.Embedding(looks, width)
         self.relation = relation_embedding(self.radius_m, settings.fourier_bands, width)
         self.blocks = nn.ModuleList(
             Attention(width, settings.heads, settings.dropout, bipartite=False)
             for _ in range(settings.map_blocks)
         )
-        self.next_token = mlp(width, width, codebook.num_roads)
+        self.next_token = mlp(width, width, codebook.num_map_tokens)
 
     def look(self, roads: Roads) -> RoadSight:
         """Find who sees whom on the maps."""
@@ -84,7 +84,7 @@ class RoadEncoder(nn.Module):
         for block in self.blocks:
             x = block(x, around.seen(normed(x)))
         rows, features, lamps = sight.rows, normed(x), None
-        if self.step_lights:
+        if self.signals_each_step:
             looks, lamps = self._lamps(roads, rows, x)
             features = torch.cat([features, looks])
         lines = StopLines.of(roads) if self.stop_lines else None
@@ -115,7 +115,7 @@ class RoadEncoder(nn.Module):
         embedded: Tensor = gather(shapes, rows.pack(roads.token))
         embedded = embedded + self.point_kind(rows.pack(roads.point_kind))
         embedded = embedded + self.line_kind(rows.pack(roads.line_kind))
-        if self.step_lights:
+        if self.signals_each_step:
             return embedded
         return embedded + self.signal(rows.pack(roads.signal))
 

@@ -14,7 +14,7 @@ from jaxtyping import Float32, Int64
 from torch import Tensor, nn
 
 from infgen.model.layers import mlp
-from infgen.tokens.vocabulary import MotionCodebook
+from infgen.tokens.vocabulary import MotionVocabulary
 
 LONGEST_WAVE_M = 64.0
 """Longer than any move. Each wave is half as long as the one before it ..."""
@@ -34,16 +34,18 @@ class MoveHead(nn.Module):
 
     waves: Tensor
 
-    def __init__(self, width: int, move_width: int, codebook: MotionCodebook) -> None:
+    def __init__(
+        self, width: int, motion_feature_width: int, codebook: MotionVocabulary
+    ) -> None:
         super().__init__()
         waves = torch.from_numpy(_waves(codebook.end_pose))
         self.register_buffer("waves", waves, persistent=False)
         self.shape = nn.Sequential(
-            nn.Linear(waves.shape[-1], 2 * move_width),
+            nn.Linear(waves.shape[-1], 2 * motion_feature_width),
             nn.ReLU(),
-            nn.Linear(2 * move_width, move_width),
+            nn.Linear(2 * motion_feature_width, motion_feature_width),
         )
-        self.wanted = mlp(width, width, move_width)
+        self.wanted = mlp(width, width, motion_feature_width)
         self.usual = nn.Parameter(torch.zeros(waves.shape[:2]))
 
     def table(self) -> Tensor:

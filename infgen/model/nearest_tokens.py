@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
 from infgen.tokens.motion_tokens import make_move_table
-from infgen.tokens.vocabulary import MotionCodebook
+from infgen.tokens.vocabulary import MotionVocabulary
 
 _ROWS_AT_ONCE = 1024
 """Keeps the table of gaps (rows x moves) within 16 MiB."""
@@ -36,7 +36,7 @@ class MoveEnds:
     corners_m: Float64[Tensor, "3 move 8"]
 
     @classmethod
-    def of(cls, codebook: MotionCodebook, device: torch.device) -> "MoveEnds":
+    def of(cls, codebook: MotionVocabulary, device: torch.device) -> "MoveEnds":
         """Lay a codebook out on a device."""
         table = make_move_table(codebook)
         pose = torch.from_numpy(codebook.end_pose.copy()).to(device)
@@ -76,7 +76,7 @@ def nearest_of(
 
     Args:
         wanted: Where to, in the frame of each move's start.
-        kind: ``AgentKind`` of each row.
+        kind: ``AgentType`` of each row.
         choice: The moves to choose from; of equally near ones the first.
         ends: Where moves end.
     """

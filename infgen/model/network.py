@@ -26,7 +26,7 @@ from infgen.model.relations import Rows, relations
 from infgen.model.settings import ModelSettings
 from infgen.tokens.grid import Grid, make_grid
 from infgen.tokens.settings import TokenSettings
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 EGO = 0
 """Row of the ego, in batches as in simulation."""
@@ -41,8 +41,8 @@ class Network(nn.Module):
     def __init__(
         self,
         settings: ModelSettings,
-        motion: MotionCodebook,
-        roads: RoadCodebook,
+        motion: MotionVocabulary,
+        roads: MapVocabulary,
         grid: TokenSettings,
     ) -> None:
         super().__init__()
@@ -60,8 +60,10 @@ class Network(nn.Module):
         self.roads = RoadEncoder(settings, roads)
         self.embed = AgentEmbedding(settings, motion, cells)
         self.motion = MotionStack(settings, motion, CLOCK.token_s)
-        self.cells = CellStack(settings, cells) if settings.life_cycle else None
-        self.details = DetailStack(settings, cells) if settings.life_cycle else None
+        self.cells = CellStack(settings, cells) if settings.insertion_and_removal else None
+        self.details = (
+            DetailStack(settings, cells) if settings.insertion_and_removal else None
+        )
         self.apply(initialise)
 
     @property
@@ -69,15 +71,15 @@ class Network(nn.Module):
         """Cells and heading bins that entries are told in."""
         return make_grid(self.grid_settings)
 
-    def motion_codebook(self) -> MotionCodebook:
+    def motion_codebook(self) -> MotionVocabulary:
         """Return the moves that motion logits choose from."""
         names = ("motion_size_lw_m", "motion_path", "motion_real")
-        return MotionCodebook(*(self.get_buffer(n).numpy(force=True) for n in names))
+        return MotionVocabulary(*(self.get_buffer(n).numpy(force=True) for n in names))
 
-    def road_codebook(self) -> RoadCodebook:
+    def road_codebook(self) -> MapVocabulary:
         """Return the shapes of road tokens."""
         names = ("road_curve_m", "road_real")
-        return RoadCodebook(*(self.get_buffer(n).numpy(force=True) for n in names))
+        return MapVocabulary(*(self.get_buffer(n).numpy(force=True) for n in names))
 
     def forward(self, batch: Batch, *, hidden_roads: bool = False) -> Outputs:
         """Compute all logits, every token given the true ones before it.
@@ -140,7 +142,7 @@ class Network(nn.Module):
 
     def _past(self, agents: Agents, rows: Rows) -> tuple[Tensor, Tensor, Shared]:
         """Rows, presence and relations of every row's own past, oldest first [N, K]."""
-        window = self.settings.window_tokens
+        window = self.settings.temporal_window_tokens
 
         def past(values: Tensor) -> Tensor:
             padded = functional.pad(values, (0, 0, window, 0))  # [scene, token, agent]

@@ -18,42 +18,43 @@ class ModelSettings:
         scene_blocks: Blocks of the scene stack.
         fourier_bands: Learned frequencies per scalar.
         dropout: Of attention weights and feed-forward layers.
-        window_tokens: Past tokens that temporal attention sees.
+        temporal_window_tokens: Past tokens that temporal attention sees.
         map_map_radius_m: Reach of map tokens among themselves.
         map_agent_radius_m: Reach of an agent to the map.
         agent_agent_radius_m: Reach of agents among themselves.
-        query_radius_m: Reach of the query for a newcomer's cell.
-        heading_radius_m: Reach of the query for a newcomer's heading.
+        position_query_radius_m: Reach of the query for a newcomer's cell.
+        heading_query_radius_m: Reach of the query for a newcomer's heading.
         map_map_neighbours: Nearest map tokens that a map token sees.
         map_agent_neighbours: Nearest map tokens that an agent sees.
-        map_agent_ahead_m: They are those nearest to (and within the radius of) a point so
-            far ahead of the agent: what lies behind, it has passed.
-        map_agent_across: Whether an agent is also told how far to the side of each of them
-            it is: of a lane's tokens, how far off the lane's centre it drives.
+        map_agent_lookahead_m: They are those nearest to (and within the radius of) a point
+            so far ahead of the agent: what lies behind, it has passed.
+        map_agent_lateral_offset: Whether an agent is also told how far to the side of each
+            of them it is: of a lane's tokens, how far off the lane's centre it drives.
         agent_agent_neighbours: Nearest agents that an agent sees.
-        query_map_neighbours: Nearest map tokens that a query for a cell sees.
-        heading_map_neighbours: Nearest map tokens that a query for a heading sees.
-        heading_agent_neighbours: Nearest agents that a query for a heading sees.
-        max_entries: Newcomers per half second that are supervised (L').
-        life_cycle: Whether agents enter and leave. Without it nothing is left but motion:
-            SMART (SPEC 7.1). The next three switches are the ablations of SPEC 7.2.
-        leave_token: Whether the network says who leaves.
-        cell_token: Whether newcomers are placed by cell and offset, not by regression.
+        position_query_map_neighbours: Nearest map tokens that a query for a cell sees.
+        heading_query_map_neighbours: Nearest map tokens that a query for a heading sees.
+        heading_query_agent_neighbours: Nearest agents that a query for a heading sees.
+        max_insertions: Newcomers per half second that are supervised (L').
+        insertion_and_removal: Whether agents enter and leave. Without it nothing is left
+            but motion: SMART (SPEC 7.1). The next three switches are the ablations of SPEC
+            7.2.
+        remove_token: Whether the network says who leaves.
+        position_token: Whether newcomers are placed by cell and offset, not by regression.
         heading_token: Whether newcomers' headings are bins, not regressed.
-        pattern_tokens: Whether the network says at which steps of the next half second a
-            log would show the agent: detections flicker.
-        ground_width: Features of every cell by which newcomers' cells and headings are told
-            from the street that is there; 0 to tell them from the query alone, as the
-            paper does.
-        move_width: Features of every move by which the next one is told from where it
-            leads; 0 for a logit per move, each learned alone, as in the paper.
-        tell_ego: Whether the ego's embedding says that it is the ego: whoever records is
-            under way, where one that looks the same may be parked.
-        step_lights: Whether agents see traffic lights as they are in each half second, not
-            as they were at the end of the history; in rollouts, ``rollout.lights`` says
-            what they show. In half of the scenes of a training nobody looks at them after
-            the history, so that rollouts may go on without.
-        light_ahead_m: So far ahead every agent is told by itself what the traffic light of
+        validity_pattern_tokens: Whether the network says at which steps of the next half
+            second a log would show the agent: detections flicker.
+        cell_feature_width: Features of every cell by which newcomers' cells and headings
+            are told from the street that is there; 0 to tell them from the query alone, as
+            the paper does.
+        motion_feature_width: Features of every move by which the next one is told from
+            where it leads; 0 for a logit per move, each learned alone, as in the paper.
+        ego_embedding: Whether the ego's embedding says that it is the ego: whoever records
+            is under way, where one that looks the same may be parked.
+        signals_each_step: Whether agents see traffic lights as they are in each half
+            second, not as they were at the end of the history; in rollouts,
+            ``rollout.lights`` says what they show. In half of the scenes of a training
+            nobody looks at them after the history, so that rollouts may go on without.
+        signal_ahead_m: So far ahead every agent is told by itself what the traffic light of
             its lane shows, and for how long it has; 0 for only among all other road tokens.
     """
 
@@ -64,31 +65,31 @@ class ModelSettings:
     scene_blocks: int = 3
     fourier_bands: int = 64
     dropout: float = 0.1
-    window_tokens: int = 12
+    temporal_window_tokens: int = 12
     map_map_radius_m: float = 10.0
     map_agent_radius_m: float = 30.0
     agent_agent_radius_m: float = 60.0
-    query_radius_m: float = 75.0
-    heading_radius_m: float = 10.0
+    position_query_radius_m: float = 75.0
+    heading_query_radius_m: float = 10.0
     map_map_neighbours: int = 32
     map_agent_neighbours: int = 64
-    map_agent_ahead_m: float = 0.0
-    map_agent_across: bool = False
+    map_agent_lookahead_m: float = 0.0
+    map_agent_lateral_offset: bool = False
     agent_agent_neighbours: int = 64
-    query_map_neighbours: int = 256
-    heading_map_neighbours: int = 32
-    heading_agent_neighbours: int = 16
-    max_entries: int = 10
-    life_cycle: bool = True
-    leave_token: bool = True
-    cell_token: bool = True
+    position_query_map_neighbours: int = 256
+    heading_query_map_neighbours: int = 32
+    heading_query_agent_neighbours: int = 16
+    max_insertions: int = 10
+    insertion_and_removal: bool = True
+    remove_token: bool = True
+    position_token: bool = True
     heading_token: bool = True
-    pattern_tokens: bool = False
-    ground_width: int = 0
-    move_width: int = 0
-    tell_ego: bool = False
-    step_lights: bool = False
-    light_ahead_m: float = 0.0
+    validity_pattern_tokens: bool = False
+    cell_feature_width: int = 0
+    motion_feature_width: int = 0
+    ego_embedding: bool = False
+    signals_each_step: bool = False
+    signal_ahead_m: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse what no network can be made of.
@@ -96,7 +97,13 @@ class ModelSettings:
         Raises:
             ConfigError: naming the setting, its value and what is expected.
         """
-        one_or_more = ("width", "heads", "motion_blocks", "fourier_bands", "window_tokens")
+        one_or_more = (
+            "width",
+            "heads",
+            "motion_blocks",
+            "fourier_bands",
+            "temporal_window_tokens",
+        )
         bounds = {
             **dict.fromkeys(one_or_more, (1, math.inf)),
             **{f.name: (1, math.inf) for f in fields(self) if "_neighbours" in f.name},
@@ -108,8 +115,8 @@ class ModelSettings:
                 f"model.width is {self.width}; expected a multiple of model.heads "
                 f"({self.heads})"
             )
-        if self.light_ahead_m and not self.step_lights:
+        if self.signal_ahead_m and not self.signals_each_step:
             raise ConfigError(
-                f"model.light_ahead_m is {self.light_ahead_m:g}, which needs "
-                "model.step_lights=true; set that as well, or model.light_ahead_m=0"
+                f"model.signal_ahead_m is {self.signal_ahead_m:g}, which needs "
+                "model.signals_each_step=true; set that as well, or model.signal_ahead_m=0"
             )

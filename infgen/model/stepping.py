@@ -164,7 +164,7 @@ class Stepper:
             self._asking = _Asking.of(network.cells, network.details)
 
     @property
-    def life_cycle(self) -> bool:
+    def insertion_and_removal(self) -> bool:
         """Whether agents can enter; if not, the network knows motion only."""
         return self._asking is not None
 
@@ -178,12 +178,12 @@ class Stepper:
         """Encode maps and start with an empty past.
 
         Args:
-            roads: Map of each scene (``batch.collate_roads(records, max_roads)``).
+            roads: Map of each scene (``batch.collate_roads(records, max_map_tokens)``).
             scene: Which of those scenes each rollout plays.
             rows: Places for agents.
         """
         settings = self.network.settings
-        shape = (len(scene), rows, settings.window_tokens)
+        shape = (len(scene), rows, settings.temporal_window_tokens)
         pose = torch.zeros((*shape, 3), device=scene.device)
         features = pose.new_zeros((settings.motion_blocks, *shape, settings.width))
         return Memory(
@@ -349,7 +349,7 @@ class Stepper:
     def _asked(self) -> _Asking:
         if self._asking is None:
             raise ValueError(
-                "these weights know motion only (model.life_cycle is false): "
+                "these weights know motion only (model.insertion_and_removal is false): "
                 "nobody can enter"
             )
         return self._asking

@@ -17,7 +17,7 @@ class Column:
     """All agents of all rollouts at the end of one half second.
 
     Attributes:
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         size_lwh_m: Boxes.
         pose: Quantised x, y, heading (world frame of the scene).
         move: Move that led here, ``FIRST_MOVE`` where entering, else ``NO_MOVE``.
@@ -102,7 +102,7 @@ class EntryDetails:
     """Who enters at a place: sample a kind, then take that kind's row of the others.
 
     Attributes:
-        kind_logits: ``AgentKind`` given the cell.
+        kind_logits: ``AgentType`` given the cell.
         size_lwh_m: Box, given the kind.
         heading_logits: Heading bin relative to the ego, given the kind ...
         turned_rad: ... or the heading itself, relative to the ego.

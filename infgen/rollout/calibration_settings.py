@@ -24,19 +24,19 @@ class CalibrateSettings:
             the rollouts that are scored, but as long as those, and with as much of a map.
         scenes: Scenes to play, evenly spread over those of the split, each once with every
             pair of biases; 0 for all.
-        scenes_per_task: Scenes of one unit of work.
-        add_reach: Plays are up to this far above the odds' own bias of entering; what is
-            taken may lie half as far again to either side.
-        leave_reach: The same for leaving, above and below.
+        scenes_per_unit: Scenes of one unit of work.
+        add_bias_range: Plays are up to this far above the odds' own bias of entering; what
+            is taken may lie half as far again to either side.
+        remove_bias_range: The same for leaving, above and below.
         count_radius_m: Agents nearer to the ego are counted.
     """
 
     by: str = "odds"
     split: str = "training"
     scenes: int = 48
-    scenes_per_task: int = 16
-    add_reach: float = 0.8
-    leave_reach: float = 0.3
+    scenes_per_unit: int = 16
+    add_bias_range: float = 0.8
+    remove_bias_range: float = 0.3
     count_radius_m: float = 75.0
 
     def __post_init__(self) -> None:
@@ -48,7 +48,7 @@ class CalibrateSettings:
         if self.by not in WAYS:
             ways = ", ".join(WAYS[:-1])
             raise ConfigError(f"calibrate.by is {self.by!r}; expected {ways} or {WAYS[-1]}")
-        for name in ("add_reach", "leave_reach"):
+        for name in ("add_bias_range", "remove_bias_range"):
             if not getattr(self, name) > 0:
                 raise ConfigError(
                     f"calibrate.{name} is {getattr(self, name)}; expected more than 0 "
@@ -56,7 +56,7 @@ class CalibrateSettings:
                 )
         bounds = (
             ("scenes", 0, math.inf),
-            ("scenes_per_task", 1, math.inf),
+            ("scenes_per_unit", 1, math.inf),
             ("count_radius_m", 0, math.inf),
         )
         check_bounds(self, "calibrate", bounds)

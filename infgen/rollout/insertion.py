@@ -45,7 +45,7 @@ class Asking:
     @property
     def tries(self) -> int:
         """How often a newcomer may be asked for."""
-        return 1 if self.room is None else self.player.settings.entry_tries
+        return 1 if self.room is None else self.player.settings.max_insertion_attempts
 
     def luck(self, token: int, turn: int, attempt: int = 0) -> Luck:
         """Random numbers of a newcomer of each rollout."""
@@ -72,7 +72,7 @@ class Asking:
         if self.wanted is not None:
             there = population.count_others(self.player.grid.radius_m)
             # One is asked for after another: how many come is proportional to the odds.
-            bias += settings.keep_count * np.log((self.wanted + 1) / (there + 1))
+            bias += settings.density_control * np.log((self.wanted + 1) / (there + 1))
         return bias
 
 
@@ -121,7 +121,7 @@ def add_newcomers(
     player, everyone = asking.player, np.arange(len(asking.streams))
     entries = player.stepper.entry_begin(memory, player.column(population))
     party = _Party(asking, entries, population, everyone)
-    for turn in range(player.settings.max_entries):
+    for turn in range(player.settings.max_insertions):
         party, newcomers = _next_newcomers(party, token, turn)
         if newcomers is None:
             break
@@ -216,9 +216,9 @@ def _place(
         drawn = choose(
             query.cell_logits.masked_fill(player.tensor(taken), float("-inf")),
             luck(Purpose.CELL),
-            settings.top_cells,
-            nucleus=settings.cell_nucleus,
-            temperature=settings.cell_temperature,
+            settings.position_top_k,
+            nucleus=settings.position_top_p,
+            temperature=settings.position_temperature,
         )
         cell = drawn.cpu().numpy().astype(np.int16)
         return cell, decode_cell(cell, grid)

@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float32, Int64
 
 from infgen.geometry import boxes_overlap, to_world
 from infgen.rollout.population import EGO_ROW, Newcomers, Population, entry_pose
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.map import LineKind
 from infgen.tokens.scene_tokens import Presence, SceneTokens
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 NOWHERE_M = np.float32(1e9)
 """Where padding of the lanes lies."""
@@ -48,8 +48,8 @@ class Room:
     ) -> Bool[np.ndarray, " rollout"]:
         """Tell which newcomers may stand where they are to enter."""
         pose = entry_pose(population.pose[:, EGO_ROW], newcomers)
-        on_foot = newcomers.kind == AgentKind.PEDESTRIAN
-        passed = on_foot[:, None] & (population.kind == AgentKind.PEDESTRIAN)
+        on_foot = newcomers.kind == AgentType.PEDESTRIAN
+        passed = on_foot[:, None] & (population.kind == AgentType.PEDESTRIAN)
         in_the_way = np.zeros(len(pose), dtype=bool)
         for everyone in (population.pose, self._soon(population)):
             on_somebody = boxes_overlap(
@@ -62,7 +62,7 @@ class Room:
             in_the_way |= on_somebody.any(axis=1)
         laneless = (self.start_m == NOWHERE_M).all(axis=(1, 2))[self.scene]
         by_a_lane = self.lane_distance_m(pose[:, :2]) <= self.lane_m
-        by_a_lane |= laneless | (newcomers.kind != AgentKind.VEHICLE)
+        by_a_lane |= laneless | (newcomers.kind != AgentType.VEHICLE)
         return by_a_lane & ~in_the_way
 
     def _soon(self, population: Population) -> Float32[np.ndarray, "rollout row 3"]:
@@ -86,7 +86,7 @@ class Room:
 
 def make_room(
     maps: Sequence[SceneTokens],
-    books: tuple[MotionCodebook, RoadCodebook],
+    books: tuple[MotionVocabulary, MapVocabulary],
     scene: Int64[np.ndarray, " rollout"],
     lane_m: float,
 ) -> Room:
@@ -102,7 +102,7 @@ def make_room(
     return Room(start_m, along_m, scene, lane_m, moves.end_pose)
 
 
-def _lanes(tokens: SceneTokens, roads: RoadCodebook) -> tuple[np.ndarray, np.ndarray]:
+def _lanes(tokens: SceneTokens, roads: MapVocabulary) -> tuple[np.ndarray, np.ndarray]:
     """First points of a map's lane tokens, and the way to their last points."""
     rows = tokens.road_line_kind == LineKind.LANE
     end_m = roads.curve_m[tokens.road_token[rows], -1]

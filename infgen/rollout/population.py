@@ -16,7 +16,7 @@ from infgen.geometry import to_world, wrap_angle
 from infgen.rollout.recording import NOBODY, Start
 from infgen.tokens.grid import Grid, encode_cell, from_grid, to_grid
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
-from infgen.tokens.vocabulary import MotionCodebook
+from infgen.tokens.vocabulary import MotionVocabulary
 
 EGO_ROW = 0
 
@@ -28,7 +28,7 @@ class Population:
     Attributes:
         life: Number of the agent in its rollout, or ``NOBODY`` in a free row.
         born: Lives so far in each rollout.
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         size_lwh_m: Boxes.
         pose: x, y, heading in the scene's frame.
         move: Move that led here, ``FIRST_MOVE`` where entering, else ``NO_MOVE``.
@@ -93,7 +93,7 @@ class Newcomers:
         who: Rollouts that have one; the other entries mean nothing.
         place_m: Where in the ego's grid frame.
         turned_rad: Heading relative to the ego.
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         size_lwh_m: Box.
     """
 
@@ -191,7 +191,7 @@ def move_on(
     population: Population,
     move: Int64[np.ndarray, "rollout row"],
     leave: Bool[np.ndarray, "rollout row"],
-    codebook: MotionCodebook,
+    codebook: MotionVocabulary,
 ) -> tuple[Population, Float32[np.ndarray, "rollout row 5 3"]]:
     """Move everyone by half a second; whoever was leaving is gone, its row free.
 

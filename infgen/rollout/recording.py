@@ -34,7 +34,7 @@ class Frame:
         leaving: Rows whose agent is there for the last time.
         born: Life of an agent placed at the end of this half second, else ``NOBODY``; its
             row is free in ``life``.
-        kind: ``AgentKind`` of every row after this half second.
+        kind: ``AgentType`` of every row after this half second.
         size_lwh_m: Box of every row after this half second.
     """
 

@@ -25,7 +25,7 @@ class Rollout:
         now: Last step of the history.
         ego: Row of the recording car.
         id: Track id of logged agents; inserted agents count on from the largest.
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         size_lwh_m: One box per agent.
         xyz_m: Box centres.
         heading_rad: Counter-clockwise from +x.

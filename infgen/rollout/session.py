@@ -81,7 +81,7 @@ class Session:
         self.token = starts[0].history.now
         self._table = make_move_table(player.codebook)
         self._lookout = look_out(
-            starts, player.codebook, stay_on_road=player.settings.stay_on_road
+            starts, player.codebook, reject_off_road=player.settings.reject_off_road
         )
         self._standing = player.tensor(player.codebook.standing)
         self._driven_to: np.ndarray | None = None
@@ -181,8 +181,8 @@ class Session:
         driven[:, EGO_ROW] = ego_path is not None
         move = self._take_care(before, said, token, move, driven)
         moved, path = move_on(before, move, leave, player.codebook)
-        if settings.removes and settings.leave_radius_m:
-            moved = leave_beyond(before, moved, settings.leave_radius_m)
+        if settings.removes and settings.removal_radius_m:
+            moved = leave_beyond(before, moved, settings.removal_radius_m)
         if ego_path is not None:
             path = path.copy()  # The population goes on from where the moves led.
             path[:, EGO_ROW] = ego_path
@@ -197,7 +197,7 @@ class Session:
         driven: Bool[np.ndarray, "rollout row"],
     ) -> Int64[np.ndarray, "rollout row"]:
         """Draw moves again that lead into somebody or off the road."""
-        tries, again = self._player.settings.move_tries, ~driven
+        tries, again = self._player.settings.max_motion_samples, ~driven
         slowest, changed = move.copy(), again
         for attempt in range(1, tries):
             # Whom the road and the others leave no way out is to spare the others.
@@ -261,7 +261,9 @@ class Session:
         stalled &= self._player.codebook.standing[before.kind, move]
         if not stalled.any():
             return move
-        attempt = self._player.settings.move_tries  # A number that no other draw has.
+        attempt = (
+            self._player.settings.max_motion_samples
+        )  # A number that no other draw has.
         return self._moves_again(before, said, token, attempt, move, stalled, stalled)
 
     def _draw(self, logits: Tensor, kind: Tensor, luck: Tensor) -> Tensor:
@@ -270,10 +272,10 @@ class Session:
         return choose(
             logits,
             luck,
-            settings.top_moves,
-            nucleus=settings.move_nucleus,
-            temperature=settings.move_temperature,
-            apart=self._standing[kind] if settings.move_nucleus < 1 else None,
+            settings.motion_top_k,
+            nucleus=settings.motion_top_p,
+            temperature=settings.motion_temperature,
+            apart=self._standing[kind] if settings.motion_top_p < 1 else None,
         )
 
     def _leaves(self, said: MotionStep, token: int) -> Bool[np.ndarray, "rollout row"]:
@@ -281,7 +283,7 @@ class Session:
         if packed.leave_logit is None or not settings.removes:
             return np.zeros(self.population.life.shape, dtype=bool)
         luck = self._luck(packed.rows, token, Purpose.LEAVE)
-        leave = happens(packed.leave_logit, luck, settings.leave_bias)
+        leave = happens(packed.leave_logit, luck, settings.remove_bias)
         return packed.rows.spread(leave).cpu().numpy()
 
     def _luck(self, rows: Rows, token: int, purpose: Purpose, attempt: int = 0) -> Tensor:
@@ -318,14 +320,14 @@ def _lay_out(starts: Sequence[Start]) -> Roads:
     histories = [start.history for start in maps]
     return collate_roads(
         histories,
-        max(history.num_roads for history in histories),
+        max(history.num_map_tokens for history in histories),
         [start.lights for start in maps],
     )
 
 
 def _be_patient(player: Player, roads: Roads, starts: Sequence[Start]) -> Patience | None:
     """Remember who stands, if nobody is to stand for ever."""
-    tokens = math.ceil(player.settings.patience_s / CLOCK.token_s)
+    tokens = math.ceil(player.settings.max_stall_s / CLOCK.token_s)
     if not tokens:
         return None
     maps, scene = number_maps(starts)
@@ -334,7 +336,7 @@ def _be_patient(player: Player, roads: Roads, starts: Sequence[Start]) -> Patien
 
 def _keep_full(player: Player, starts: Sequence[Start], now: Population) -> Fullness | None:
     """Remember how full the street is at now, if it is to stay so."""
-    if not (player.inserts and player.settings.keep_count):
+    if not (player.inserts and player.settings.density_control):
         return None
     return Fullness.of(starts, now, player.grid.radius_m)
 
@@ -351,9 +353,12 @@ def _begin(
     histories = [start.history for start in maps]
     memory = player.stepper.begin(roads, player.tensor(scene), first.life.shape[1])
     settings, room = player.settings, None
-    if settings.entry_mask:
+    if settings.insertion_mask:
         room = make_room(
-            histories, (player.codebook, player.roads), scene, settings.entry_lane_m
+            histories,
+            (player.codebook, player.roads),
+            scene,
+            settings.insertion_lane_distance_m,
         )
     most = np.maximum(settings.max_agents, first.num_agents)
     return memory, Asking(player, streams, room, most)

@@ -50,54 +50,57 @@ class RolloutSettings:
         seconds: Length of a rollout after the history; the mode's if None.
         count: Rollouts per scene.
         scenes: Scenes to play, evenly spread over those of the split; 0 for all.
-        scenes_per_task: Scenes of one unit of work.
+        scenes_per_unit: Scenes of one unit of work.
         batch: Rollouts that are played at once.
         everyone: Whether to play every agent of the log that is there at now, however far
-            from the ego, or those within ``tokenize.max_distance_m``; the mode's if None.
+            from the ego, or those within ``tokenize.max_ego_distance_m``; the mode's if
+            None.
         insert: Whether agents may enter; the mode's if None.
         remove: Whether agents may leave; the mode's if None.
-        leave_radius_m: Whoever gets farther from the ego leaves, if anyone may; 0 for
+        removal_radius_m: Whoever gets farther from the ego leaves, if anyone may; 0 for
             nobody. For weights that do not say who leaves (SPEC 7).
         lights: What traffic lights show after the history, to weights that see them change:
             ``now`` for nothing but what they showed last, ``log`` for what they do in the
             log while it goes on. Not in mode ``wosac``, which forbids to look.
         patterns: Whether agents are seen and lost as by a detector, with weights that have
             learned validity patterns.
-        top_moves: Most likely moves that are sampled from; 0 for all.
-        top_cells: Most likely cells that are sampled from; 0 for all.
-        move_nucleus: Least share of probability that the moves sampled from have together,
+        motion_top_k: Most likely moves that are sampled from; 0 for all.
+        position_top_k: Most likely cells that are sampled from; 0 for all.
+        motion_top_p: Least share of probability that the moves sampled from have together,
             the most likely first; 1 for all. Moves that stand still and those that do not
             have a nucleus each and keep their probability: who seldom sets off still does.
-        cell_nucleus: The same for cells.
-        move_tries: Moves that are drawn for who would run into somebody ahead within 1.5 s,
-            everybody going on alike, until one does not lead there; 1 for whatever is drawn
-            first, as in the paper.
-        stay_on_road: Whether half of these draws are also for vehicles that would leave the
-            road before they could stop, or go farther off it. Who is more than a metre off
-            may; who is too fast for every draw takes the slowest.
-        patience_s: Vehicles that have stood in a lane for so long set off, unless a light
+        position_top_p: The same for cells.
+        max_motion_samples: Moves that are drawn for who would run into somebody ahead
+            within 1.5 s, everybody going on alike, until one does not lead there; 1 for
+            whatever is drawn first, as in the paper.
+        reject_off_road: Whether half of these draws are also for vehicles that would leave
+            the road before they could stop, or go farther off it. Who is more than a metre
+            off may; who is too fast for every draw takes the slowest.
+        max_stall_s: Vehicles that have stood in a lane for so long set off, unless a light
             that is not green is ahead or they would run into somebody; 0 for who stands as
             long as it likes, as in the paper. A network that looks back for a few seconds
             takes whoever has stood all of them for parked.
-        move_temperature: Logits of moves are divided by it: below 1 the likely become
+        motion_temperature: Logits of moves are divided by it: below 1 the likely become
             likelier.
-        cell_temperature: The same for cells.
+        position_temperature: The same for cells.
         heading_temperature: The same for heading bins.
         add_bias: Added to the log-odds that one more agent enters, on top of what stage
             ``calibrate`` finds.
-        leave_bias: The same for an agent's leaving.
-        keep_count: How firmly the number of agents around the ego is held to what it was
-            at now: the odds that one more enters are multiplied by that number, over the
-            number there is, to this power; 0 for not at all, as in the paper. A network
+        remove_bias: The same for an agent's leaving.
+        density_control: How firmly the number of agents around the ego is held to what it
+            was at now: the odds that one more enters are multiplied by that number, over
+            the number there is, to this power; 0 for not at all, as in the paper. A network
             that looks back for a few seconds forgets how full the street was. Where a map
             ends there are to be fewer.
-        entry_mask: Whether newcomers are kept off other boxes, also off where these will be
-            in half a second, and vehicles near lanes. The paper lets them in anywhere.
-        entry_lane_m: Farthest from a lane's middle that a vehicle may enter. Most logged
-            newcomers are parked cars that come into view: of all, 47 % are within 5 m, 69 %
-            within 10 m, 78 % within 15 m; of those that drive, 96, 97 and 97 %.
-        entry_tries: Cells that are tried for one newcomer before there is none.
-        max_entries: Newcomers per half second.
+        insertion_mask: Whether newcomers are kept off other boxes, also off where these
+            will be in half a second, and vehicles near lanes. The paper lets them in
+            anywhere.
+        insertion_lane_distance_m: Farthest from a lane's middle that a vehicle may enter.
+            Most logged newcomers are parked cars that come into view: of all, 47 % are
+            within 5 m, 69 % within 10 m, 78 % within 15 m; of those that drive, 96, 97 and
+            97 %.
+        max_insertion_attempts: Cells that are tried for one newcomer before there is none.
+        max_insertions: Newcomers per half second.
         max_agents: Agents at any one time; or as many as a scene has at now, if more.
         seed: Of all random streams.
     """
@@ -107,31 +110,31 @@ class RolloutSettings:
     seconds: float | None = None
     count: int = 32
     scenes: int = 0
-    scenes_per_task: int = 8
+    scenes_per_unit: int = 8
     batch: int = 32
     everyone: bool | None = None
     insert: bool | None = None
     remove: bool | None = None
-    leave_radius_m: float = 0.0
+    removal_radius_m: float = 0.0
     lights: str = "now"
     patterns: bool = False
-    top_moves: int = 5
-    top_cells: int = 10
-    move_nucleus: float = 1.0
-    cell_nucleus: float = 1.0
-    move_tries: int = 1
-    stay_on_road: bool = False
-    patience_s: float = 0.0
-    move_temperature: float = 1.0
-    cell_temperature: float = 1.0
+    motion_top_k: int = 5
+    position_top_k: int = 10
+    motion_top_p: float = 1.0
+    position_top_p: float = 1.0
+    max_motion_samples: int = 1
+    reject_off_road: bool = False
+    max_stall_s: float = 0.0
+    motion_temperature: float = 1.0
+    position_temperature: float = 1.0
     heading_temperature: float = 1.0
     add_bias: float = 0.0
-    leave_bias: float = 0.0
-    keep_count: float = 0.0
-    entry_mask: bool = True
-    entry_lane_m: float = 15.0
-    entry_tries: int = 4
-    max_entries: int = 16
+    remove_bias: float = 0.0
+    density_control: float = 0.0
+    insertion_mask: bool = True
+    insertion_lane_distance_m: float = 15.0
+    max_insertion_attempts: int = 4
+    max_insertions: int = 16
     max_agents: int = 128
     seed: int = 0
 
@@ -159,52 +162,53 @@ class RolloutSettings:
                 "rollout.lights=log looks into the future, which rollout.mode=wosac "
                 "forbids; say rollout.lights=now"
             )
-        if self.stay_on_road and self.move_tries < 2:
+        if self.reject_off_road and self.max_motion_samples < 2:
             raise ConfigError(
-                "rollout.stay_on_road draws moves again, but rollout.move_tries is "
-                f"{self.move_tries}; say rollout.move_tries=32 too"
+                "rollout.reject_off_road samples again, but rollout.max_motion_samples "
+                f"is {self.max_motion_samples}; say rollout.max_motion_samples=32 too"
             )
-        if self.patience_s and self.move_tries < 2:
+        if self.max_stall_s and self.max_motion_samples < 2:
             raise ConfigError(
-                f"rollout.patience_s is {self.patience_s}, but rollout.move_tries is "
-                f"{self.move_tries}: who sets off may run into somebody; say "
-                "rollout.move_tries=32 too"
+                f"rollout.max_stall_s is {self.max_stall_s}, but rollout.max_motion_samples "
+                f"is {self.max_motion_samples}: a released vehicle may collide; say "
+                "rollout.max_motion_samples=32 too"
             )
         self._check_numbers()
 
     def _check_numbers(self) -> None:
-        for name in ("move_temperature", "cell_temperature", "heading_temperature"):
+        for name in ("motion_temperature", "position_temperature", "heading_temperature"):
             if not getattr(self, name) > 0:
                 raise ConfigError(
                     f"rollout.{name} is {getattr(self, name)}; expected more than 0 "
-                    "(for the most likely alone, say rollout.top_moves=1)"
+                    "(for the most likely alone, say rollout.motion_top_k=1)"
                 )
-        for name in ("move_nucleus", "cell_nucleus"):
+        for name in ("motion_top_p", "position_top_p"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigError(
                     f"rollout.{name} is {getattr(self, name)}; expected up to 1, above 0"
                 )
         one_or_more = (
-            "count", "scenes_per_task", "batch", "move_tries", "entry_tries", "max_agents"
+            "count", "scenes_per_unit", "batch",
+            "max_motion_samples", "max_insertion_attempts", "max_agents",
         )  # fmt: skip
         bounds = {
             **dict.fromkeys(one_or_more, (1, math.inf)),
-            **dict.fromkeys(("add_bias", "leave_bias"), (-math.inf, math.inf)),
+            **dict.fromkeys(("add_bias", "remove_bias"), (-math.inf, math.inf)),
             "seed": (0, 2**63 - 1),
         }
         check_numbers(self, "rollout", bounds)
         try:
-            CLOCK.tokens_in(self.length_s)
+            CLOCK.tokens_in(self.duration_s)
         except ValueError as error:
             raise ConfigError(f"rollout.seconds: {error}") from error
 
     @property
-    def length_s(self) -> float:
+    def duration_s(self) -> float:
         """Seconds that are played."""
         return MODES[self.mode].seconds if self.seconds is None else self.seconds
 
     @property
-    def plays_everyone(self) -> bool:
+    def simulates_all_agents(self) -> bool:
         """Whether agents however far away are played."""
         return MODES[self.mode].everyone if self.everyone is None else self.everyone
 

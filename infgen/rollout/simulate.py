@@ -16,5 +16,5 @@ def simulate(player: Player, starts: Sequence[Start]) -> Iterator[Frame]:
         starts: Scenes to continue; several rollouts of one scene share its map.
     """
     session = Session(player, starts)
-    for _ in range(CLOCK.tokens_in(player.settings.length_s)):
+    for _ in range(CLOCK.tokens_in(player.settings.duration_s)):
         yield session.step()

@@ -14,7 +14,7 @@ from infgen.rollout.random_streams import Purpose, Stream, uniforms
 from infgen.rollout.settings import RolloutSettings
 from infgen.tokens.grid import Grid, make_grid
 from infgen.tokens.settings import TokenSettings
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +31,8 @@ class Player:
     """
 
     stepper: Stepper
-    codebook: MotionCodebook
-    roads: RoadCodebook
+    codebook: MotionVocabulary
+    roads: MapVocabulary
     tokens: TokenSettings
     settings: RolloutSettings
     device: torch.device
@@ -45,12 +45,12 @@ class Player:
     @property
     def inserts(self) -> bool:
         """Whether agents enter: they may, and the network can tell who."""
-        return self.settings.inserts and self.stepper.life_cycle
+        return self.settings.inserts and self.stepper.insertion_and_removal
 
     @property
     def plays(self) -> str:
         """What these weights and settings play, in words."""
-        removes = self.stepper.leaves or self.settings.leave_radius_m > 0
+        removes = self.stepper.leaves or self.settings.removal_radius_m > 0
         words = [
             word
             for word, done in (

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32
 
-from infgen.scene import AgentKind, Tracks
+from infgen.scene import AgentType, Tracks
 from infgen.sources import wire
 from infgen.sources.batch import decode, messages
 from infgen.sources.tfrecord import RecordError
@@ -133,8 +133,8 @@ def origin_near(tracks: WorldTracks, ego: int, now: int) -> Float64[np.ndarray, 
 
 
 def _kinds(types: Int32[np.ndarray, " agent"]) -> np.ndarray:
-    """Turn WOMD's object types into ``AgentKind``: less one; the unset ones are other."""
-    return np.where(types == 0, AgentKind.OTHER, types - 1).astype(np.int8)
+    """Turn WOMD's object types into ``AgentType``: less one; the unset ones are other."""
+    return np.where(types == 0, AgentType.OTHER, types - 1).astype(np.int8)
 
 
 def _check_unique(ids: list[int]) -> None:

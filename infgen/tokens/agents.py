@@ -20,14 +20,14 @@ from infgen.tokens.insertion import (
     Entries,
     decode_entries,
     encode_entries,
-    entry_order,
+    insertion_order,
     join_entries,
 )
 from infgen.tokens.motion_tokens import MoveTable, advance, nearest_moves
 from infgen.tokens.presence import live, observe, resumes, seen_tokens
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence, SceneTokens
 from infgen.tokens.tracks import Paths
-from infgen.tokens.vocabulary import MotionCodebook
+from infgen.tokens.vocabulary import MotionVocabulary
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ def replay(
     entries: Entries,
     anchors: Anchors,
     ego: int,
-    codebook: MotionCodebook,
+    codebook: MotionVocabulary,
     grid: Grid,
 ) -> AgentMatrix:
     """Move agents along their moves from where they enter. Inverse of ``match_agents``.
@@ -141,7 +141,7 @@ def matrix_of(tokens: SceneTokens) -> AgentMatrix:
 
 
 def decode_tracks(
-    matrix: AgentMatrix, codebook: MotionCodebook, clock: Clock = CLOCK
+    matrix: AgentMatrix, codebook: MotionVocabulary, clock: Clock = CLOCK
 ) -> tuple[Float32[np.ndarray, "agent step 3"], Bool[np.ndarray, "agent step"]]:
     """Draw agents at every 0.1 s step along the paths of their moves (SPEC 2.4).
 
@@ -198,7 +198,7 @@ def _move_on(
     kind: np.ndarray,
     move: np.ndarray,
     anchors: Anchors,
-    codebook: MotionCodebook,
+    codebook: MotionVocabulary,
 ) -> np.ndarray:
     pose = advance(pose, kind, move, codebook)
     pose[anchors.agent] = anchors.pose
@@ -209,7 +209,7 @@ def _in_order(
     coming: np.ndarray, logged: np.ndarray, ego_pose: np.ndarray, ego: int, order: str
 ) -> np.ndarray:
     """Order the rows of newcomers; the ego is always the first."""
-    coming = coming[entry_order(logged[coming], ego_pose, order)]
+    coming = coming[insertion_order(logged[coming], ego_pose, order)]
     return coming[np.argsort(coming != ego, kind="stable")]
 
 

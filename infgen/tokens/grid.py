@@ -69,7 +69,7 @@ def make_grid(settings: TokenSettings) -> Grid:
     Raises:
         ConfigError: if there would be more cells than an int16 can number.
     """
-    radius_m, step_m = settings.grid_radius_m, settings.grid_step_m
+    radius_m, step_m = settings.grid_radius_m, settings.grid_cell_m
     reach = int(radius_m / step_m + 1e-9)
     if 4 * reach * reach > np.iinfo(np.int16).max:
         raise ConfigError(
@@ -87,7 +87,7 @@ def make_grid(settings: TokenSettings) -> Grid:
         step_m=step_m,
         centre_m=centre_m.astype(np.float32),
         cell_at=cell_at,
-        num_headings=round(360 / settings.heading_step_deg),
+        num_headings=round(360 / settings.heading_bin_deg),
     )
 
 

@@ -86,7 +86,7 @@ def decode_entries(
     return np.concatenate([xy_m, heading_rad[:, None]], axis=-1)
 
 
-def entry_order(
+def insertion_order(
     pose: Float32[np.ndarray, "entry 3"], ego_pose: Float32[np.ndarray, "3"], order: str
 ) -> Int64[np.ndarray, " entry"]:
     """Order newcomers of one token by their ``entry_key``."""

@@ -15,7 +15,7 @@ from jaxtyping import Float32, Int8, Int16, Int32, Int64
 
 from infgen.geometry import rotate
 from infgen.scene import FeatureKind, LaneType, RoadEdgeType, RoadLineType, RoadMap
-from infgen.tokens.vocabulary import ROAD_SAMPLES, ROAD_SPACING_M, RoadCodebook
+from infgen.tokens.vocabulary import ROAD_SAMPLES, ROAD_SPACING_M, MapVocabulary
 
 POINTS_PER_PIECE = 11
 INTERVALS_PER_PIECE = POINTS_PER_PIECE - 1
@@ -115,7 +115,7 @@ class RoadPieces:
     feature_id: Int64[np.ndarray, " road"]
 
     @property
-    def num_roads(self) -> int:
+    def num_map_tokens(self) -> int:
         """Number of pieces."""
         return len(self.line)
 
@@ -168,13 +168,13 @@ def road_pieces(road_map: RoadMap) -> RoadPieces:
     )
 
 
-def match_roads(pieces: RoadPieces, codebook: RoadCodebook) -> Int16[np.ndarray, " road"]:
+def match_roads(pieces: RoadPieces, codebook: MapVocabulary) -> Int16[np.ndarray, " road"]:
     """Find the shape nearest to each piece: least sum of squared gaps of three points."""
     return match_curves(pieces.curve_m, codebook)
 
 
 def match_curves(
-    curve_m: Float32[np.ndarray, "road 11 2"], codebook: RoadCodebook
+    curve_m: Float32[np.ndarray, "road 11 2"], codebook: MapVocabulary
 ) -> Int16[np.ndarray, " road"]:
     """Find the shape nearest to each curve in the frame of its piece.
 

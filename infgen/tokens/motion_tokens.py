@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int16
 
 from infgen.geometry import box_corners, to_local, to_world
-from infgen.tokens.vocabulary import MotionCodebook
+from infgen.tokens.vocabulary import MotionVocabulary
 
 _ROWS_AT_ONCE = 4096
 """Keeps the table of gaps (rows x moves) within 32 MiB."""
@@ -35,14 +35,14 @@ class MoveTable:
         corners_m: Corners of each kind's box at each move's end: x of the four, then y.
     """
 
-    codebook: MotionCodebook
+    codebook: MotionVocabulary
     reach_m: Float32[np.ndarray, " 3"]
     weights: Float32[np.ndarray, "3 5 move"]
     corners_m: Float64[np.ndarray, "3 move 8"]
 
 
 @lru_cache(maxsize=4)
-def make_move_table(codebook: MotionCodebook) -> MoveTable:
+def make_move_table(codebook: MotionVocabulary) -> MoveTable:
     """Lay a codebook out for matching; of the last few codebooks only once."""
     reach_m = np.linalg.norm(codebook.size_lw_m, axis=1) / np.float32(2)
     spread = _spread(codebook.end_pose, reach_m[:, None]).swapaxes(1, 2)
@@ -85,7 +85,7 @@ def nearest_moves(
     Args:
         target: Where each agent is at the end of the move.
         pose: Where the move starts.
-        kind: ``AgentKind`` of each agent.
+        kind: ``AgentType`` of each agent.
         table: The moves to choose from.
     """
     return nearest_few(target, pose, kind, table, 1)[:, 0]
@@ -117,7 +117,7 @@ def advance(
     pose: Float32[np.ndarray, "agent 3"],
     kind: Int8[np.ndarray, " agent"],
     move: Int16[np.ndarray, " agent"],
-    codebook: MotionCodebook,
+    codebook: MotionVocabulary,
 ) -> Float32[np.ndarray, "agent 3"]:
     """Move agents on by half a second; who has no move (a negative one) stays."""
     end = codebook.end_pose[kind, np.maximum(move, 0)]
@@ -181,7 +181,7 @@ def _candidates(
         slack = np.float32(5e-6) * (square[rows] + twice)
         flat = np.flatnonzero(gap <= (twice - square[rows] + slack)[:, None])
         found.append(flat + ends[number] * gap.shape[1])
-    return np.divmod(np.concatenate(found), table.codebook.num_moves)
+    return np.divmod(np.concatenate(found), table.codebook.num_motion_tokens)
 
 
 def _mean_gap(one_m: np.ndarray, other_m: np.ndarray) -> np.ndarray:

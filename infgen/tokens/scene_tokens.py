@@ -63,7 +63,7 @@ class SceneTokens:
         now: Token that ends at the last step of the history (1 in WOMD).
         ego: Row of the recording car.
         track_id: Id of each kept agent's track.
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         size_lwh_m: One box per agent (mean over its observed steps).
         z_m: Height of the box centre at each token's end; meaningless where absent.
         pose: Quantised x, y, heading at each token's end; zero where absent. An agent that
@@ -150,6 +150,6 @@ class SceneTokens:
         return int(self.pose.shape[1])
 
     @property
-    def num_roads(self) -> int:
+    def num_map_tokens(self) -> int:
         """Number of road tokens."""
         return len(self.road_token)

@@ -17,7 +17,7 @@ from infgen.tokens.grid import make_grid
 from infgen.tokens.insertion import Entries
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_MOVE, Presence, SceneTokens, Word
 from infgen.tokens.settings import TokenSettings
-from infgen.tokens.vocabulary import MotionCodebook
+from infgen.tokens.vocabulary import MotionVocabulary
 
 _NOBODY = -1
 _MOVES, _CONTROLS, _ENTRIES, _END = range(4)
@@ -47,7 +47,7 @@ def write_words(matrix: AgentMatrix, entries: Entries, ego: int) -> Words:
 
 
 def decode_sequence(
-    tokens: SceneTokens, codebook: MotionCodebook, settings: TokenSettings
+    tokens: SceneTokens, codebook: MotionVocabulary, settings: TokenSettings
 ) -> AgentMatrix:
     """Read the agent matrix back from the stream. Inverse of ``write_words``.
 

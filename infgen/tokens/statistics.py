@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from infgen.clock import CLOCK, Clock
-from infgen.scene import AgentKind, Scene
+from infgen.scene import AgentType, Scene
 from infgen.tokens.presence import first_token, last_token
 from infgen.tokens.scene_tokens import NO_CELL, Presence, SceneTokens
 
@@ -90,7 +90,7 @@ def count(scene: Scene, tokens: SceneTokens, clock: Clock = CLOCK) -> Figures:
     return Figures(
         scenes=1,
         tokens=length,
-        roads=tokens.num_roads,
+        roads=tokens.num_map_tokens,
         words=len(tokens.word),
         agents=np.bincount(tokens.kind, minlength=3),
         late=np.bincount(tokens.kind[tokens.entry_agent[late]], minlength=3),
@@ -110,7 +110,7 @@ def describe(figures: Figures) -> dict[str, Any]:
     scenes, agents = max(1, figures.scenes), max(1, int(figures.agents.sum()))
     steps = max(1, int(figures.entering.sum()))
     newcomers = int(np.arange(len(figures.entering)) @ figures.entering)
-    kinds = [kind.name.lower() for kind in AgentKind if kind != AgentKind.OTHER]
+    kinds = [kind.name.lower() for kind in AgentType if kind != AgentType.OTHER]
     return {
         "scenes": figures.scenes,
         "tokens": figures.tokens,
@@ -145,7 +145,7 @@ def _errors(scene: Scene, tokens: SceneTokens, clock: Clock) -> np.ndarray:
     flat = tokens.kind[agent].astype(np.int64) * NUM_ERROR_BINS + np.minimum(
         bins, NUM_ERROR_BINS - 1
     )
-    counts = np.bincount(flat, minlength=len(AgentKind) * NUM_ERROR_BINS)
+    counts = np.bincount(flat, minlength=len(AgentType) * NUM_ERROR_BINS)
     return counts.reshape(-1, NUM_ERROR_BINS)[:3]
 
 

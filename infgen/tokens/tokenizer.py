@@ -16,13 +16,13 @@ from infgen.tokens.sequence import write_words
 from infgen.tokens.settings import TokenSettings
 from infgen.tokens.signals import Lights, signal_lines, signals_at
 from infgen.tokens.tracks import Paths, read_paths
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 
 def tokenize_scene(
     scene: Scene,
-    motion: MotionCodebook,
-    roads: RoadCodebook,
+    motion: MotionVocabulary,
+    roads: MapVocabulary,
     settings: TokenSettings,
     until: int | None = None,
     clock: Clock = CLOCK,
@@ -37,7 +37,7 @@ def tokenize_scene(
         until: Last step to look at. With ``until=scene.now`` the tokens are the history
             alone, as a simulation starts from: nothing later is read, and every agent
             observed at that step is kept, no other. (For agents however far from the ego
-            set ``max_distance_m`` to infinity.)
+            set ``max_ego_distance_m`` to infinity.)
         clock: Steps and tokens.
 
     Raises:
@@ -48,7 +48,7 @@ def tokenize_scene(
     paths = read_paths(scene, settings, until, clock)
     paths = paths.take(_kept(paths, whole_log=until is None))
     agents, entries, anchors = match_agents(
-        paths, make_move_table(motion), grid, settings.entry_order
+        paths, make_move_table(motion), grid, settings.insertion_order
     )
     words = write_words(agents, entries, paths.ego)
 
@@ -99,7 +99,7 @@ def read_lights(scene: Scene, clock: Clock = CLOCK) -> Lights:
 
 
 def _roads(
-    scene: Scene, roads: RoadCodebook, last: int, tokens: int, clock: Clock
+    scene: Scene, roads: MapVocabulary, last: int, tokens: int, clock: Clock
 ) -> dict[str, Any]:
     """Return the fields of ``SceneTokens`` that tell of the map and its signals."""
     pieces = road_pieces(scene.road_map)

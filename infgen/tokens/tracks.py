@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Int8, Int32, Int64, UInt8
 
 from infgen.clock import CLOCK, Clock
 from infgen.geometry import wrap_angle
-from infgen.scene import AgentKind, Scene, Tracks
+from infgen.scene import AgentType, Scene, Tracks
 from infgen.tokens.settings import TokenSettings
 from infgen.tokens.validity_patterns import encode_patterns
 
@@ -30,7 +30,7 @@ class Paths:
 
     Attributes:
         track_id: Id of each agent's track.
-        kind: ``AgentKind``; none is ``OTHER``.
+        kind: ``AgentType``; none is ``OTHER``.
         ego: Row of the recording car.
         size_lwh_m: Mean box over the observed steps.
         pose: x, y, heading at each border; meaningless where not valid.
@@ -101,12 +101,12 @@ def read_paths(
 
     away_m = filled.xyz_m[..., :2] - filled.xyz_m[ego, :, :2]
     distance_m = np.hypot(away_m[..., 0], away_m[..., 1])  # [agent, step]
-    known = filled.valid & filled.valid[ego] & (distance_m < settings.max_distance_m)
-    if settings.enter_distance_m > 0:
-        arrived = known & (distance_m < settings.enter_distance_m)
+    known = filled.valid & filled.valid[ego] & (distance_m < settings.max_ego_distance_m)
+    if settings.insertion_distance_m > 0:
+        arrived = known & (distance_m < settings.insertion_distance_m)
         arrived[:, scene.now] |= known[:, scene.now]
         known &= np.logical_or.accumulate(arrived, axis=1) | known[:, [scene.now]]
-    near = (known & (distance_m < settings.near_distance_m)).any(axis=1)
+    near = (known & (distance_m < settings.motion_loss_distance_m)).any(axis=1)
 
     pose, valid = _at_borders(filled, known, scene.now, tokens, clock)
     if not valid[ego].all():
@@ -163,7 +163,7 @@ def _check_time(scene: Scene, tokens: int, last: int, clock: Clock) -> None:
 def _road_users(scene: Scene, last: int) -> tuple[Tracks, int]:
     """Take the vehicles, pedestrians and cyclists up to a step, and the ego's new row."""
     tracks = scene.tracks
-    rows = np.flatnonzero((tracks.kind >= 0) & (tracks.kind < AgentKind.OTHER))
+    rows = np.flatnonzero((tracks.kind >= 0) & (tracks.kind < AgentType.OTHER))
     ego = np.flatnonzero(rows == scene.ego)
     if len(ego) == 0:
         raise TokensError(f"the ego is of kind {tracks.kind[scene.ego]}, no road user")

@@ -29,14 +29,14 @@ ROAD_SAMPLES = (0, 5, 10)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class MotionCodebook:
-    """The moves that agents choose from, ``num_moves`` for each of three kinds.
+class MotionVocabulary:
+    """The moves that agents choose from, ``num_motion_tokens`` for each of three kinds.
 
     The same row means another motion for another kind. Row ``STAND_STILL`` of each kind is
     the agent that stays where it is.
 
     Attributes:
-        size_lw_m: Box by which moves of each kind (row: ``AgentKind``) are compared.
+        size_lw_m: Box by which moves of each kind (row: ``AgentType``) are compared.
         path: Poses at steps 0 to 5 of each move, in the frame of step 0: pose 0 is zero.
         real: Whether a move is the mean of logged motion; False for a mirrored or made one.
     """
@@ -46,7 +46,7 @@ class MotionCodebook:
     real: Bool[np.ndarray, "3 move"]
 
     @property
-    def num_moves(self) -> int:
+    def num_motion_tokens(self) -> int:
         """Number of moves per kind."""
         return int(self.path.shape[1])
 
@@ -67,7 +67,7 @@ class MotionCodebook:
 
 
 @dataclass(frozen=True, slots=True)
-class RoadCodebook:
+class MapVocabulary:
     """The shapes that a road token may have.
 
     Attributes:
@@ -80,7 +80,7 @@ class RoadCodebook:
     real: Bool[np.ndarray, " road"]
 
     @property
-    def num_roads(self) -> int:
+    def num_map_tokens(self) -> int:
         """Number of shapes."""
         return len(self.curve_m)
 

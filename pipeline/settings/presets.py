@@ -16,9 +16,9 @@
           infgen: {published: InfGen, plays: [long, wosac]}
           smart:
             profile: smart              # over the preset's profile
-            plays: {long: {score: {enter_radius_m: 75}}, wosac: {}}
+            plays: {long: {score: {presence_radius_m: 75}}, wosac: {}}
           catk: {profile: "smart,closed-loop", start: smart, plays: [long]}
-          no-cell: {profile: no-cell-token, ablates: infgen, plays: [long]}
+          no-cell: {profile: no-position-token, ablates: infgen, plays: [long]}
 
 Sections of settings may stand in the preset itself, in an arm, in a play, and in a play of
 an arm; each is laid over those before it, and all of them over the profiles.

@@ -38,7 +38,15 @@ def narrow(settings: Settings) -> Settings:
             "calibrate": CalibrateSettings(by=by),
         }
     usual = RolloutSettings()
-    same = ("split", "scenes", "scenes_per_task", "batch", "add_bias", "leave_bias", "seed")
+    same = (
+        "split",
+        "scenes",
+        "scenes_per_unit",
+        "batch",
+        "add_bias",
+        "remove_bias",
+        "seed",
+    )
     rest = {name: getattr(usual, name) for name in same}
     return {**settings, "rollout": replace(played, count=1, **rest)}
 
@@ -81,7 +89,7 @@ def plan(inputs: Inputs, settings: Settings) -> list[Unit]:
 def _reach(weights: Path, how: CalibrateSettings) -> Any:
     from pipeline.stages.flow_response import Reach  # noqa: PLC0415
 
-    return Reach(read_biases(weights), how.add_reach, how.leave_reach)
+    return Reach(read_biases(weights), how.add_bias_range, how.remove_bias_range)
 
 
 def _parts(inputs: Inputs, how: CalibrateSettings) -> list[list[tuple[Done, list[int]]]]:
@@ -96,7 +104,7 @@ def _parts(inputs: Inputs, how: CalibrateSettings) -> list[list[tuple[Done, list
     )  # fmt: skip
     chosen = zip(files, spread(files, how.scenes), strict=True)
     scenes = [(done, row) for done, rows in chosen for row in rows]
-    most = how.scenes_per_task
+    most = how.scenes_per_unit
     parts = [scenes[at : at + most] for at in range(0, len(scenes), most)]
     return [
         [(done, [row for _, row in some]) for done, some in groupby(part, itemgetter(0))]
@@ -116,7 +124,7 @@ def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Re
     folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
     player, weights = load_player(folder, identity, played)
     starts, played_on, logs, refused = [], [], [], []
-    longest = CLOCK.tokens_in(player.settings.length_s)
+    longest = CLOCK.tokens_in(player.settings.duration_s)
     for scene in _scenes(unit):
         try:
             logged = from_log(scene, settings["tokenize"])
@@ -166,7 +174,7 @@ def finish(
     if units:
         found, about = _find(inputs, units, target, how)
     write_found(target, found)
-    return {"add_bias": found.add, "leave_bias": found.leave, **about}
+    return {"add_bias": found.add, "remove_bias": found.leave, **about}
 
 
 def _find(

@@ -43,7 +43,7 @@ class Biases:
         return replace(
             settings,
             add_bias=settings.add_bias + self.add,
-            leave_bias=settings.leave_bias + self.leave,
+            remove_bias=settings.remove_bias + self.leave,
         )
 
 
@@ -76,7 +76,7 @@ def read_biases(folder: Path) -> Biases:
     bins = found[-1] if found else {}
     return Biases(
         add=find_bias(bins["add_bins"]) if "add_bins" in bins else 0.0,
-        leave=find_bias(bins["stay_bins"]) if "stay_bins" in bins else 0.0,
+        leave=find_bias(bins["keep_bins"]) if "keep_bins" in bins else 0.0,
     )
 
 

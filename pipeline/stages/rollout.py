@@ -40,17 +40,17 @@ INDEX: Fields = {
 
 OF_ENTRIES = (
     "add_bias",
-    "keep_count",
-    "entry_mask",
-    "entry_lane_m",
-    "entry_tries",
-    "max_entries",
-    "top_cells",
-    "cell_nucleus",
-    "cell_temperature",
+    "density_control",
+    "insertion_mask",
+    "insertion_lane_distance_m",
+    "max_insertion_attempts",
+    "max_insertions",
+    "position_top_k",
+    "position_top_p",
+    "position_temperature",
     "heading_temperature",
 )
-OF_EXITS = ("leave_bias", "leave_radius_m")
+OF_EXITS = ("remove_bias", "removal_radius_m")
 
 
 def narrow(sections: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -78,7 +78,7 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
     shards = files_of(every, settings.split, to="play", setting="rollout.split")
     units = []
     for done, rows in zip(shards, spread(shards, settings.scenes), strict=True):
-        for first, after in pairwise(_edges(len(rows), settings.scenes_per_task)):
+        for first, after in pairwise(_edges(len(rows), settings.scenes_per_unit)):
             units.append(
                 Unit(
                     name=f"{done.name}-{rows[first]:05d}",
@@ -122,7 +122,7 @@ def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
         rows += [_row(unit.name, group, at, done) for at, done in enumerate(rollouts)]
     table(rows, INDEX).write_parquet(target / "index.parquet")
     pace = {"rollouts_per_s": round(_rate(len(rows), begun), 4)}
-    told = {"add_bias": settings.add_bias, "leave_bias": settings.leave_bias}
+    told = {"add_bias": settings.add_bias, "remove_bias": settings.remove_bias}
     return {**_report(rows, refused), **told, "plays": player.plays, "run": pace}
 
 
@@ -151,7 +151,7 @@ def finish(
     }
     refused = [line for done in units for line in done.report["refused"]]
     plays = sorted({done.report["plays"] for done in units})
-    biases = {name: units[0].report[name] for name in ("add_bias", "leave_bias") if units}
+    biases = {name: units[0].report[name] for name in ("add_bias", "remove_bias") if units}
     return {
         "rollouts": count,
         "plays": "; ".join(plays),

@@ -130,7 +130,7 @@ class _Scorer:
         from infgen.spatial.road_edges import edges_of  # noqa: PLC0415
         from pipeline.stages.score_write import rows_of  # noqa: PLC0415
 
-        edges, radius_m = edges_of(scene), self._settings.enter_radius_m
+        edges, radius_m = edges_of(scene), self._settings.presence_radius_m
         self.official.append(_score_wosac(scene, rollouts, self._settings.wosac))
         for rollout in rollouts:
             lived = live_within(rollout, radius_m) if radius_m else rollout

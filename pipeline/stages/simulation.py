@@ -68,8 +68,8 @@ def begin(player: "Player", scene: "Scene") -> "list[Start]":
     from infgen.tokens.tokenizer import read_lights, tokenize_scene  # noqa: PLC0415
 
     tokens, settings = player.tokens, player.settings
-    if settings.plays_everyone:
-        tokens = replace(tokens, max_distance_m=math.inf)
+    if settings.simulates_all_agents:
+        tokens = replace(tokens, max_ego_distance_m=math.inf)
     history = tokenize_scene(scene, player.codebook, player.roads, tokens, until=scene.now)
     lights = read_lights(scene) if settings.lights == "log" else None
     return [
@@ -94,13 +94,13 @@ def play_all(
     from infgen.rollout.recording import Frame, collect  # noqa: PLC0415
     from infgen.rollout.simulate import simulate  # noqa: PLC0415
 
-    length_s, done = player.settings.length_s, 0
-    few = max(1, int(TOGETHER_S / length_s))
+    duration_s, done = player.settings.duration_s, 0
+    few = max(1, int(TOGETHER_S / duration_s))
     for batch in _batches(starts, player.settings.batch):
         frames: list[Frame] = []
         for frame in simulate(player, batch):
             frames.append(frame)
-            tell(done + len(batch) * len(frames) * CLOCK.token_s / length_s)
+            tell(done + len(batch) * len(frames) * CLOCK.token_s / duration_s)
         done += len(batch)
         for first in range(0, len(batch), few):
             places = range(len(batch))[first : first + few]

@@ -138,7 +138,7 @@ class _Shard:
                 "row": len(self._pending),
                 "agents": tokens.num_agents,
                 "tokens": tokens.num_tokens,
-                "roads": tokens.num_roads,
+                "roads": tokens.num_map_tokens,
                 "words": len(tokens.word),
                 "entries": len(tokens.entry_agent),
             }

@@ -30,7 +30,7 @@ from infgen.tokens.clustering.physical_limits import limits_of
 from infgen.tokens.clustering.sample_keys import name_key
 from infgen.tokens.clustering.vocabularies import Origin, cluster_moves, cluster_roads
 from infgen.tokens.tracks import Paths, TokensError, read_paths
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from infgen.views.charts.vocabularies import codebook_page
 from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import Done, Inputs, Progress, Report, Source, Stage, Unit
@@ -85,21 +85,21 @@ class _Gathered(NamedTuple):
 class _Books(NamedTuple):
     """Both codebooks, the ``Origin`` of their rows, and the radius of a disk of roads."""
 
-    motion: MotionCodebook
+    motion: MotionVocabulary
     move_origin: np.ndarray
-    roads: RoadCodebook
+    roads: MapVocabulary
     road_origin: np.ndarray
     road_tolerance_m: float
 
 
-def load_codebooks(folder: Path) -> tuple[MotionCodebook, RoadCodebook]:
+def load_codebooks(folder: Path) -> tuple[MotionVocabulary, MapVocabulary]:
     """Read both codebooks from the folder of this stage.
 
     Raises:
         StoreError: if one is missing or damaged.
     """
-    motion = _read(folder / "motion.zarr", MotionCodebook, MOTION_SCHEMA)
-    roads = _read(folder / "roads.zarr", RoadCodebook, ROADS_SCHEMA)
+    motion = _read(folder / "motion.zarr", MotionVocabulary, MOTION_SCHEMA)
+    roads = _read(folder / "roads.zarr", MapVocabulary, ROADS_SCHEMA)
     return motion[0], roads[0]
 
 
@@ -122,14 +122,16 @@ def plan(inputs: Inputs, settings: VocabSettings) -> list[Unit]:
     """
     files = inputs.units("ingest")
     learn = [done for done in files if in_split(done.name, settings.split)]
-    held_out = [done for done in files if in_split(done.name, settings.held_out)]
-    if not learn and not (settings.start and held_out):
+    validation_split = [
+        done for done in files if in_split(done.name, settings.validation_split)
+    ]
+    if not learn and not (settings.start and validation_split):
         found = ", ".join(sorted({split_of(done.name) for done in files})) or "none"
         raise PlanError(
             f"no file of split {settings.split!r} to build vocabularies from (there is: "
             f"{found}); set build-vocab.split"
         )
-    others = [done for done in held_out if done not in learn]
+    others = [done for done in validation_split if done not in learn]
     roles = {done.name: LEARN if others else BOTH for done in learn}
     roles |= {done.name: HELD_OUT for done in others}
     return [
@@ -148,8 +150,10 @@ def work(unit: Unit, target: Path, settings: VocabSettings, progress: Progress) 
     role = unit.task["role"]
     samples = {side: _Sample(side, settings) for side in _SIDES}
     for scene in read_scenes_of(unit.task):
-        held_out = role == BOTH and name_key(scene.scenario_id) % HELD_OUT_EVERY == 0
-        samples[HELD_OUT if held_out or role == HELD_OUT else LEARN].take(scene)
+        validation_split = (
+            role == BOTH and name_key(scene.scenario_id) % HELD_OUT_EVERY == 0
+        )
+        samples[HELD_OUT if validation_split or role == HELD_OUT else LEARN].take(scene)
     for sample in samples.values():
         sample.write(target)
     return {"role": role, **{side: sample.scenes for side, sample in samples.items()}}
@@ -164,23 +168,25 @@ def finish(
 ) -> Report:
     """Cluster all samples, and measure the codebooks on what was held out."""
     progress(0, 4, "samples")
-    learn, held_out = (_gather(units, side, settings) for side in _SIDES)
+    learn, validation_split = (_gather(units, side, settings) for side in _SIDES)
     starts = [Path(source.url) for source in inputs.sources]
     books = _taken(starts[0]) if starts else _clustered(learn, settings, progress)
     motion, move_origin, roads, road_origin, road_tolerance_m = books
-    _write(target / "motion.zarr", [motion], MotionCodebook, MOTION_SCHEMA)
-    _write(target / "roads.zarr", [roads], RoadCodebook, ROADS_SCHEMA)
+    _write(target / "motion.zarr", [motion], MotionVocabulary, MOTION_SCHEMA)
+    _write(target / "roads.zarr", [roads], MapVocabulary, ROADS_SCHEMA)
 
     progress(3, 4, "coverage")
-    matches, familiar = (match_paths(side.paths, motion) for side in (held_out, learn))
+    matches, familiar = (
+        match_paths(side.paths, motion) for side in (validation_split, learn)
+    )
     report = {
         "scenes": {side: sum(done.report[side] for done in units) for side in _SIDES},
-        "held_out": _held_out_words(units, settings),
+        "validation_split": _held_out_words(units, settings),
         "tolerance_m": settings.tolerance_m,
         "road_tolerance_m": round(road_tolerance_m, 5),
         "motion": describe_moves(motion, move_origin, matches, familiar, settings),
         "roads": describe_roads(
-            roads, road_origin, held_out.curves.curve_m, learn.curves.curve_m
+            roads, road_origin, validation_split.curves.curve_m, learn.curves.curve_m
         ),
     }
     from pipeline.storage.zarr_store import write_file, write_json  # noqa: PLC0415
@@ -286,10 +292,10 @@ def _held_out_words(units: Sequence[Done], settings: VocabSettings) -> str:
     """Say in words what the coverage is measured on."""
     scenes = sum(done.report[HELD_OUT] for done in units)
     if any(done.report["role"] == HELD_OUT for done in units):
-        return f"{scenes} scenes of split {settings.held_out}"
+        return f"{scenes} scenes of split {settings.validation_split}"
     return (
         f"{scenes} scenes of split {settings.split}, held out by the hash of their id: "
-        f"there is no split {settings.held_out}"
+        f"there is no split {settings.validation_split}"
     )
 
 
@@ -298,7 +304,7 @@ def _headline(report: dict[str, Any]) -> Report:
     kinds = report["motion"].items()
     return {
         "scenes": report["scenes"][LEARN],
-        "held_out": report["held_out"],
+        "validation_split": report["validation_split"],
         "real": {kind: figures["real"] for kind, figures in kinds},
         "error_m": {
             kind: (figures["held_out_error_m"] or {}).get("mean") for kind, figures in kinds

@@ -16,7 +16,7 @@ from torch import Tensor
 from infgen.config import ModelSettings, TokenSettings, build
 from infgen.model.network import Network
 from infgen.pretrained import builtin_weights
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from pipeline.engine.atomic import StoreError, write_file, write_json
 from pipeline.engine.layout import read_json
 from pipeline.storage.initial_weights import ABOUT, WEIGHTS
@@ -104,7 +104,7 @@ def load_network(folder: Path) -> Network:
     return network.eval()
 
 
-def load_codebooks(folder: Path) -> tuple[MotionCodebook, RoadCodebook]:
+def load_codebooks(folder: Path) -> tuple[MotionVocabulary, MapVocabulary]:
     """Read the codebooks that the weights in a folder were trained with.
 
     Raises:
@@ -196,7 +196,7 @@ def read_about(folder: Path) -> dict[str, Any]:
     return about
 
 
-def vocabulary_fingerprint(motion: MotionCodebook, roads: RoadCodebook) -> str:
+def vocabulary_fingerprint(motion: MotionVocabulary, roads: MapVocabulary) -> str:
     """Identity of two codebooks: the same arrays, the same text."""
     digest = hashlib.sha256()
     for array in (motion.size_lw_m, motion.path, motion.real, roads.curve_m, roads.real):
@@ -210,10 +210,10 @@ def state_of(network: torch.nn.Module) -> dict[str, Tensor]:
     return {name: tensor.detach() for name, tensor in network.state_dict().items()}
 
 
-def _codebooks(tensors: Mapping[str, Tensor]) -> tuple[MotionCodebook, RoadCodebook]:
+def _codebooks(tensors: Mapping[str, Tensor]) -> tuple[MotionVocabulary, MapVocabulary]:
     return (
-        MotionCodebook(*_arrays(tensors, "motion_size_lw_m motion_path motion_real")),
-        RoadCodebook(*_arrays(tensors, "road_curve_m road_real")),
+        MotionVocabulary(*_arrays(tensors, "motion_size_lw_m motion_path motion_real")),
+        MapVocabulary(*_arrays(tensors, "road_curve_m road_real")),
     )
 
 

@@ -11,7 +11,7 @@ from infgen.config import ConfigError
 from infgen.exports.wosac import About, complete, encode_about, encode_futures, in_words
 from infgen.metrics.wosac.rollouts import Rollouts, RolloutsError
 from infgen.metrics.wosac.submission import read_submission
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from tests.exports.replays import replay, with_newcomer, without
 from tests.exports.submission_proto import Submission
 
@@ -38,7 +38,7 @@ def rollouts(scene):
 
 def of_other_kind(scene, row):
     kind = scene.tracks.kind.copy()
-    kind[row] = AgentKind.OTHER
+    kind[row] = AgentType.OTHER
     return replace(scene, tracks=replace(scene.tracks, kind=kind))
 
 

@@ -106,7 +106,7 @@ def test_a_long_rollout_is_counted_in_windows_as_long_as_its_log(played):
     back = shown(played, (-10, 5), (71, 80))
 
     def windows(rollout):
-        return count_turnover(from_rollout(rollout), 75.0, window_tokens=8)
+        return count_turnover(from_rollout(rollout), 75.0, temporal_window_tokens=8)
 
     assert windows(played) == Turnover(0, 0, agents=2 * 12, tokens=12)
     assert windows(late) == Turnover(1, 0, agents=12 + 5, tokens=12)
@@ -119,8 +119,10 @@ def test_windows_reach_from_the_first_half_second_to_the_last(played):
     """Three of 5 of 16 half seconds: 0 to 5, 5.5 to 10.5 and 11 to 16."""
     late = shown(played, (66, 80))
 
-    found = count_turnover(from_rollout(late), 75.0, window_tokens=5)
+    found = count_turnover(from_rollout(late), 75.0, temporal_window_tokens=5)
 
     assert found.tokens == 3 * 3
     assert found == Turnover(1, 0, agents=9 + 1, tokens=9)
-    assert count_turnover(from_rollout(late), 75.0, window_tokens=99) == count(late)
+    assert count_turnover(from_rollout(late), 75.0, temporal_window_tokens=99) == count(
+        late
+    )

@@ -19,10 +19,10 @@ from infgen.tokens.scene_tokens import (
     SceneTokens,
     SignalClass,
 )
-from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import BOX_LW_M, MapVocabulary, MotionVocabulary
 
 NUM_MOVES, NUM_ROADS = 24, 12
-GRID = TokenSettings(grid_radius_m=60.0, grid_step_m=4.0, heading_step_deg=10.0)
+GRID = TokenSettings(grid_radius_m=60.0, grid_cell_m=4.0, heading_bin_deg=10.0)
 TINY = ModelSettings(
     width=16,
     heads=2,
@@ -31,59 +31,64 @@ TINY = ModelSettings(
     scene_blocks=2,
     fourier_bands=4,
     dropout=0.0,
-    window_tokens=4,
+    temporal_window_tokens=4,
     map_map_neighbours=8,
     map_agent_neighbours=16,
     agent_agent_neighbours=6,
-    query_map_neighbours=24,
-    heading_map_neighbours=8,
-    heading_agent_neighbours=4,
-    max_entries=3,
-    map_agent_ahead_m=4.0,
-    map_agent_across=True,
-    ground_width=6,
-    move_width=10,
-    tell_ego=True,
-    step_lights=True,
-    light_ahead_m=15.0,
+    position_query_map_neighbours=24,
+    heading_query_map_neighbours=8,
+    heading_query_agent_neighbours=4,
+    max_insertions=3,
+    map_agent_lookahead_m=4.0,
+    map_agent_lateral_offset=True,
+    cell_feature_width=6,
+    motion_feature_width=10,
+    ego_embedding=True,
+    signals_each_step=True,
+    signal_ahead_m=15.0,
 )
 
 VARIANTS = {
     "full": {},
-    "smart": {"life_cycle": False},
-    "no leave token": {"leave_token": False},
-    "no cell token": {"cell_token": False},
+    "smart": {"insertion_and_removal": False},
+    "no leave token": {"remove_token": False},
+    "no cell token": {"position_token": False},
     "no heading token": {"heading_token": False},
-    "no leave, no cell token": {"leave_token": False, "cell_token": False},
-    "patterns": {"pattern_tokens": True},
+    "no leave, no cell token": {"remove_token": False, "position_token": False},
+    "patterns": {"validity_pattern_tokens": True},
     "the paper's": {
-        "ground_width": 0,
-        "move_width": 0,
-        "tell_ego": False,
-        "step_lights": False,
-        "light_ahead_m": 0.0,
-        "map_agent_ahead_m": 0.0,
-        "map_agent_across": False,
+        "cell_feature_width": 0,
+        "motion_feature_width": 0,
+        "ego_embedding": False,
+        "signals_each_step": False,
+        "signal_ahead_m": 0.0,
+        "map_agent_lookahead_m": 0.0,
+        "map_agent_lateral_offset": False,
     },
-    "smart with patterns": {"life_cycle": False, "pattern_tokens": True},
+    "smart with patterns": {
+        "insertion_and_removal": False,
+        "validity_pattern_tokens": True,
+    },
 }
 """Baselines and ablations of SPEC 7, and heads that are off by default."""
 
 
-def make_motion_codebook(num_moves=NUM_MOVES):
+def make_motion_codebook(num_motion_tokens=NUM_MOVES):
     random = np.random.default_rng(0)
-    end = random.uniform([0, -0.5, -0.3], [5, 0.5, 0.3], size=(3, num_moves, 3))
+    end = random.uniform([0, -0.5, -0.3], [5, 0.5, 0.3], size=(3, num_motion_tokens, 3))
     end[:, 0] = 0
     path = end[:, :, None] * np.linspace(0, 1, 6)[:, None]
-    real = np.ones((3, num_moves), dtype=bool)
-    return MotionCodebook(BOX_LW_M, path.astype(np.float32), real)
+    real = np.ones((3, num_motion_tokens), dtype=bool)
+    return MotionVocabulary(BOX_LW_M, path.astype(np.float32), real)
 
 
-def make_road_codebook(num_roads=NUM_ROADS):
-    bend = np.linspace(-0.1, 0.1, num_roads)[:, None] * np.arange(11)
+def make_road_codebook(num_map_tokens=NUM_ROADS):
+    bend = np.linspace(-0.1, 0.1, num_map_tokens)[:, None] * np.arange(11)
     steps = 0.5 * np.stack([np.cos(bend), np.sin(bend)], axis=-1)
-    curve = np.concatenate([np.zeros((num_roads, 1, 2)), steps.cumsum(axis=1)[:, :10]], 1)
-    return RoadCodebook(curve.astype(np.float32), np.ones(num_roads, dtype=bool))
+    curve = np.concatenate(
+        [np.zeros((num_map_tokens, 1, 2)), steps.cumsum(axis=1)[:, :10]], 1
+    )
+    return MapVocabulary(curve.astype(np.float32), np.ones(num_map_tokens, dtype=bool))
 
 
 def make_record(
@@ -100,7 +105,7 @@ def make_record(
     agents = len(lives)
     codebook = make_motion_codebook()
     kind = np.array([0, *random.choice(kinds, agents - 1)], dtype=np.int8)
-    move = random.integers(codebook.num_moves, size=(agents, tokens))
+    move = random.integers(codebook.num_motion_tokens, size=(agents, tokens))
     start = random.uniform(-1, 1, size=(agents, 3)) * [spread_m, spread_m, np.pi]
     start[0] = [0, 0, 0.4]
     pose = [start.astype(np.float32)]
@@ -224,7 +229,7 @@ def move_world(record, turn_rad, shift_m):
 
 @pytest.fixture(scope="session")
 def limits():
-    return Limits(agents=32, roads=200, entries=TINY.max_entries, tokens=18, grid=GRID)
+    return Limits(agents=32, roads=200, entries=TINY.max_insertions, tokens=18, grid=GRID)
 
 
 def make_network(settings=TINY, seed=0):
@@ -274,7 +279,7 @@ def grid_settings():
 
 @pytest.fixture(scope="session")
 def codebooks():
-    def make(num_moves=NUM_MOVES, num_roads=NUM_ROADS):
-        return make_motion_codebook(num_moves), make_road_codebook(num_roads)
+    def make(num_motion_tokens=NUM_MOVES, num_map_tokens=NUM_ROADS):
+        return make_motion_codebook(num_motion_tokens), make_road_codebook(num_map_tokens)
 
     return make

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from infgen.model.motion_head import MoveHead
-from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook
+from infgen.tokens.vocabulary import BOX_LW_M, MotionVocabulary
 
 WIDTH, FEATURES = 16, 12
 
@@ -15,7 +15,7 @@ def row_of_moves(kinds=3, spacing_m=0.1, count=40):
     path = np.zeros((kinds, count, 6, 3), np.float32)
     length_m = spacing_m * np.arange(count) * np.array([[1.0], [0.8], [0.6]])
     path[..., 0] = length_m[..., None] * np.linspace(0, 1, 6)
-    return MotionCodebook(BOX_LW_M, path, np.ones((kinds, count), bool))
+    return MotionVocabulary(BOX_LW_M, path, np.ones((kinds, count), bool))
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from infgen import geometry
 from infgen.model.nearest_tokens import MoveEnds, nearest, nearest_of, to_local, to_world
 from infgen.tokens.motion_tokens import advance, make_move_table, nearest_moves
-from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook
+from infgen.tokens.vocabulary import BOX_LW_M, MotionVocabulary
 
 CPU = torch.device("cpu")
 
@@ -19,7 +19,7 @@ def random_codebook(rng, moves=200):
     end[:, 0] = 0
     end[:, moves // 2] = end[:, 1]  # twins
     path = end[:, :, None] * np.linspace(0, 1, 6)[:, None]
-    return MotionCodebook(BOX_LW_M, path.astype(np.float32), np.ones((3, moves), bool))
+    return MotionVocabulary(BOX_LW_M, path.astype(np.float32), np.ones((3, moves), bool))
 
 
 def poses(rng, rows, far_m=30.0):

@@ -207,7 +207,7 @@ def test_hidden_road_tokens_are_not_seen(network, record, limits):
 
 
 def test_signals_as_they_were_last_are_seen(new_network, tiny, record, limits):
-    network = new_network(replace(tiny, step_lights=False, light_ahead_m=0.0)).eval()
+    network = new_network(replace(tiny, signals_each_step=False, signal_ahead_m=0.0)).eval()
     batch, before = run(network, [record(1)], limits)
     signal = (batch.roads.signal + 1) % 5
 

@@ -162,5 +162,5 @@ def test_turning_and_shifting_the_world_changes_nothing(turn_rad):
 
 
 def test_the_light_ahead_needs_lights_that_change():
-    with pytest.raises(ConfigError, match=r"light_ahead_m is 40.*step_lights=true"):
-        ModelSettings(light_ahead_m=40.0)
+    with pytest.raises(ConfigError, match=r"signal_ahead_m is 40.*signals_each_step=true"):
+        ModelSettings(signal_ahead_m=40.0)

@@ -56,9 +56,9 @@ def play(network, batch, records):
     maps = replace(collate_roads(records, 10_000), shown=batch.roads.shown)
     memory = stepper.begin(maps, torch.arange(scenes), rows)
     motion, queries, details = [], {}, {}
-    slots, by_cell = batch.entries.agent.shape[2], network.settings.cell_token
+    slots, by_cell = batch.entries.agent.shape[2], network.settings.position_token
     for token in range(batch.agents.pose.shape[1]):
-        if token > 0 and stepper.life_cycle:
+        if token > 0 and stepper.insertion_and_removal:
             entries = stepper.entry_begin(memory, column_at(batch.agents, token, turns=0))
             for slot in range(slots):
                 queries[token, slot] = stepper.entry_query(entries)
@@ -131,7 +131,7 @@ def test_details_of_newcomers_are_the_same_step_by_step(both):
 
 
 def test_weights_that_know_motion_only_let_nobody_in(tiny, new_network, records):
-    stepper = Stepper(new_network(replace(tiny, life_cycle=False)))
+    stepper = Stepper(new_network(replace(tiny, insertion_and_removal=False)))
     roads = collate_roads(records, 10_000)
     memory = stepper.begin(roads, torch.arange(2), rows=4)
     nobody = Column(

@@ -15,7 +15,7 @@ from infgen.tokens.scene_tokens import Presence
 
 TRAIN = TrainSettings(label_smoothing=0.0)
 ALWAYS = {"motion", "map"}
-CONTROL = {"add", "kind", "size"}
+CONTROL = {"add", "agent_type", "size"}
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +32,18 @@ def terms_of(network, batch):
 @pytest.mark.parametrize(
     ("switches", "names"),
     [
-        ({}, CONTROL | {"stay", "cell", "heading", "offset"}),
-        ({"life_cycle": False}, set()),
-        ({"leave_token": False}, CONTROL | {"cell", "heading", "offset"}),
-        ({"cell_token": False}, CONTROL | {"stay", "place", "heading"}),
-        ({"heading_token": False}, CONTROL | {"stay", "cell", "turn", "offset"}),
-        ({"life_cycle": False, "pattern_tokens": True}, {"pattern"}),
+        ({}, CONTROL | {"keep", "position", "heading", "offset"}),
+        ({"insertion_and_removal": False}, set()),
+        ({"remove_token": False}, CONTROL | {"position", "heading", "offset"}),
+        ({"position_token": False}, CONTROL | {"keep", "position_regression", "heading"}),
+        (
+            {"heading_token": False},
+            CONTROL | {"keep", "position", "heading_regression", "offset"},
+        ),
+        (
+            {"insertion_and_removal": False, "validity_pattern_tokens": True},
+            {"validity_pattern"},
+        ),
     ],
 )
 def test_each_variant_has_the_terms_of_its_heads(tiny, new_network, batch, switches, names):
@@ -70,22 +76,29 @@ def _has_no_say(name):
 
 
 def test_figures_call_no_distance_right_or_wrong(tiny, new_network, batch):
-    settings = replace(tiny, cell_token=False, heading_token=False)
+    settings = replace(tiny, position_token=False, heading_token=False)
 
     found = figures(terms_of(new_network(settings), batch))
 
-    assert {"place", "turn", "place_count"} <= found.keys()
-    assert not {"place_accuracy", "turn_accuracy", "size_accuracy"} & found.keys()
+    assert {
+        "position_regression",
+        "heading_regression",
+        "position_regression_count",
+    } <= found.keys()
+    assert (
+        not {"position_regression_accuracy", "heading_regression_accuracy", "size_accuracy"}
+        & found.keys()
+    )
 
 
 def test_heads_that_are_off_leave_the_others_weights_as_they_were(codebooks, tiny):
     def weights(**switches):
         torch.manual_seed(0)
-        grid = TokenSettings(grid_radius_m=60.0, grid_step_m=4.0)
+        grid = TokenSettings(grid_radius_m=60.0, grid_cell_m=4.0)
         network = Network(replace(tiny, **switches), *codebooks(), grid)
         return dict(network.named_parameters())
 
-    full, smart = weights(), weights(life_cycle=False)
+    full, smart = weights(), weights(insertion_and_removal=False)
     extra = full.keys() - smart.keys()
 
     assert smart.keys() < full.keys()
@@ -95,11 +108,11 @@ def test_heads_that_are_off_leave_the_others_weights_as_they_were(codebooks, tin
         "embed",
         "motion",
     }
-    assert weights(pattern_tokens=True).keys() > full.keys()
+    assert weights(validity_pattern_tokens=True).keys() > full.keys()
 
 
 def test_smart_has_about_seven_million_parameters(codebooks):
-    settings = ModelSettings(life_cycle=False, window_tokens=6)
+    settings = ModelSettings(insertion_and_removal=False, temporal_window_tokens=6)
     network = Network(settings, *codebooks(2048, 1024), TokenSettings())
 
     assert 6.8e6 < sum(p.numel() for p in network.parameters()) < 7.4e6
@@ -108,7 +121,7 @@ def test_smart_has_about_seven_million_parameters(codebooks):
 def test_who_enters_where_changes_nothing_where_only_motion_is_modelled(
     tiny, new_network, batch
 ):
-    network = new_network(replace(tiny, life_cycle=False)).eval()
+    network = new_network(replace(tiny, insertion_and_removal=False)).eval()
     agents = batch.agents
     leaving = agents.presence == Presence.LEAVING
     presence = agents.presence.masked_fill(leaving, int(Presence.PRESENT))
@@ -133,7 +146,7 @@ def test_places_are_the_inverse_of_cells(batch):
 def test_regression_of_places_and_headings_is_right_at_the_logs_own(
     tiny, new_network, batch
 ):
-    network = new_network(replace(tiny, cell_token=False, heading_token=False))
+    network = new_network(replace(tiny, position_token=False, heading_token=False))
     outputs = network(batch, hidden_roads=True)
     entries, details, pose = batch.entries, batch.details, batch.agents.pose
 
@@ -157,12 +170,14 @@ def test_regression_of_places_and_headings_is_right_at_the_logs_own(
     terms = losses(right, batch, TRAIN)
 
     # Six metres off in a grid of sixty, and 0.3 of a half turn of pi.
-    assert float(terms["place"].mean) == pytest.approx(0.1**2, rel=1e-3)
-    assert float(terms["turn"].mean) == pytest.approx((0.3 / math.pi) ** 2, rel=1e-3)
+    assert float(terms["position_regression"].mean) == pytest.approx(0.1**2, rel=1e-3)
+    assert float(terms["heading_regression"].mean) == pytest.approx(
+        (0.3 / math.pi) ** 2, rel=1e-3
+    )
 
 
 def test_regressed_places_stay_within_the_grids_square(tiny, new_network, batch):
-    outputs = new_network(replace(tiny, cell_token=False))(batch)
+    outputs = new_network(replace(tiny, position_token=False))(batch)
 
     assert outputs.entries.cell_logits is None
     assert outputs.details.offset_m is None
@@ -179,12 +194,12 @@ def test_patterns_are_learned_as_long_as_an_agent_lives_on(batch, tiny, new_netw
     assert not mask[:, -1].any()
     assert mask[:, :-1, 0].any()
 
-    network = new_network(replace(tiny, pattern_tokens=True))
+    network = new_network(replace(tiny, validity_pattern_tokens=True))
     outputs = network(batch, hidden_roads=True)
     target = torch.roll(agents.pattern, -1, dims=1)
     sure = torch.nn.functional.one_hot(outputs.motion.rows.pack(target), 32) * 50.0
     told = replace(outputs, motion=replace(outputs.motion, pattern_logits=sure))
-    term = losses(told, batch, TRAIN)["pattern"]
+    term = losses(told, batch, TRAIN)["validity_pattern"]
 
     assert float(term.mean) < 1e-4
     assert float(term.right) == float(term.count) == float(mask.sum())

@@ -15,7 +15,7 @@ from infgen.sources.towns import builtin_records
 from infgen.sources.womd import iter_scenes
 from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from pipeline.engine.events import Events
 from pipeline.engine.layout import Root
 from pipeline.engine.runner import Orders, Result, run
@@ -123,7 +123,7 @@ def workshop(tmp_path, monkeypatch) -> Workshop:
 
 
 TRAINING = {
-    "tokenize": TokenSettings(grid_radius_m=60.0, grid_step_m=4.0),
+    "tokenize": TokenSettings(grid_radius_m=60.0, grid_cell_m=4.0),
     "model": ModelSettings(
         width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4
     ),
@@ -131,8 +131,8 @@ TRAINING = {
         steps=6,
         batch_scenes=2,
         warmup_steps=2,
-        checkpoint_every=2,
-        validate_every=4,
+        checkpoint_every_steps=2,
+        validate_every_steps=4,
         validation_scenes=2,
         learning_rate=1e-3,
     ),
@@ -164,8 +164,8 @@ def shards(tmp_path_factory, crossing, metre_moves, bent_roads):
     books = folder / "vocab"
     books.mkdir()
     for name, book, kind, schema in (
-        ("motion", metre_moves, MotionCodebook, "infgen.motion/1"),
-        ("roads", bent_roads, RoadCodebook, "infgen.roads/1"),
+        ("motion", metre_moves, MotionVocabulary, "infgen.motion/1"),
+        ("roads", bent_roads, MapVocabulary, "infgen.roads/1"),
     ):
         write_records(books / f"{name}.zarr", [book], kind, schema, compress=False)
     return folder
@@ -176,7 +176,7 @@ def train_unit(shards):
     """The unit of work of stage ``train`` on these shards."""
     task = {
         "scenes": [str(shards / "training")],
-        "held_out": [str(shards / "validation")],
+        "validation_split": [str(shards / "validation")],
         "codebooks": str(shards / "vocab"),
     }
     return Unit("weights", {}, task)

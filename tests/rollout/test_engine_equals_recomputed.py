@@ -16,11 +16,11 @@ CLOSE = 1e-4
 NEAR = {"atol": CLOSE, "rtol": 0.0}
 BUSY = {
     "max_agents": 20,
-    "max_entries": 2,
-    "entry_tries": 2,
-    "top_moves": 0,
+    "max_insertions": 2,
+    "max_insertion_attempts": 2,
+    "motion_top_k": 0,
     "add_bias": -0.7,
-    "leave_bias": -2.2,
+    "remove_bias": -2.2,
 }
 """Agents come and go at every half second, rows run out and are used again at once."""
 
@@ -38,7 +38,9 @@ def listening(player):
     """``listening(model={}, stepper=Listening)``: a player that keeps what is said."""
 
     def build(model=None, stepper=Listening, **settings):
-        playing = player({"window_tokens": 6, **(model or {})}, **{**BUSY, **settings})
+        playing = player(
+            {"temporal_window_tokens": 6, **(model or {})}, **{**BUSY, **settings}
+        )
         network = playing.stepper.network
         torch.manual_seed(1)
         for parameter in network.parameters():  # No gain of 1, no bias of 0.
@@ -78,8 +80,8 @@ def test_every_logit_of_thirty_seconds_is_that_of_a_plain_pass(starts, listening
 @pytest.mark.parametrize(
     ("model", "settings"),
     [
-        ({"pattern_tokens": True}, {"patterns": True}),
-        ({"leave_token": False, "cell_token": False}, {"leave_radius_m": 40.0}),
+        ({"validity_pattern_tokens": True}, {"patterns": True}),
+        ({"remove_token": False, "position_token": False}, {"removal_radius_m": 40.0}),
         ({"heading_token": False, "motion_blocks": 2, "scene_blocks": 2}, {}),
     ],
 )

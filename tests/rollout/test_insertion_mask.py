@@ -6,11 +6,11 @@ import pytest
 from infgen.geometry import boxes_overlap
 from infgen.rollout.insertion_mask import make_room
 from infgen.rollout.population import Newcomers, settle
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.map import LineKind
 from infgen.tokens.scene_tokens import FIRST_MOVE
 
-CAR, WALKER = AgentKind.VEHICLE, AgentKind.PEDESTRIAN
+CAR, WALKER = AgentType.VEHICLE, AgentType.PEDESTRIAN
 SIZE = {CAR: (4.0, 2.0, 1.5), WALKER: (1.0, 1.0, 1.7)}
 
 

@@ -13,7 +13,7 @@ from infgen.tokens.scene_tokens import SignalClass
 from infgen.tokens.signals import Lights
 from infgen.tokens.tokenizer import read_lights
 
-SEES = {"step_lights": True}
+SEES = {"signals_each_step": True}
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def play(player, start):
     """``play(scene, lights, model=...)``: logits of moves, half second by half second."""
 
     def build(scene, lights, model=SEES):
-        playing = player(model, insert=False, remove=False, top_moves=1)
+        playing = player(model, insert=False, remove=False, motion_top_k=1)
         network = playing.stepper.network
         with torch.no_grad():
             network.roads.signal.weight.normal_(std=3.0)

@@ -12,7 +12,7 @@ from infgen.rollout.population import (
     move_on,
     settle,
 )
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.grid import make_grid
 from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
 
@@ -26,7 +26,7 @@ def newcomers(who, cell, heading=60, offset_m=(0.0, 0.0)):
         who=np.array(who),
         place_m=np.tile(place_m, (count, 1)),
         turned_rad=np.full(count, grid.heading_centre_rad[heading]),
-        kind=np.full(count, AgentKind.CYCLIST, dtype=np.int8),
+        kind=np.full(count, AgentType.CYCLIST, dtype=np.int8),
         size_lwh_m=np.tile(np.array([2.0, 1.0, 1.7], dtype=np.float32), (count, 1)),
     )
 

@@ -4,7 +4,7 @@ from infgen.clock import CLOCK
 from infgen.rollout.population import Newcomers, enter, move_on, settle
 from infgen.rollout.recording import NOBODY, Frame, collect
 from infgen.rollout.rollout import NEVER
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence
 
 
@@ -38,7 +38,7 @@ def car_ahead(grid):
         who=np.array([True]),
         place_m=grid.centre_m[ahead],
         turned_rad=grid.heading_centre_rad[60:61],
-        kind=np.array([AgentKind.VEHICLE], dtype=np.int8),
+        kind=np.array([AgentType.VEHICLE], dtype=np.int8),
         size_lwh_m=np.array([[4.0, 2.0, 1.5]], dtype=np.float32),
     )
 
@@ -86,7 +86,7 @@ def test_a_newcomer_is_valid_from_the_step_after_its_entry(
     assert rollout.id[2] == begin.scene.tracks.id.max() + 1
     # The ego is at 10 m at step 20, the newcomer 30 m ahead; a metre later, both moved on.
     np.testing.assert_allclose(rollout.xyz_m[2, 21, 0], 41.0, atol=0.1)
-    assert rollout.kind[2] == AgentKind.VEHICLE
+    assert rollout.kind[2] == AgentType.VEHICLE
     np.testing.assert_allclose(rollout.size_lwh_m[2], [4.0, 2.0, 1.5])
 
 

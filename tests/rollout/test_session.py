@@ -31,7 +31,7 @@ def pose(x_m, y_m=0.0, heading_rad=0.0):
 
 
 def test_without_a_driver_a_session_is_a_simulation(crossing, start, player):
-    begin, playing = [start(crossing())], player(seconds=1.5, max_entries=2)
+    begin, playing = [start(crossing())], player(seconds=1.5, max_insertions=2)
     session = Session(playing, begin[0])
 
     frames = [session.step() for _ in range(3)]
@@ -87,7 +87,7 @@ def test_errors_of_moves_do_not_add_up(session):
 
 def test_others_react_in_the_next_half_second_and_not_before(session):
     def play(first):
-        driven = session(top_moves=0)
+        driven = session(motion_top_k=0)
         frames = [driven.step(first), driven.step(pose(-20))]
         return frames
 
@@ -128,7 +128,7 @@ def test_other_numbers_of_poses_are_refused(session, count, shape):
 
 
 def test_newcomers_enter_around_the_driven_ego(crossing, start, player, force):
-    playing = player(max_entries=2, remove=False)
+    playing = player(max_insertions=2, remove=False)
     force(playing, add=20.0)
     driven = Session(playing, start(crossing()))
     for step in range(1, 4):
@@ -148,7 +148,7 @@ def test_the_number_of_agents_is_held_to_what_it_was_at_now(
     begin = [start(parked(6), at) for at in range(6)]
     counts = {}
     for firmly in (0.0, 40.0):
-        playing = player(entry_mask=False, keep_count=firmly, max_agents=40)
+        playing = player(insertion_mask=False, density_control=firmly, max_agents=40)
         force(playing, add=add, leave=leave)
         session = Session(playing, begin)
         for _ in range(6):
@@ -173,10 +173,10 @@ def new_hits(playing, begin, tokens=8):
 def test_who_would_run_into_somebody_draws_again(parked, start, player):
     """Moves of an untrained network are as good as drawn by lot; many cars are near."""
     begin = [start(parked(5), at) for at in range(12)]
-    still = {"insert": False, "remove": False, "top_moves": 0}
+    still = {"insert": False, "remove": False, "motion_top_k": 0}
 
     careless = new_hits(player(**still), begin)
-    careful = new_hits(player(**still, move_tries=20), begin)
+    careful = new_hits(player(**still, max_motion_samples=20), begin)
 
     assert careless > 20
     assert careful < careless / 5
@@ -187,7 +187,8 @@ def test_where_nobody_would_run_into_anybody_nothing_changes(drive, start, playe
     alone = {"insert": False, "remove": False}
 
     careless, careful = (
-        Session(player(**alone, move_tries=tries), begin).step() for tries in (1, 20)
+        Session(player(**alone, max_motion_samples=tries), begin).step()
+        for tries in (1, 20)
     )
 
     np.testing.assert_array_equal(careless.path, careful.path)
@@ -209,10 +210,10 @@ def off_the_road(playing, begin, tokens=8):
 
 def test_who_would_leave_the_road_draws_again_if_asked(drive, start, player):
     begin = [start(drive(), at) for at in range(24)]
-    still = {"insert": False, "remove": False, "top_moves": 0, "move_tries": 20}
+    still = {"insert": False, "remove": False, "motion_top_k": 0, "max_motion_samples": 20}
 
     careless = off_the_road(player(**still), begin)
-    careful = off_the_road(player(**still, stay_on_road=True), begin)
+    careful = off_the_road(player(**still, reject_off_road=True), begin)
 
     assert careless > 20
     assert careful < careless / 5
@@ -221,10 +222,10 @@ def test_who_would_leave_the_road_draws_again_if_asked(drive, start, player):
 def test_who_has_to_steer_does_not_stop_for_it(drive, start, player):
     """Nobody else stands than would have anyway, though many draw again."""
     begin = [start(drive(), at) for at in range(200)]
-    still = {"insert": False, "remove": False, "top_moves": 0, "move_tries": 20}
+    still = {"insert": False, "remove": False, "motion_top_k": 0, "max_motion_samples": 20}
 
     plain, kept = (
-        Session(player(**still, stay_on_road=stays), begin).step().path
+        Session(player(**still, reject_off_road=stays), begin).step().path
         for stays in (False, True)
     )
 
@@ -238,16 +239,16 @@ def test_who_can_stay_on_the_road_only_by_running_into_others_leaves_it(
     parked, start, player
 ):
     begin = [start(parked(5), at) for at in range(12)]
-    still = {"insert": False, "remove": False, "top_moves": 0}
+    still = {"insert": False, "remove": False, "motion_top_k": 0}
 
     careless = new_hits(player(**still), begin)
-    careful = new_hits(player(**still, move_tries=40, stay_on_road=True), begin)
+    careful = new_hits(player(**still, max_motion_samples=40, reject_off_road=True), begin)
 
     assert careful < careless / 5
 
 
 def test_who_is_driven_is_never_drawn_for(parked, start, player):
-    careful = {"move_tries": 5, "stay_on_road": True}
+    careful = {"max_motion_samples": 5, "reject_off_road": True}
     driven = Session(player(**careful, insert=False, remove=False), start(parked(1)))
 
     frame = driven.step(pose(8.0, -2.0))
@@ -257,8 +258,8 @@ def test_who_is_driven_is_never_drawn_for(parked, start, player):
 
 def test_drawing_again_does_not_depend_on_other_rollouts(parked, start, player):
     playing = player(
-        **{"move_tries": 5, "stay_on_road": True, "patience_s": 1.0},
-        **{"insert": False, "remove": False, "top_moves": 0},
+        **{"max_motion_samples": 5, "reject_off_road": True, "max_stall_s": 1.0},
+        **{"insert": False, "remove": False, "motion_top_k": 0},
     )
     begin = [start(parked(5), at) for at in range(4)]
 
@@ -273,7 +274,7 @@ def test_drawing_again_does_not_depend_on_other_rollouts(parked, start, player):
 def test_who_is_too_fast_for_every_way_takes_the_slowest(drive, start, player):
     """The network knows 10 to 19 m to the right only, and all lead off the road soon."""
     begin = [start(drive(), at) for at in range(24)]
-    still = {"insert": False, "remove": False, "top_moves": 0, "move_tries": 40}
+    still = {"insert": False, "remove": False, "motion_top_k": 0, "max_motion_samples": 40}
 
     def ways_m(playing):
         step, move = playing.stepper.motion_step, torch.arange(61)
@@ -290,7 +291,7 @@ def test_who_is_too_fast_for_every_way_takes_the_slowest(drive, start, player):
         return np.linalg.norm(session.step().path[:, 0, -1, :2] - before, axis=-1)
 
     careless = ways_m(player(**still))
-    careful = ways_m(player(**still, stay_on_road=True))
+    careful = ways_m(player(**still, reject_off_road=True))
 
     assert careless.mean() > 13
     assert np.median(careful) < 12

@@ -5,18 +5,18 @@ from infgen.rollout.settings import MODES
 
 
 @pytest.mark.parametrize(
-    ("mode", "length_s", "everyone", "comes_and_goes"),
+    ("mode", "duration_s", "everyone", "comes_and_goes"),
     [
         ("long", 30.0, False, True),
         ("motion-only", 30.0, False, False),
         ("wosac", 8.0, True, False),
     ],
 )
-def test_one_word_says_what_is_played(mode, length_s, everyone, comes_and_goes):
+def test_one_word_says_what_is_played(mode, duration_s, everyone, comes_and_goes):
     settings = RolloutSettings(mode=mode)
 
-    assert settings.length_s == length_s
-    assert settings.plays_everyone == everyone
+    assert settings.duration_s == duration_s
+    assert settings.simulates_all_agents == everyone
     assert settings.inserts == settings.removes == comes_and_goes
 
 
@@ -25,8 +25,8 @@ def test_what_a_mode_leaves_open_may_be_said():
         RolloutSettings, {"mode": "motion-only", "seconds": "12", "everyone": "true"}, "-s"
     )
 
-    assert settings.length_s == 12
-    assert settings.plays_everyone
+    assert settings.duration_s == 12
+    assert settings.simulates_all_agents
     assert not settings.inserts
     assert not RolloutSettings(insert=False).inserts
     assert RolloutSettings(insert=False).removes
@@ -53,23 +53,23 @@ def test_saying_what_the_mode_says_is_no_contradiction():
 
     settings = RolloutSettings(mode="wosac", seconds=mode.seconds, insert=mode.insert)
 
-    assert settings.length_s == 8
+    assert settings.duration_s == 8
 
 
 @pytest.mark.parametrize(
     ("given", "said"),
     [
         ({"mode": "short"}, "expected long or motion-only or wosac"),
-        ({"move_temperature": 0.0}, "more than 0"),
+        ({"motion_temperature": 0.0}, "more than 0"),
         ({"heading_temperature": float("nan")}, "more than 0"),
-        ({"cell_nucleus": 1.5}, "up to 1"),
-        ({"move_nucleus": 0.0}, "above 0"),
-        ({"entry_tries": 0}, "1 or more"),
-        ({"leave_radius_m": -1.0}, "0 or more"),
-        ({"stay_on_road": True}, "say rollout.move_tries=32"),
-        ({"patience_s": 20.0}, "say rollout.move_tries=32"),
-        ({"patience_s": -1.0, "move_tries": 2}, "0 or more"),
-        ({"keep_count": -0.5}, "0 or more"),
+        ({"position_top_p": 1.5}, "up to 1"),
+        ({"motion_top_p": 0.0}, "above 0"),
+        ({"max_insertion_attempts": 0}, "1 or more"),
+        ({"removal_radius_m": -1.0}, "0 or more"),
+        ({"reject_off_road": True}, "say rollout.max_motion_samples=32"),
+        ({"max_stall_s": 20.0}, "say rollout.max_motion_samples=32"),
+        ({"max_stall_s": -1.0, "max_motion_samples": 2}, "0 or more"),
+        ({"density_control": -0.5}, "0 or more"),
     ],
 )
 def test_nonsense_is_refused(given, said):

@@ -104,7 +104,7 @@ def test_without_removal_everyone_stays(crossing, start, play, network):
 def test_newcomers_come_up_to_the_cap_and_inside_the_grid(crossing, start, play, network):
     force(network, add=20.0, leave=-20.0)
 
-    (rollout,) = play([start(crossing())], max_entries=3, seconds=1.0)
+    (rollout,) = play([start(crossing())], max_insertions=3, seconds=1.0)
 
     new = ~rollout.logged
     assert new.sum() == 6
@@ -125,7 +125,7 @@ def test_nobody_enters_where_insertion_is_off(crossing, start, play, network):
 def test_a_crowded_scene_keeps_to_its_rows(crossing, start, play, network):
     force(network, add=20.0, leave=-20.0)
 
-    (rollout,) = play([start(crossing())], max_entries=16, max_agents=10)
+    (rollout,) = play([start(crossing())], max_insertions=16, max_agents=10)
 
     assert rollout.valid[:, -1].sum() == 10
 
@@ -136,8 +136,8 @@ def test_a_crowded_scene_beside_it_gives_a_scene_no_more_room(
     force(network, add=20.0, leave=-20.0)
     full, thin = start(parked(7)), start(drive())
 
-    (alone,) = play([thin], max_entries=16, max_agents=4)
-    beside, crowded = play([thin, full], max_entries=16, max_agents=4)
+    (alone,) = play([thin], max_insertions=16, max_agents=4)
+    beside, crowded = play([thin, full], max_insertions=16, max_agents=4)
 
     assert crowded.valid[:, -1].sum() == 8
     assert beside.valid[:, -1].sum() == 4
@@ -147,7 +147,7 @@ def test_a_crowded_scene_beside_it_gives_a_scene_no_more_room(
 def test_rows_are_used_again_and_lives_are_not(crossing, start, play, network):
     force(network, add=20.0, leave=20.0)  # everyone leaves at once, others come
 
-    (rollout,) = play([start(crossing())], max_entries=4, max_agents=9, seconds=5.0)
+    (rollout,) = play([start(crossing())], max_insertions=4, max_agents=9, seconds=5.0)
 
     assert len(rollout.id) == len(set(rollout.id.tolist()))
     assert len(rollout.id) > 20

@@ -13,17 +13,17 @@ from infgen.rollout.recording import NOBODY, collect
 from infgen.rollout.rollout import NEVER
 from infgen.rollout.session import Session
 from infgen.rollout.simulate import simulate
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence
 
 VARIANTS = {
     "full": {},
-    "smart": {"life_cycle": False},
-    "no leave token": {"leave_token": False},
-    "no cell token": {"cell_token": False},
+    "smart": {"insertion_and_removal": False},
+    "no leave token": {"remove_token": False},
+    "no cell token": {"position_token": False},
     "no heading token": {"heading_token": False},
-    "no leave, no cell token": {"leave_token": False, "cell_token": False},
-    "patterns": {"pattern_tokens": True},
+    "no leave, no cell token": {"remove_token": False, "position_token": False},
+    "patterns": {"validity_pattern_tokens": True},
 }
 FASTEST_M = 20.0
 """The longest move of the codebook of these tests."""
@@ -63,16 +63,20 @@ def test_every_variant_plays_and_keeps_the_rules(
     variant, crossing, parked, start, player, force
 ):
     playing = player(
-        VARIANTS[variant], max_agents=9, max_entries=2, entry_tries=2, leave_radius_m=80.0
+        VARIANTS[variant],
+        max_agents=9,
+        max_insertions=2,
+        max_insertion_attempts=2,
+        removal_radius_m=80.0,
     )
-    add = 1.0 if playing.stepper.life_cycle else None
+    add = 1.0 if playing.stepper.insertion_and_removal else None
     force(playing, add=add, leave=-1.0 if playing.stepper.leaves else None)
     session = Session(playing, [start(crossing()), start(parked(4))])
 
     ids = check_session(session, 5, playing.grid)
 
     newcomers = len(ids) - (3 + 5)
-    assert newcomers > 3 if playing.stepper.life_cycle else newcomers == 0
+    assert newcomers > 3 if playing.stepper.insertion_and_removal else newcomers == 0
 
 
 @settings(
@@ -91,7 +95,11 @@ def test_the_rules_hold_whatever_comes_and_goes(
     crossing, start, player, force, add, leave, rows, index, mask
 ):
     playing = player(
-        max_agents=rows, entry_mask=mask, max_entries=3, top_moves=0, top_cells=0
+        max_agents=rows,
+        insertion_mask=mask,
+        max_insertions=3,
+        motion_top_k=0,
+        position_top_k=0,
     )
     force(playing, add=add, leave=leave)
     session = Session(playing, start(crossing(), index))
@@ -102,7 +110,7 @@ def test_the_rules_hold_whatever_comes_and_goes(
 
 
 def test_rows_that_are_freed_are_used_again(crossing, start, player, force):
-    playing = player(max_agents=5, max_entries=2)
+    playing = player(max_agents=5, max_insertions=2)
     force(playing, add=20.0, leave=2.0)
     session = Session(playing, start(crossing()))
 
@@ -114,7 +122,7 @@ def test_rows_that_are_freed_are_used_again(crossing, start, player, force):
 def test_motion_only_weights_say_what_they_play_and_ignore_the_rest(
     crossing, start, player
 ):
-    playing = player({"life_cycle": False}, insert=True, remove=True)
+    playing = player({"insertion_and_removal": False}, insert=True, remove=True)
 
     (rollout,) = play(playing, [start(crossing())])
 
@@ -122,7 +130,7 @@ def test_motion_only_weights_say_what_they_play_and_ignore_the_rest(
     assert rollout.logged.all()
     assert (rollout.exit_step == NEVER).all()
     assert player().plays == "motion, entries, exits"
-    assert player({"leave_token": False}).plays == "motion, entries"
+    assert player({"remove_token": False}).plays == "motion, entries"
     assert player(mode="wosac", seconds=None).plays == "motion only"
 
 
@@ -155,7 +163,7 @@ def test_smart_with_the_radius_heuristic_enters_and_leaves_as_the_paper_says(
 
 @pytest.mark.parametrize("variant", ["smart", "no leave token"])
 def test_without_leave_tokens_agents_leave_by_distance_alone(variant, passing, player):
-    playing = player(VARIANTS[variant], seconds=4.0, insert=False, leave_radius_m=60.0)
+    playing = player(VARIANTS[variant], seconds=4.0, insert=False, removal_radius_m=60.0)
     keep_speed(playing)
 
     (rollout,) = play(playing, [passing])
@@ -181,7 +189,11 @@ def keep_speed(playing):
 
 def test_newcomers_are_kept_off_others_and_near_lanes(parked, start, player, force):
     playing = player(
-        entry_lane_m=6.0, entry_tries=5, top_cells=0, max_agents=40, max_entries=5
+        insertion_lane_distance_m=6.0,
+        max_insertion_attempts=5,
+        position_top_k=0,
+        max_agents=40,
+        max_insertions=5,
     )
     force(playing, add=3.0, leave=-20.0)
     session = Session(playing, [start(parked(6), at) for at in range(4)])
@@ -191,7 +203,7 @@ def test_newcomers_are_kept_off_others_and_near_lanes(parked, start, player, for
         now = session.population
         entering = now.presence == Presence.ENTERING
         entered += entering.sum()
-        vehicles += (entering & (now.kind == AgentKind.VEHICLE)).sum()
+        vehicles += (entering & (now.kind == AgentType.VEHICLE)).sum()
         for rollout, row in np.argwhere(entering):
             assert_has_room(now, rollout, row)
     assert entered > 20
@@ -202,9 +214,9 @@ def assert_has_room(now, rollout, row):
     others = (now.presence[rollout] != Presence.ABSENT) & (
         np.arange(now.life.shape[1]) != row
     )
-    if now.kind[rollout, row] == AgentKind.PEDESTRIAN:
-        others &= now.kind[rollout] != AgentKind.PEDESTRIAN
-    elif now.kind[rollout, row] == AgentKind.VEHICLE:
+    if now.kind[rollout, row] == AgentType.PEDESTRIAN:
+        others &= now.kind[rollout] != AgentType.PEDESTRIAN
+    elif now.kind[rollout, row] == AgentType.VEHICLE:
         assert abs(now.pose[rollout, row, 1]) < 6.1, "the lane is y = 0"
     overlap = boxes_overlap(
         now.pose[rollout, row][None],
@@ -218,9 +230,12 @@ def assert_has_room(now, rollout, row):
 def test_with_a_mask_that_refuses_nobody_rollouts_are_as_without(crossing, start, player):
     scene = crossing()
 
-    few = {"seconds": 2.0, "max_entries": 2}
-    (masked,) = play(player(entry_lane_m=1e6, entry_tries=1, **few), [start(scene)])
-    (free,) = play(player(entry_mask=False, **few), [start(scene)])
+    few = {"seconds": 2.0, "max_insertions": 2}
+    (masked,) = play(
+        player(insertion_lane_distance_m=1e6, max_insertion_attempts=1, **few),
+        [start(scene)],
+    )
+    (free,) = play(player(insertion_mask=False, **few), [start(scene)])
 
     same = min(len(masked.id), len(free.id))
     first = int(np.argmax(masked.entry_step[:same] != free.entry_step[:same]) or same)
@@ -229,9 +244,9 @@ def test_with_a_mask_that_refuses_nobody_rollouts_are_as_without(crossing, start
 
 
 def test_patterns_make_agents_flicker_and_nothing_else(crossing, start, player, force):
-    model = {"pattern_tokens": True}
+    model = {"validity_pattern_tokens": True}
     seen, flickering = (
-        player(model, patterns=patterns, max_entries=2, seconds=3.0)
+        player(model, patterns=patterns, max_insertions=2, seconds=3.0)
         for patterns in (False, True)
     )
     for playing in (seen, flickering):
@@ -257,22 +272,27 @@ def test_patterns_make_agents_flicker_and_nothing_else(crossing, start, player, 
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("add_bias", -30.0), ("add_bias", 30.0), ("leave_bias", 30.0), ("leave_bias", -30.0)],
+    [
+        ("add_bias", -30.0),
+        ("add_bias", 30.0),
+        ("remove_bias", 30.0),
+        ("remove_bias", -30.0),
+    ],
 )
 def test_biases_decide_where_the_network_is_undecided(crossing, start, player, name, value):
-    kept = {"add_bias": -30.0, "leave_bias": -30.0, name: value}
+    kept = {"add_bias": -30.0, "remove_bias": -30.0, name: value}
 
-    (rollout,) = play(player(seconds=1.0, max_entries=2, **kept), [start(crossing())])
+    (rollout,) = play(player(seconds=1.0, max_insertions=2, **kept), [start(crossing())])
 
     assert (~rollout.logged).any() == (kept["add_bias"] > 0)
-    assert (rollout.exit_step != NEVER).any() == (kept["leave_bias"] > 0)
+    assert (rollout.exit_step != NEVER).any() == (kept["remove_bias"] > 0)
 
 
 def test_the_likeliest_alone_is_what_every_seed_plays(crossing, start, player):
     scene = crossing()
     few = {"insert": False, "remove": False, "seconds": 1.0}
-    certain = player(top_moves=1, **few)
-    cold = player(top_moves=0, move_temperature=1e-6, **few)
+    certain = player(motion_top_k=1, **few)
+    cold = player(motion_top_k=0, motion_temperature=1e-6, **few)
 
     one, other = play(certain, [start(scene, 0), start(scene, 1)])
 
@@ -284,8 +304,8 @@ def test_the_likeliest_alone_is_what_every_seed_plays(crossing, start, player):
 def test_a_narrow_nucleus_leaves_the_likeliest_way_to_go_and_to_stand(
     crossing, start, player
 ):
-    few = {"insert": False, "remove": False, "seconds": 0.5, "top_moves": 0}
-    playing = player(move_nucleus=1e-6, **few)
+    few = {"insert": False, "remove": False, "seconds": 0.5, "motion_top_k": 0}
+    playing = player(motion_top_p=1e-6, **few)
 
     ends_m = [
         play(playing, [start(crossing(), seed)])[0].xyz_m[:, -1] for seed in range(12)

@@ -5,7 +5,7 @@ import pytest
 
 from infgen.geometry import box_corners, wrap_angle
 from infgen.scene import (
-    AgentKind,
+    AgentType,
     FeatureKind,
     LaneType,
     LinkKind,
@@ -89,7 +89,7 @@ def test_scenes_have_the_steps_and_roles_of_womd(scenes):
         assert scene.now == 10
         np.testing.assert_allclose(np.diff(scene.timestamps_s), 0.1)
         assert scene.tracks.valid[scene.ego].all()
-        assert scene.tracks.kind[scene.ego] == AgentKind.VEHICLE
+        assert scene.tracks.kind[scene.ego] == AgentType.VEHICLE
         assert scene.ego not in scene.predict_row
         assert scene.tracks.valid[scene.predict_row, scene.now].all()
         assert set(scene.predict_difficulty) <= {1, 2}
@@ -99,7 +99,7 @@ def test_scenes_have_the_steps_and_roles_of_womd(scenes):
 def test_all_kinds_of_agents_come_in_both_splits(scenes):
     for part in (scenes[:24], scenes[24:]):
         kinds = np.concatenate([scene.tracks.kind for scene in part])
-        assert set(kinds) == {AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST}
+        assert set(kinds) == {AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST}
 
 
 def test_agents_enter_and_leave_the_grid_of_the_ego(scenes):
@@ -144,7 +144,7 @@ def _off_road_m(scene, *, moving=True):
     """Signed distance to the nearest road edge of each vehicle's most off-road corner."""
     tracks = scene.tracks
     moves = np.linalg.norm(tracks.velocity_mps, axis=-1).max(axis=1) > 0.5
-    rows = (tracks.kind == AgentKind.VEHICLE) & (moves == moving)
+    rows = (tracks.kind == AgentType.VEHICLE) & (moves == moving)
     pose = np.concatenate([tracks.xyz_m[..., :2], tracks.heading_rad[..., None]], axis=-1)
     shown = tracks.valid[rows][:, ::15]
     corners_m = box_corners(pose[rows][:, ::15], tracks.size_lwh_m[rows][:, ::15, :2])[
@@ -179,7 +179,7 @@ def test_vehicles_hardly_ever_overlap(scenes):
     shares, driving = [], []
     for scene in scenes:
         tracks = scene.tracks
-        cars = np.flatnonzero(tracks.kind == AgentKind.VEHICLE)
+        cars = np.flatnonzero(tracks.kind == AgentType.VEHICLE)
         for step in range(0, 91, 10):
             rows = cars[tracks.valid[cars, step]]
             pose = np.column_stack(
@@ -208,7 +208,7 @@ def _overlaps(corners_m):
 def test_motion_is_smooth(scenes):
     for scene in scenes:
         tracks = scene.tracks
-        cars = tracks.kind == AgentKind.VEHICLE
+        cars = tracks.kind == AgentType.VEHICLE
         step_m = np.linalg.norm(np.diff(tracks.xyz_m[cars, :, :2], axis=1), axis=-1)
         both = tracks.valid[cars, 1:] & tracks.valid[cars, :-1]
         turned_rad = wrap_angle(np.diff(tracks.heading_rad[cars], axis=1))
@@ -246,7 +246,7 @@ def _crossings(scene):
         lit = np.bincount(signals.step[rows], minlength=steps)
         red = (np.bincount(signals.step[rows], waits, minlength=steps) == lit) & (lit > 0)
         over = _crosses(scene, int(signals.lane_id[rows[0]]), stop_m)
-        over &= (tracks.kind != AgentKind.PEDESTRIAN)[:, None]
+        over &= (tracks.kind != AgentType.PEDESTRIAN)[:, None]
         assert not over[:, red[1:]].any()
         crossed += over.sum()
     return crossed

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from infgen.scene import (
-    AgentKind,
+    AgentType,
     FeatureKind,
     LinkKind,
     Scene,
@@ -64,7 +64,7 @@ def test_tracks_keep_ids_kinds_sizes_and_roles():
     scene = scene_of()
 
     assert scene.tracks.id.tolist() == [7, 9]
-    assert scene.tracks.kind.tolist() == [AgentKind.VEHICLE, AgentKind.PEDESTRIAN]
+    assert scene.tracks.kind.tolist() == [AgentType.VEHICLE, AgentType.PEDESTRIAN]
     assert scene.tracks.size_lwh_m[0, 0].tolist() == [4.5, 2.0, 1.5]
     assert scene.tracks.valid[1].tolist() == [False, False] + [True] * (STEPS - 2)
     assert (scene.ego, scene.now, scene.tracks.num_steps) == (0, NOW, STEPS)
@@ -149,7 +149,7 @@ def test_unset_and_unknown_kinds_of_agents_are_other():
         message.tracks[0].ClearField("object_type")
         message.tracks[1].object_type = 77
 
-    assert scene_of(change).tracks.kind.tolist() == [AgentKind.OTHER] * 2
+    assert scene_of(change).tracks.kind.tolist() == [AgentType.OTHER] * 2
 
 
 def test_unknown_enum_values_are_unset():

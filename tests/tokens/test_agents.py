@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from infgen.config import TokenSettings
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.agents import decode_tracks, match_agents
 from infgen.tokens.grid import make_grid
 from infgen.tokens.motion_tokens import make_move_table
@@ -36,7 +36,7 @@ def flickering(build_scene):
 
 @pytest.mark.parametrize("kind", [0, 1, 2])
 def test_a_drive_the_codebook_can_write_is_written_exactly(match, drive, kind):
-    matrix, _, _ = match(drive(speed_mps=10.0, kind=AgentKind(kind)))
+    matrix, _, _ = match(drive(speed_mps=10.0, kind=AgentType(kind)))
 
     np.testing.assert_array_equal(matrix.move, [[FIRST_MOVE] + [5] * 17])
     np.testing.assert_allclose(matrix.pose[0, :, 0], 5.0 * np.arange(1, 19), atol=1e-4)

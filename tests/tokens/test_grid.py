@@ -36,13 +36,13 @@ def test_75_m_in_steps_of_3_m_hold_1961_cells_and_the_ego_is_in_the_middle_one()
     ("radius_m", "step_m", "cells"), [(3.0, 3.0, 5), (4.3, 3.0, 9), (72.0, 3.0, 1793)]
 )
 def test_the_number_of_cells_follows_from_radius_and_step(radius_m, step_m, cells):
-    settings = TokenSettings(grid_radius_m=radius_m, grid_step_m=step_m)
+    settings = TokenSettings(grid_radius_m=radius_m, grid_cell_m=step_m)
 
     assert make_grid(settings).num_cells == cells
 
 
 def test_cells_run_row_by_row_from_the_front_and_from_left_to_right():
-    grid = make_grid(TokenSettings(grid_radius_m=3.0, grid_step_m=3.0))
+    grid = make_grid(TokenSettings(grid_radius_m=3.0, grid_cell_m=3.0))
 
     expected = [[0, 3], [-3, 0], [0, 0], [3, 0], [0, -3]]
     np.testing.assert_array_equal(grid.centre_m, expected)
@@ -128,4 +128,4 @@ def test_no_heading_is_farther_than_half_a_bin_from_its_bins_middle(relative_rad
 
 def test_a_grid_too_fine_to_be_numbered_is_refused():
     with pytest.raises(ConfigError, match="too many cells"):
-        make_grid(dataclasses.replace(TokenSettings(), grid_step_m=0.5))
+        make_grid(dataclasses.replace(TokenSettings(), grid_cell_m=0.5))

@@ -8,7 +8,7 @@ from infgen.tokens.grid import make_grid
 from infgen.tokens.insertion import (
     decode_entries,
     encode_entries,
-    entry_order,
+    insertion_order,
     join_entries,
 )
 from infgen.tokens.scene_tokens import NO_CELL
@@ -60,20 +60,20 @@ def test_entries_decode_to_the_pose_they_were_made_from(pose, ego):
 def test_newcomers_are_ordered_from_near_to_far():
     pose = np.float32([[100, 90, 0], [100, 40, 0], [120, 50, 0]])  # 40, 10, 20 m
 
-    assert entry_order(pose, EGO, "distance").tolist() == [1, 2, 0]
+    assert insertion_order(pose, EGO, "distance").tolist() == [1, 2, 0]
 
 
 def test_equally_near_newcomers_keep_the_order_of_the_log():
     pose = np.float32([[100, 60, 0], [110, 50, 0], [100, 40, 0]])
 
-    assert entry_order(pose, EGO, "distance").tolist() == [0, 1, 2]
+    assert insertion_order(pose, EGO, "distance").tolist() == [0, 1, 2]
 
 
 def test_bearing_sweeps_from_behind_over_the_right_and_the_front_to_the_left():
     left, front, right = (90, 50, 0), (100, 60, 0), (110, 50, 0)
     behind_right = (101, 40, 0)
 
-    order = entry_order(np.float32([left, front, right, behind_right]), EGO, "bearing")
+    order = insertion_order(np.float32([left, front, right, behind_right]), EGO, "bearing")
 
     assert order.tolist() == [3, 2, 1, 0]
 

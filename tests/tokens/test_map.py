@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from infgen.scene import FeatureKind, LaneType, RoadEdgeType, RoadLineType
 from infgen.tokens.map import LineKind, PointKind, match_curves, match_roads, road_pieces
-from infgen.tokens.vocabulary import RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary
 
 LANE = (FeatureKind.LANE, LaneType.SURFACE_STREET)
 
@@ -72,7 +72,7 @@ def test_a_curve_is_cut_by_its_arc_length(pieces_of):
     angle = np.linspace(0, np.pi / 2, 400)
     circle = 20 * np.column_stack([np.sin(angle), 1 - np.cos(angle)])
     pieces = pieces_of(circle)
-    assert pieces.num_roads == 7  # 31.4 m: six whole ones and 1.4 m
+    assert pieces.num_map_tokens == 7  # 31.4 m: six whole ones and 1.4 m
     np.testing.assert_allclose(pieces.pose[:, 2], 0.25 * np.arange(7) + 0.0125, atol=0.01)
     bent = np.arctan2(*(pieces.curve_m[0, -1] - pieces.curve_m[0, -2])[::-1])
     assert bent == pytest.approx(0.225, abs=0.01)
@@ -88,7 +88,7 @@ def test_lines_are_broken_where_points_are_far_apart(pieces_of):
 def test_lines_are_broken_at_a_stray_chord_but_not_at_a_straight_one(pieces_of):
     bend = np.concatenate([along_x(6.0), along_x(6.0) + np.array([8.0, 4.0])])
     straight = np.concatenate([along_x(6.0), along_x(6.0) + np.array([10.0, 0.0])])
-    assert pieces_of(bend).num_roads == 2
+    assert pieces_of(bend).num_map_tokens == 2
     np.testing.assert_allclose(pieces_of(straight).pose[:, 0], [0, 5, 10], atol=1e-5)
 
 
@@ -115,7 +115,7 @@ def test_repeated_points_and_lines_of_one_point_are_harmless(pieces_of):
 
 def test_an_empty_map_has_no_pieces(pieces_of, bent_roads):
     pieces = pieces_of()
-    assert pieces.num_roads == 0
+    assert pieces.num_map_tokens == 0
     assert match_roads(pieces, bent_roads).shape == (0,)
 
 
@@ -182,7 +182,7 @@ def test_a_lane_with_a_stop_sign_has_its_own_kind(build_map):
 
 def test_stop_signs_and_unknown_features_are_no_lines(build_map):
     features = [(5, FeatureKind.STOP_SIGN, 0, np.zeros((1, 2))), (6, 0, 0, along_x(9.0))]
-    assert road_pieces(build_map(features)).num_roads == 0
+    assert road_pieces(build_map(features)).num_map_tokens == 0
 
 
 ZEBRA = np.array([[0, 0], [12, 0], [12, 3], [0, 3]])
@@ -292,7 +292,7 @@ def test_pieces_are_those_of_the_plain_loop(pieces_of, seed, many, spacing_m):
     )
     points = points.astype(np.float32).astype(float)
     pieces, expected = pieces_of(points), loop_pieces(points)
-    assert pieces.num_roads == len(expected)
+    assert pieces.num_map_tokens == len(expected)
     for pose, curve, wanted in zip(pieces.pose, pieces.curve_m, expected, strict=True):
         cos, sin = np.cos(pose[2]), np.sin(pose[2])
         world = curve @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
@@ -327,7 +327,7 @@ def test_a_shape_of_the_codebook_is_matched_to_itself():
     length = rng.uniform(1, 5, (1000, 1, 1))
     steps = np.stack([np.cos(turn), np.sin(turn)], axis=-1) * length / 10
     curve = np.concatenate([np.zeros((1000, 1, 2)), np.cumsum(steps, axis=1)], axis=1)
-    codebook = RoadCodebook(curve.astype(np.float32), np.ones(1000, bool))
+    codebook = MapVocabulary(curve.astype(np.float32), np.ones(1000, bool))
     np.testing.assert_array_equal(match_curves(codebook.curve_m, codebook), np.arange(1000))
 
 

@@ -4,7 +4,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from infgen.geometry import box_corners, to_local
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.motion_tokens import (
     advance,
     follow,
@@ -12,7 +12,7 @@ from infgen.tokens.motion_tokens import (
     nearest_few,
     nearest_moves,
 )
-from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook
+from infgen.tokens.vocabulary import BOX_LW_M, MotionVocabulary
 
 
 def random_codebook(rng, moves=200, spread=(8.0, 1.0, 0.6)):
@@ -21,7 +21,7 @@ def random_codebook(rng, moves=200, spread=(8.0, 1.0, 0.6)):
     end[:, moves // 2] = end[:, 1]  # twins
     path = end[:, :, None] * np.linspace(0, 1, 6)[:, None]
     real = np.ones((3, moves), bool)
-    return MotionCodebook(BOX_LW_M, path.astype(np.float32), real)
+    return MotionVocabulary(BOX_LW_M, path.astype(np.float32), real)
 
 
 def measure_them_all(target, pose, kind, codebook):
@@ -132,12 +132,12 @@ def test_boxes_are_compared_at_each_kinds_own_size(kind):
     # pedestrian's (0.7 m) by 0.21 m.
     ends = np.float32([[0, 0, 0], [1.3, 0, 0], [1, 0, 0.3]])
     path = np.broadcast_to(ends[:, None] * np.linspace(0, 1, 6)[:, None], (3, 3, 6, 3))
-    codebook = MotionCodebook(BOX_LW_M, path.astype(np.float32), np.ones((3, 3), bool))
+    codebook = MotionVocabulary(BOX_LW_M, path.astype(np.float32), np.ones((3, 3), bool))
     target = np.float32([[1, 0, 0]])
 
     found = nearest_moves(target, 0 * target, np.int8([kind]), make_move_table(codebook))
 
-    assert found[0] == (2 if kind == AgentKind.PEDESTRIAN else 1)
+    assert found[0] == (2 if kind == AgentType.PEDESTRIAN else 1)
 
 
 def test_an_agent_without_a_move_stays(metre_moves):

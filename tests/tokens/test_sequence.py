@@ -19,7 +19,7 @@ FIELDS = ("kind", "pose", "move", "presence", "observed", "cell")
 
 
 @st.composite
-def paths_and_gaps(draw, max_agents=6, max_tokens=8):
+def paths_and_gaps(draw, max_agents=6, max_token_steps=8):
     """Draw poses [agent, step, 3], kinds [agent] and validity [agent, step].
 
     The ego is row 0 and known throughout; the others come, go and flicker. Numbers come
@@ -27,7 +27,7 @@ def paths_and_gaps(draw, max_agents=6, max_tokens=8):
     """
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     agents = draw(st.integers(1, max_agents))
-    steps = 5 * draw(st.integers(2, max_tokens)) + draw(st.integers(1, 5))
+    steps = 5 * draw(st.integers(2, max_token_steps)) + draw(st.integers(1, 5))
     turn_rad = rng.normal(0, 0.5, (agents, 1)) * (0.1 * np.arange(steps))
     heading = rng.uniform(-np.pi, np.pi, (agents, 1)) + turn_rad
     speed_mps = rng.choice([0.0, 1.5, 8.0, 25.0], (agents, 1))
@@ -174,7 +174,7 @@ def test_values_are_moves_cells_bins_and_kinds(tokens_of, crossing):
 def test_the_stream_brings_the_matrix_back_bit_for_bit(
     tokens_of, metre_moves, build_scene, drawn, order
 ):
-    chosen = dataclasses.replace(SETTINGS, entry_order=order)
+    chosen = dataclasses.replace(SETTINGS, insertion_order=order)
     tokens = tokens_of(build_scene(*drawn), chosen)
 
     decoded = decode_sequence(stream_alone(tokens), metre_moves, chosen)
@@ -296,7 +296,7 @@ def test_lives_are_those_of_the_public_reference(
         pytest.skip(f"{folder} is not here: golden values are not part of the project")
     logged = np.load(folder / f"long_term_reference/log_tokens_{golden}.npz")
     (scene,) = iter_scenes(folder / f"wosac/{scenario_id}/scenario.tfrecord")
-    as_there = dataclasses.replace(SETTINGS, max_distance_m=np.inf, max_gap_s=1e9)
+    as_there = dataclasses.replace(SETTINGS, max_ego_distance_m=np.inf, max_gap_s=1e9)
 
     tokens = tokenize_scene(scene, dense_moves, bent_roads, as_there)
 

@@ -134,7 +134,7 @@ def test_nobody_is_too_far_for_a_simulation_that_asks_so(tokens_of, build_scene)
     x_m = np.arange(91.0)
     path = np.stack([np.column_stack([x_m, 0 * x_m + y, 0 * x_m]) for y in (0, 400)])
     scene = build_scene(path, [0, 0])
-    everywhere = dataclasses.replace(SETTINGS, max_distance_m=np.inf)
+    everywhere = dataclasses.replace(SETTINGS, max_ego_distance_m=np.inf)
 
     assert tokens_of(scene, until=10).num_agents == 1
     assert tokens_of(scene, everywhere, until=10).num_agents == 2
@@ -163,7 +163,7 @@ def test_road_tokens_lie_on_the_map(tokens_of, drive):
 
     lane = tokens.road_line == tokens.road_line[0]
     np.testing.assert_allclose(tokens.road_pose[lane, 1:], 0.0, atol=1e-5)
-    assert len(tokens.road_token) == len(tokens.road_pose) == tokens.num_roads
+    assert len(tokens.road_token) == len(tokens.road_pose) == tokens.num_map_tokens
     assert (np.diff(tokens.road_line) >= 0).all()
 
 
@@ -216,5 +216,5 @@ def test_a_long_log_has_tokens_beyond_what_a_byte_can_count(tokens_of, parked):
 def test_a_scene_without_a_map_has_no_road_tokens(tokens_of, drive, build_map):
     tokens = tokens_of(drive(road_map=build_map([])))
 
-    assert tokens.num_roads == 0
+    assert tokens.num_map_tokens == 0
     assert len(tokens.signal_line) == 0

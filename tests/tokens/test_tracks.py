@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from infgen.config import TokenSettings
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.tracks import TokensError, clean_headings, read_paths
 
 SETTINGS = TokenSettings()
-CAR, WALKER, OTHER = AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.OTHER
+CAR, WALKER, OTHER = AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.OTHER
 
 
 def line(start_xy_m=(0.0, 0.0), velocity_mps=(10.0, 0.0), steps=91, heading_rad=0.0):
@@ -120,9 +120,9 @@ def test_agents_are_cut_where_they_are_too_far_from_the_ego(build_scene):
     scene = build_scene(path, [CAR, CAR])
 
     assert tokens_of(scene) == list(range(9))
-    assert tokens_of(scene, dataclasses.replace(SETTINGS, max_distance_m=np.inf)) == list(
-        range(18)
-    )
+    assert tokens_of(
+        scene, dataclasses.replace(SETTINGS, max_ego_distance_m=np.inf)
+    ) == list(range(18))
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_who_comes_from_beyond_is_observed_from_within_on(
 ):
     valid = np.stack([np.ones(91, bool), shown(91, span)])
     path = np.stack([line(velocity_mps=(0, 0)), line((100, 0), (-9.99, 0))])
-    settings = dataclasses.replace(SETTINGS, enter_distance_m=enters_m)
+    settings = dataclasses.replace(SETTINGS, insertion_distance_m=enters_m)
 
     assert tokens_of(build_scene(path, [CAR, CAR], valid), settings) == list(expected)
 
@@ -147,7 +147,7 @@ def test_who_comes_from_beyond_is_observed_from_within_on(
 def test_who_has_come_near_is_observed_however_far_it_then_goes(build_scene):
     valid = np.stack([np.ones(91, bool), shown(91, (20, 91))])
     path = np.stack([line(velocity_mps=(0, 0)), line((10, 0), (10, 0))])
-    settings = dataclasses.replace(SETTINGS, enter_distance_m=40.0)
+    settings = dataclasses.replace(SETTINGS, insertion_distance_m=40.0)
 
     assert tokens_of(build_scene(path, [CAR, CAR], valid), settings) == list(range(4, 18))
 

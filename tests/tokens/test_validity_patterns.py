@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from infgen.config import TokenSettings
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence
 from infgen.tokens.tokenizer import tokenize_scene
 from infgen.tokens.validity_patterns import decode_patterns, encode_patterns
@@ -47,7 +47,7 @@ def side_by_side(num_cars):
 @pytest.fixture
 def tokens_of(build_scene, metre_moves, bent_roads):
     def run(path, valid):
-        scene = build_scene(path, [AgentKind.VEHICLE] * len(path), valid)
+        scene = build_scene(path, [AgentType.VEHICLE] * len(path), valid)
         return tokenize_scene(scene, metre_moves, bent_roads, TokenSettings())
 
     return run

@@ -1,14 +1,14 @@
 import numpy as np
 import pytest
 
-from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import BOX_LW_M, MapVocabulary, MotionVocabulary
 
 
 @pytest.fixture
 def one_metre_ahead():
     path = np.zeros((3, 2, 6, 3), np.float32)
     path[:, 1, :, 0] = np.linspace(0, 1, 6)
-    return MotionCodebook(BOX_LW_M, path, np.zeros((3, 2), bool))
+    return MotionVocabulary(BOX_LW_M, path, np.zeros((3, 2), bool))
 
 
 def test_boxes_are_those_of_the_vocabulary_not_swapped_between_pedestrian_and_cyclist():
@@ -26,12 +26,12 @@ def test_corners_at_the_end_are_those_of_the_kinds_box_moved(one_metre_ahead):
 
 
 def test_end_poses_are_the_last_of_each_path(one_metre_ahead):
-    assert one_metre_ahead.num_moves == 2
+    assert one_metre_ahead.num_motion_tokens == 2
     np.testing.assert_array_equal(one_metre_ahead.end_pose[:, 1], [[1, 0, 0]] * 3)
 
 
 def test_roads_are_sampled_at_first_middle_and_last_point():
     curve = np.stack([0.5 * np.arange(11), np.zeros(11)], axis=-1)[None]
-    codebook = RoadCodebook(curve.astype(np.float32), np.ones(1, bool))
-    assert codebook.num_roads == 1
+    codebook = MapVocabulary(curve.astype(np.float32), np.ones(1, bool))
+    assert codebook.num_map_tokens == 1
     np.testing.assert_array_equal(codebook.sample_m, [[[0, 0], [2.5, 0], [5, 0]]])

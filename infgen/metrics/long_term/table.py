@@ -125,12 +125,12 @@ def _add_rates(
         total = counts.sum()
         rate = float((yes & counts).sum() / total) if total else float("nan")
         numbers[f"{protocol.name}/{name}"] = rate
-    length_s = windows.length * CLOCK.token_s
+    duration_s = windows.length * CLOCK.token_s
     for name, feature in (("entry_rate", "num_entries"), ("exit_rate", "num_exits")):
         events = events_per_token(binned, feature, protocol, windows.num_tokens)
         seconds = windows.num_tokens * CLOCK.token_s
         numbers[f"{protocol.name}/{name}"] = float(events.sum() / seconds)
-        curves[f"{protocol.name}/{name}"] = windows.sum_tokens(events) / length_s
+        curves[f"{protocol.name}/{name}"] = windows.sum_tokens(events) / duration_s
 
 
 def _add_counts(

@@ -1,7 +1,7 @@
 """The radius of ``live_within`` that makes placement most like the logs' (SPEC 7.1).
 
 Placement needs no boxes and no map, so a radius is tried at the cost of one pass over the
-paths. To be tuned on validation, and then set as ``score.enter_radius_m``.
+paths. To be tuned on validation, and then set as ``score.presence_radius_m``.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

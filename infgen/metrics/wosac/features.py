@@ -12,7 +12,7 @@ from infgen.metrics.motion import Motion
 from infgen.metrics.road import road_edge_m
 from infgen.metrics.wosac.logged import LoggedScene
 from infgen.metrics.wosac.signals import build_stop_lines, runs_red_light
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.spatial.road_edges import build_edges
 
 
@@ -83,7 +83,7 @@ def measure(
         traffic_light_violation=_red_lights(log, motion, evaluated)[..., steps],
         average_displacement_error=_displacement_m(log.motion, motion, evaluated),
         valid=motion.valid[:, evaluated, steps],
-        vehicle=motion.kind[evaluated] == AgentKind.VEHICLE,
+        vehicle=motion.kind[evaluated] == AgentType.VEHICLE,
     )
 
 

@@ -33,7 +33,7 @@ class LoggedScene:
     Attributes:
         scenario_id: Id of the log.
         id: Track ids.
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         x_m: Box centres.
         y_m: Box centres.
         z_m: Box centres.

@@ -49,7 +49,7 @@ class Agents:
     """All agents of all scenes, as ``SceneTokens`` has them; padding is ABSENT.
 
     Attributes:
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         size_lwh_m: Boxes.
         near: Whether the agent has a motion loss.
         pose: x, y, heading at each token's end.
@@ -143,7 +143,7 @@ class Details:
         token: When.
         turn: Newcomers of this turn and later are hidden as well.
         cell: Where.
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         size_lwh_m: Its box.
         heading: Heading bin relative to the ego.
         offset_m: Position less the cell's centre, in the ego's grid frame.
@@ -196,7 +196,11 @@ class Limits:
     ) -> "Limits":
         """Take the limits from the settings."""
         return cls(
-            train.max_agents, train.max_roads, model.max_entries, train.max_tokens, grid
+            train.max_agents,
+            train.max_map_tokens,
+            model.max_insertions,
+            train.max_token_steps,
+            grid,
         )
 
 
@@ -225,20 +229,20 @@ def collate(
 
 def collate_roads(
     records: Sequence[SceneTokens],
-    max_roads: int,
+    max_map_tokens: int,
     lights: Sequence[Lights | None] | None = None,
 ) -> Roads:
     """Put only the maps of scenes side by side, with nothing hidden.
 
     Args:
         records: The scenes.
-        max_roads: Road tokens of each.
+        max_map_tokens: Road tokens of each.
         lights: What the lights of each show, if that is known for longer than the record;
             afterwards they are remembered as they were last.
     """
     maps = []
     for at, record in enumerate(records):
-        window = cut_window(record, 0, record.num_tokens, record.num_agents, max_roads)
+        window = cut_window(record, 0, record.num_tokens, record.num_agents, max_map_tokens)
         token = record.road_token[window.roads]
         arrays = _roads(window, token, np.zeros(len(token), dtype=bool))
         known = (lights[at] if lights else None) or Lights(

@@ -54,7 +54,7 @@ class SceneWindow:
 
 
 def cut_window(
-    record: SceneTokens, start: int, tokens: int, max_agents: int, max_roads: int
+    record: SceneTokens, start: int, tokens: int, max_agents: int, max_map_tokens: int
 ) -> SceneWindow:
     """Take ``tokens`` half seconds from ``start`` on, and what is nearest to the ego."""
     stop = min(start + tokens, record.num_tokens)
@@ -62,7 +62,7 @@ def cut_window(
     visible = observed | (presence == Presence.ENTERING)
     pose, pattern = record.pose[:, start:stop], record.pattern[:, start:stop]
     rows = _nearest_agents(pose, visible, record.ego)[:max_agents]
-    roads = _nearest_roads(record.road_pose, pose[record.ego], max_roads)
+    roads = _nearest_roads(record.road_pose, pose[record.ego], max_map_tokens)
 
     row_of = np.full(record.num_agents, -1, dtype=np.int64)
     row_of[rows] = np.arange(len(rows))
@@ -117,7 +117,7 @@ def disturb(
 
 
 def hide_far(window: SceneWindow, settings: TokenSettings, known: int) -> SceneWindow:
-    """Let who is beyond ``enter_distance_m`` at first not be there before it comes within.
+    """Hide agents that begin beyond ``insertion_distance_m`` until they come within.
 
     It then enters, as who comes later does already; who never comes never is.
 
@@ -126,11 +126,11 @@ def hide_far(window: SceneWindow, settings: TokenSettings, known: int) -> SceneW
         settings: The distance (0: nobody is hidden), and the order of newcomers.
         known: Half seconds of the history.
     """
-    if not settings.enter_distance_m or known < 1:
+    if not settings.insertion_distance_m or known < 1:
         return window
     away_m = window.pose[..., :2] - window.pose[0, :, :2]
     visible = window.observed | (window.presence == Presence.ENTERING)
-    inside = np.hypot(away_m[..., 0], away_m[..., 1]) < settings.enter_distance_m
+    inside = np.hypot(away_m[..., 0], away_m[..., 1]) < settings.insertion_distance_m
     inside &= visible
     born = visible.argmax(axis=1)
     # Who is there as the history ends is seen from the half second after it on at latest.
@@ -150,7 +150,7 @@ def hide_far(window: SceneWindow, settings: TokenSettings, known: int) -> SceneW
         label=move,
         pattern=np.where(presence == Presence.ABSENT, np.uint8(0), window.pattern),
     )
-    return _with_entries(changed, far, settings.entry_order)
+    return _with_entries(changed, far, settings.insertion_order)
 
 
 def look_away(window: SceneWindow, known: int) -> SceneWindow:

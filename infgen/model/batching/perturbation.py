@@ -31,7 +31,7 @@ from infgen.tokens.motion_tokens import (
     nearest_few,
     nearest_moves,
 )
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 FARTHEST_M = 1.0
 """No draw leads farther from where an agent should be: where moves are rare, the second
@@ -85,21 +85,25 @@ class Strays(NamedTuple):
 
 
 def make_noise(
-    settings: TrainSettings, motion: MotionCodebook, roads: RoadCodebook
+    settings: TrainSettings, motion: MotionVocabulary, roads: MapVocabulary
 ) -> Noise | None:
     """Make the noise that settings ask for; None if they ask for none.
 
     In a codebook that has fewer tokens, draws are from all of them.
     """
-    if not (settings.noise_moves or settings.noise_drift or settings.noise_roads):
+    if not (
+        settings.motion_noise_neighbours
+        or settings.lateral_drift_share
+        or settings.map_noise_neighbours
+    ):
         return None
-    moves = min(settings.noise_moves, motion.num_moves)
+    moves = min(settings.motion_noise_neighbours, motion.num_motion_tokens)
     return Noise(
         table=make_move_table(motion),
-        moves=max(moves, 1) if settings.noise_drift else moves,
-        share=settings.noise_share,
-        drift=settings.noise_drift,
-        near_roads=_near_roads(roads, max(1, settings.noise_roads)),
+        moves=max(moves, 1) if settings.lateral_drift_share else moves,
+        share=settings.motion_noise_share,
+        drift=settings.lateral_drift_share,
+        near_roads=_near_roads(roads, max(1, settings.map_noise_neighbours)),
     )
 
 
@@ -114,7 +118,7 @@ def lead_astray(
     """Walk agents anew along moves that are drawn.
 
     Args:
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         pose: Where each agent should be at each token's end.
         move: What led it there.
         moving: Tokens at which it goes by moves that may be drawn, none of them the first.
@@ -202,9 +206,9 @@ def exchange_roads(
     return np.where(fixed, token, noise.near_roads[token, turn])
 
 
-def _near_roads(codebook: RoadCodebook, count: int) -> Int16[np.ndarray, "road near"]:
+def _near_roads(codebook: MapVocabulary, count: int) -> Int16[np.ndarray, "road near"]:
     """Return for each shape the nearest, as pieces are matched, itself the first."""
-    points_m = codebook.sample_m.reshape(codebook.num_roads, -1)
+    points_m = codebook.sample_m.reshape(codebook.num_map_tokens, -1)
     square_m2 = ((points_m[:, None] - points_m) ** 2).sum(axis=-1)
     np.fill_diagonal(square_m2, -1.0)
     return np.argsort(square_m2, axis=1, kind="stable")[:, :count].astype(np.int16)

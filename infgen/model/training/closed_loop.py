@@ -64,7 +64,7 @@ def _play(network: Network, batch: Batch, top: int) -> tuple[Agents, Tensor]:
     logged, stepper, grid = batch.agents, Stepper(network), network.grid
     device = logged.pose.device
     codebook = network.motion_codebook()
-    ends, top = MoveEnds.of(codebook, device), min(top, codebook.num_moves)
+    ends, top = MoveEnds.of(codebook, device), min(top, codebook.num_motion_tokens)
     scenes, tokens, rows = logged.move.shape
     memory = stepper.begin(batch.roads, torch.arange(scenes, device=device), rows)
     off = torch.zeros_like(logged.observed)

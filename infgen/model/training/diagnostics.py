@@ -41,7 +41,7 @@ def decisions(outputs: Outputs, batch: Batch) -> dict[str, tuple[Tensor, Tensor]
     if leave_logit is not None:
         mask = rows.pack(stay_mask(batch.agents))
         leaves = rows.pack(batch.agents.presence.roll(-1, dims=1) == Presence.LEAVING)
-        found["stay"] = (leave_logit[mask].sigmoid(), leaves[mask])
+        found["keep"] = (leave_logit[mask].sigmoid(), leaves[mask])
     if outputs.entries is not None:
         asked, add_logit = outputs.entries.rows, outputs.entries.add_logit
         agent = asked.pack(batch.entries.agent)

@@ -13,9 +13,9 @@ from infgen.model.training_settings import TrainSettings
 from infgen.tokens.scene_tokens import Presence
 
 TERMS = (
-    *("motion", "stay", "pattern"),
-    *("add", "cell", "place"),
-    *("kind", "size", "heading", "turn", "offset"),
+    *("motion", "keep", "validity_pattern"),
+    *("add", "position", "position_regression"),
+    *("agent_type", "size", "heading", "heading_regression", "offset"),
     "map",
 )
 """Every term that a network may have, in this order."""
@@ -32,12 +32,12 @@ def supervised(batch: Batch, settings: TrainSettings) -> Tensor:
     real = (details.present & details.newcomer).sum()
     weight = {
         "motion": _motion(batch, settings),
-        "stay": stay_mask(batch.agents).sum(),
-        "pattern": pattern_mask(batch.agents).sum(),
+        "keep": stay_mask(batch.agents).sum(),
+        "validity_pattern": pattern_mask(batch.agents).sum(),
         "add": _decided(batch),
-        **dict.fromkeys(("cell", "place"), newcomers),
-        **dict.fromkeys(("kind", "size"), real),
-        **dict.fromkeys(("heading", "turn", "offset"), described),
+        **dict.fromkeys(("position", "position_regression"), newcomers),
+        **dict.fromkeys(("agent_type", "size"), real),
+        **dict.fromkeys(("heading", "heading_regression", "offset"), described),
         "map": _hidden(batch.roads).sum(),
     }
     return torch.stack([weight[name].float() for name in TERMS])
@@ -48,7 +48,7 @@ def _motion(batch: Batch, settings: TrainSettings) -> Tensor:
     mask = motion_mask(batch.agents)
     first = batch.agents.presence == Presence.ENTERING
     first[:, 0] = False
-    return mask.sum() + (settings.first_move_weight - 1) * (mask & first).sum()
+    return mask.sum() + (settings.first_motion_weight - 1) * (mask & first).sum()
 
 
 def _decided(batch: Batch) -> Tensor:

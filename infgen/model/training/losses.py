@@ -68,9 +68,9 @@ class Term:
 
 
 Terms = dict[str, Term]
-CONTROLS = ("stay", "add")
+CONTROLS = ("keep", "add")
 """Terms whose token is a yes or no."""
-MEASURED = ("size", "offset", "place", "turn")
+MEASURED = ("size", "offset", "position_regression", "heading_regression")
 """Terms that are distances: nothing is right or wrong."""
 
 
@@ -79,9 +79,11 @@ def losses(outputs: Outputs, batch: Batch, settings: TrainSettings) -> Terms:
     smoothing, motion = settings.label_smoothing, outputs.motion
     terms = {"motion": _motion(motion, batch.agents, settings)}
     if motion.leave_logit is not None:
-        terms["stay"] = _stay(motion.rows, motion.leave_logit, batch.agents)
+        terms["keep"] = _stay(motion.rows, motion.leave_logit, batch.agents)
     if motion.pattern_logits is not None:
-        terms["pattern"] = _pattern(motion.rows, motion.pattern_logits, batch.agents)
+        terms["validity_pattern"] = _pattern(
+            motion.rows, motion.pattern_logits, batch.agents
+        )
     if outputs.entries is not None:
         terms |= _entries(outputs.entries, batch, smoothing)
     if outputs.details is not None:
@@ -160,7 +162,7 @@ def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> 
     mask = rows.pack(motion_mask(agents))
     weight = torch.ones(agents.move.shape, device=mask.device)
     entering = agents.presence[:, 1:] == Presence.ENTERING
-    weight[:, 1:][entering] = settings.first_move_weight  # At token 0 nobody comes in.
+    weight[:, 1:][entering] = settings.first_motion_weight  # At token 0 nobody comes in.
     target = rows.pack(_next(agents.label, -1))
     return _choice(
         outputs.move_logits[mask],
@@ -192,10 +194,10 @@ def _entries(outputs: EntryOutputs, batch: Batch, smoothing: float) -> Terms:
     terms = {"add": _event(outputs.add_logit[decided], comes[decided])}
     if outputs.cell_logits is not None:
         cell = outputs.rows.pack(entries.cell)
-        terms["cell"] = _choice(outputs.cell_logits[comes], cell[comes], smoothing)
+        terms["position"] = _choice(outputs.cell_logits[comes], cell[comes], smoothing)
     if outputs.place_m is not None:
         gap_m = outputs.place_m - _places(outputs.rows, batch)
-        terms["place"] = _distance(gap_m[comes] / outputs.radius_m)
+        terms["position_regression"] = _distance(gap_m[comes] / outputs.radius_m)
     return terms
 
 
@@ -213,14 +215,14 @@ def _details(outputs: DetailOutputs, batch: Batch) -> Terms:
     real = pack(details.newcomer)
     size_log_m = pack(details.size_lwh_m).clamp(min=0.05).log()
     terms = {
-        "kind": _choice(outputs.kind_logits[real], pack(details.kind)[real], 0.0),
+        "agent_type": _choice(outputs.kind_logits[real], pack(details.kind)[real], 0.0),
         "size": _distance((outputs.size_log_m - size_log_m)[real]),
     }
     if outputs.heading_logits is not None:
         terms["heading"] = _choice(outputs.heading_logits, pack(details.heading), 0.0)
     if outputs.turned_rad is not None:
         gap_rad = wrap_angle(outputs.turned_rad - _turns(outputs.rows, batch))
-        terms["turn"] = _distance(gap_rad[:, None] / math.pi)
+        terms["heading_regression"] = _distance(gap_rad[:, None] / math.pi)
     if outputs.offset_m is not None:
         terms["offset"] = _distance(outputs.offset_m - pack(details.offset_m))
     return terms

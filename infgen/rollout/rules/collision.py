@@ -5,8 +5,8 @@ from jaxtyping import Bool, Float32, Int64
 
 from infgen.geometry import boxes_overlap, to_local, to_world
 from infgen.rollout.population import Population
-from infgen.scene import AgentKind
-from infgen.tokens.vocabulary import MotionCodebook
+from infgen.scene import AgentType
+from infgen.tokens.vocabulary import MotionVocabulary
 
 LOOKED_AT = (3, 5)
 """Steps of a half second at which boxes are compared: its middle and its end."""
@@ -17,7 +17,7 @@ ON_THE_WAY_M = 3.0
 def repeat(
     before: Population,
     move: Int64[np.ndarray, "rollout row"],
-    codebook: MotionCodebook,
+    codebook: MotionVocabulary,
     times: int,
 ) -> Float32[np.ndarray, "rollout row looked 3"]:
     """Where everyone is to be if its move is made several times, at ``LOOKED_AT``."""
@@ -73,7 +73,7 @@ def _near(
         gap_m = np.linalg.norm(xy_m[:, :, None] - xy_m[:, None], axis=-1)
         near |= gap_m < reach_m[:, :, None] + reach_m[:, None] + ON_THE_WAY_M
     near &= there[:, :, None] & there[:, None]
-    on_foot = before.kind == AgentKind.PEDESTRIAN
+    on_foot = before.kind == AgentType.PEDESTRIAN
     near &= ~(on_foot[:, :, None] & on_foot[:, None])
     rows = there.shape[1]
     near &= np.triu(np.ones((rows, rows), dtype=bool), 1)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32, Int64
 
 from infgen.geometry import box_corners, squares_of
 from infgen.rollout.population import Population
-from infgen.scene import AgentKind, FeatureKind, Scene
+from infgen.scene import AgentType, FeatureKind, Scene
 from infgen.spatial.nearest import nearest_by_cells
 from infgen.spatial.road_edges import RoadEdges, edges_of, project, signed_distance_m
 
@@ -130,7 +130,7 @@ def find_departures(
         scene: Map of each rollout.
     """
     departs = np.zeros(which.shape, dtype=bool)
-    vehicle = which & (before.kind == AgentKind.VEHICLE)
+    vehicle = which & (before.kind == AgentType.VEHICLE)
     poses = np.concatenate([before.pose[:, :, None], ways], axis=2)
     for at, edge in enumerate(kerbs):
         rollout, row = np.nonzero(vehicle & (scene == at)[:, None])

@@ -12,7 +12,7 @@ from infgen.rollout.recording import Start, number_maps
 from infgen.rollout.rules.collision import LOOKED_AT, find_hits, repeat
 from infgen.rollout.rules.off_road import Kerbs, find_departures
 from infgen.tokens.scene_tokens import Presence
-from infgen.tokens.vocabulary import MotionCodebook
+from infgen.tokens.vocabulary import MotionVocabulary
 
 CLEAR_AHEAD = 3
 """Half seconds that everybody is taken to go on alike where it is asked who meets whom."""
@@ -33,7 +33,7 @@ class Lookout:
         scene: Map of each rollout.
     """
 
-    codebook: MotionCodebook
+    codebook: MotionVocabulary
     kerbs: Sequence[Kerbs]
     scene: Int64[np.ndarray, " rollout"]
 
@@ -118,9 +118,9 @@ class Lookout:
 
 
 def look_out(
-    starts: Sequence[Start], codebook: MotionCodebook, *, stay_on_road: bool
+    starts: Sequence[Start], codebook: MotionVocabulary, *, reject_off_road: bool
 ) -> Lookout:
     """Look out for rollouts; those of one scene share its map."""
     maps, scene = number_maps(starts)
-    kerbs = [Kerbs(start.scene) for start in maps] if stay_on_road else []
+    kerbs = [Kerbs(start.scene) for start in maps] if reject_off_road else []
     return Lookout(codebook, kerbs, scene)

@@ -17,7 +17,7 @@ from infgen.model.signal_features import StopLines
 from infgen.rollout.population import Population
 from infgen.rollout.recording import NOBODY
 from infgen.rollout.rules.off_road import lane_pieces, lanes_distance_m
-from infgen.scene import AgentKind, Scene
+from infgen.scene import AgentType, Scene
 from infgen.tokens.scene_tokens import Presence, SignalClass
 
 AWAY_M = 1.0
@@ -67,7 +67,7 @@ class Patience:
         """
         self._remember(everyone, token)
         stood = token - self._since
-        vehicle = (everyone.kind == AgentKind.VEHICLE) & (everyone.life != NOBODY)
+        vehicle = (everyone.kind == AgentType.VEHICLE) & (everyone.life != NOBODY)
         vehicle &= everyone.presence != Presence.LEAVING
         new = vehicle & (stood == self._tokens)
         self._in_lane[new] = self._are_in_lane(everyone.pose[new], np.nonzero(new)[0])

@@ -5,7 +5,7 @@ from enum import Enum
 
 import numpy as np
 
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 
 
 class Body(Enum):
@@ -20,10 +20,10 @@ class Body(Enum):
     WALKER = "pedestrian"
 
     @property
-    def kind(self) -> AgentKind:
+    def kind(self) -> AgentType:
         """What a log calls it."""
-        kinds = {Body.BICYCLE: AgentKind.CYCLIST, Body.WALKER: AgentKind.PEDESTRIAN}
-        return kinds.get(self, AgentKind.VEHICLE)
+        kinds = {Body.BICYCLE: AgentType.CYCLIST, Body.WALKER: AgentType.PEDESTRIAN}
+        return kinds.get(self, AgentType.VEHICLE)
 
 
 MOTOR_SHARES = {

@@ -46,7 +46,7 @@ class Town:
         road_map: The map.
         lane_ids: Feature ids of lanes and of ways across junctions, by name.
         surroundings: What stands beside the road.
-        kind: ``AgentKind`` of everyone under way.
+        kind: ``AgentType`` of everyone under way.
         size_lwh_m: Their boxes.
         car: Who drives a car.
         bodies: Where they are at each recorded step.

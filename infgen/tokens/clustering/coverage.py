@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int64
 
 from infgen.clock import CLOCK
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.agents import match_agents
 from infgen.tokens.clustering.kdisks import Items, Space, gap_m
 from infgen.tokens.clustering.motion_samples import NUM_KINDS
@@ -23,7 +23,7 @@ from infgen.tokens.map import match_curves
 from infgen.tokens.motion_tokens import make_move_table
 from infgen.tokens.settings import TokenSettings
 from infgen.tokens.tracks import Paths
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 MOVING_M = 0.05
 """A move whose end is nearer than this to its start does not count as moving."""
@@ -36,7 +36,7 @@ class Matches:
     """Every observed token of some scenes, matched.
 
     Attributes:
-        kind: ``AgentKind`` of the agent.
+        kind: ``AgentType`` of the agent.
         move: The move chosen.
         error_m: From the centre where the chain of moves is to the logged centre.
     """
@@ -46,13 +46,13 @@ class Matches:
     error_m: Float64[np.ndarray, " match"]
 
 
-def match_paths(paths: Iterable[Paths], codebook: MotionCodebook) -> Matches:
+def match_paths(paths: Iterable[Paths], codebook: MotionVocabulary) -> Matches:
     """Match the agents of scenes as the tokenizer does."""
     settings = TokenSettings()
     table, grid = make_move_table(codebook), make_grid(settings)
     kinds, moves, errors_m = [np.empty(0, np.int8)], [np.empty(0, int)], [np.empty(0)]
     for scene in paths:
-        agents = match_agents(scene, table, grid, settings.entry_order)[0]
+        agents = match_agents(scene, table, grid, settings.insertion_order)[0]
         away_m = agents.pose[..., :2].astype(np.float64) - scene.pose[:, 1:, :2]
         row, token = np.nonzero(agents.observed)
         kinds.append(agents.kind[row])
@@ -62,9 +62,9 @@ def match_paths(paths: Iterable[Paths], codebook: MotionCodebook) -> Matches:
 
 
 def describe_moves(
-    codebook: MotionCodebook,
+    codebook: MotionVocabulary,
     origin: Int8[np.ndarray, "3 move"],
-    held_out: Matches,
+    validation_split: Matches,
     familiar: Matches,
     settings: VocabSettings,
 ) -> dict[str, Any]:
@@ -73,16 +73,20 @@ def describe_moves(
     Args:
         codebook: The moves.
         origin: ``Origin`` of each.
-        held_out: Matches of scenes the codebook was not made from.
+        validation_split: Matches of scenes the codebook was not made from.
         familiar: Matches of scenes it was made from; they count only as use.
         settings: What the codebook was made with.
     """
     return {
-        AgentKind(kind).name.lower(): {
+        AgentType(kind).name.lower(): {
             **_origins(origin[kind]),
-            **_use(kind, codebook.num_moves, held_out, familiar),
-            "held_out_error_m": _spread(held_out.error_m[held_out.kind == kind]),
-            "held_out_error_moving_m": _spread(_moving_error(codebook, held_out, kind)),
+            **_use(kind, codebook.num_motion_tokens, validation_split, familiar),
+            "held_out_error_m": _spread(
+                validation_split.error_m[validation_split.kind == kind]
+            ),
+            "held_out_error_moving_m": _spread(
+                _moving_error(codebook, validation_split, kind)
+            ),
             **_describe_shapes(
                 MoveSpace(kind, limits_of(settings)),
                 codebook.path[kind],
@@ -95,7 +99,7 @@ def describe_moves(
 
 
 def describe_roads(
-    codebook: RoadCodebook,
+    codebook: MapVocabulary,
     origin: Int8[np.ndarray, " road"],
     held_out_m: Float32[np.ndarray, "unknown 11 2"],
     familiar_m: Float32[np.ndarray, "known 11 2"],
@@ -110,7 +114,7 @@ def describe_roads(
     turn_deg = np.degrees(np.unwrap(heading_rad, axis=1)[:, -1])
     return {
         **_origins(origin),
-        "dead": codebook.num_roads - len(used),
+        "dead": codebook.num_map_tokens - len(used),
         "held_out_pieces": len(held_out_m),
         "held_out_error_m": _spread(np.linalg.norm(away_m, axis=-1).mean(axis=-1)),
         **_describe_shapes(space, codebook.curve_m, np.array([1, -1], dtype=np.float32)),
@@ -124,13 +128,15 @@ def _origins(origin: np.ndarray) -> dict[str, int]:
     return {name: int((origin == value).sum()) for value, name in names.items()}
 
 
-def _use(kind: int, num_moves: int, held_out: Matches, familiar: Matches) -> dict[str, int]:
-    parts = [matches.move[matches.kind == kind] for matches in (held_out, familiar)]
+def _use(
+    kind: int, num_motion_tokens: int, validation_split: Matches, familiar: Matches
+) -> dict[str, int]:
+    parts = [matches.move[matches.kind == kind] for matches in (validation_split, familiar)]
     used = len(np.unique(np.concatenate(parts)))
-    return {"dead": num_moves - used, "held_out_tokens": len(parts[0])}
+    return {"dead": num_motion_tokens - used, "held_out_tokens": len(parts[0])}
 
 
-def _moving_error(codebook: MotionCodebook, matches: Matches, kind: int) -> np.ndarray:
+def _moving_error(codebook: MotionVocabulary, matches: Matches, kind: int) -> np.ndarray:
     end_m = np.hypot(*codebook.end_pose[kind, :, :2].T)
     moving = (matches.kind == kind) & (end_m[matches.move] > MOVING_M)
     return matches.error_m[moving]

@@ -9,7 +9,7 @@ from jaxtyping import Float32
 
 from infgen.clock import CLOCK
 from infgen.geometry import rotate
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.clustering.physical_limits import MAX_REVERSE_MPS, MotionLimits, within
 from infgen.tokens.vocabulary import BOX_LW_M
 
@@ -38,14 +38,14 @@ def fan(
     """Make arcs of all lengths and turns of a kind, the most ordinary first.
 
     Args:
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         limits: What the arcs keep to.
         spacing_m: How far neighbouring arcs' box corners end apart, about.
     """
     length_m, turn_rad = _grid(kind, limits, spacing_m)
     effort = _effort(length_m, turn_rad, float(limits.speed_mps[kind]))
     path = _arcs(length_m, turn_rad, PIVOT_M[kind])
-    if kind == AgentKind.PEDESTRIAN:
+    if kind == AgentType.PEDESTRIAN:
         path, effort = _with_strolls(path, effort)
     order = np.lexsort((*path[:, -1].T, effort))
     path = path[order]

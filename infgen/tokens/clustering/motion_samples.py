@@ -7,7 +7,7 @@ from jaxtyping import Float32, Int8, UInt64
 
 from infgen.clock import CLOCK, Clock
 from infgen.geometry import box_corners, to_local
-from infgen.scene import AgentKind, Scene
+from infgen.scene import AgentType, Scene
 from infgen.tokens.clustering.physical_limits import MotionLimits, ease, plausible
 from infgen.tokens.clustering.sample_keys import item_keys, smallest
 from infgen.tokens.tracks import clean_headings
@@ -25,7 +25,7 @@ class Segments:
 
     Attributes:
         key: Identity of the segment (scene, track, start), hashed.
-        kind: ``AgentKind``; none is ``OTHER``.
+        kind: ``AgentType``; none is ``OTHER``.
         path: Poses at steps 0 to 5, in the frame of step 0.
     """
 
@@ -61,7 +61,7 @@ def scene_segments(
     steps = starts[:, None] + np.arange(clock.steps_per_token + 1)  # [start, 6]
     long = tracks.valid.sum(axis=1) >= min(MIN_STEPS, tracks.num_steps // 3)
     whole = tracks.valid[:, steps].all(axis=-1) & long[:, None]  # [agent, start]
-    whole &= ((tracks.kind >= 0) & (tracks.kind < AgentKind.OTHER))[:, None]
+    whole &= ((tracks.kind >= 0) & (tracks.kind < AgentType.OTHER))[:, None]
     agent, start = np.nonzero(whole)
 
     heading_rad = clean_headings(tracks.heading_rad, tracks.valid)

@@ -12,14 +12,14 @@ from jaxtyping import Bool, Float32
 
 from infgen.clock import CLOCK
 from infgen.geometry import rotate, wrap_angle
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.clustering.settings import VocabSettings
 
 PEDESTRIAN_MAX_YAW_RATE_RAD_S = 2 * np.pi
 """A pedestrian turns round on the spot within one move; others obey the setting."""
 
 MAX_REVERSE_MPS = (6.0, 2.0, 1.5)
-"""Who goes backwards faster is logged with a wrong heading (row: ``AgentKind``)."""
+"""Who goes backwards faster is logged with a wrong heading (row: ``AgentType``)."""
 
 JUMP = 4.0
 """A step that changes velocity by so many times the limit is a jump of the log, not noise
@@ -36,7 +36,7 @@ _INSIDE, _EASED = 1 - 1e-3, 1 - 2e-3
 
 @dataclass(frozen=True, slots=True)
 class MotionLimits:
-    """Bounds by kind (row: ``AgentKind``).
+    """Bounds by kind (row: ``AgentType``).
 
     Attributes:
         speed_mps: No step is faster.
@@ -138,7 +138,7 @@ def _goes_straight(path: np.ndarray, kind: int) -> np.ndarray:
     end_m = rotate(path[:, -1, :2], -turn_rad / 2)  # seen along the mean heading
     forward_m, left_m = end_m[:, 0], end_m[:, 1]
     straight = forward_m >= -MAX_REVERSE_MPS[kind] * CLOCK.token_s
-    if kind == AgentKind.PEDESTRIAN:
+    if kind == AgentType.PEDESTRIAN:
         return straight
     swing_m = 2 * LONGEST_PIVOT_M[kind] * np.sin(turn_rad / 2)
     straight &= left_m <= np.maximum(swing_m, 0) + SLIP_M

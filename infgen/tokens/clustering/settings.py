@@ -12,12 +12,12 @@ class VocabSettings:
 
     Attributes:
         split: Split whose scenes the codebooks are made from (start of the file name).
-        held_out: Split that the reports measure coverage on.
-        num_moves: Moves per kind of agent.
-        num_roads: Five-metre pieces of map lines.
+        validation_split: Split that the reports measure coverage on.
+        num_motion_tokens: Moves per kind of agent.
+        num_map_tokens: Five-metre pieces of map lines.
         tolerance_m: Radius of a disk: mean distance of corners between two moves.
         road_tolerance_m: Radius of a disk of map pieces; 0 to search the one that fills
-            ``num_roads``.
+            ``num_map_tokens``.
         segments_per_shard: Most segments of a kind taken from one shard.
         segments_per_kind: Most segments of a kind clustered.
         mirror: Add left/right mirrored segments where a kind would not fill its codebook.
@@ -34,9 +34,9 @@ class VocabSettings:
     """
 
     split: str = "training"
-    held_out: str = "validation"
-    num_moves: int = 2048
-    num_roads: int = 1024
+    validation_split: str = "validation"
+    num_motion_tokens: int = 2048
+    num_map_tokens: int = 1024
     tolerance_m: float = 0.05
     road_tolerance_m: float = 0.0
     segments_per_shard: int = 16384
@@ -57,8 +57,8 @@ class VocabSettings:
             ConfigError: naming the setting.
         """
         bounds = (
-            ("num_moves", 2, 2**15 - 1),
-            ("num_roads", 1, 2**15 - 1),
+            ("num_motion_tokens", 2, 2**15 - 1),
+            ("num_map_tokens", 1, 2**15 - 1),
             ("tolerance_m", 0.001, 2.0),
             ("road_tolerance_m", 0.0, 2.0),
             ("segments_per_shard", 1, math.inf),

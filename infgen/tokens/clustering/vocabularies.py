@@ -18,7 +18,7 @@ from infgen.tokens.clustering.made_motion_samples import fan
 from infgen.tokens.clustering.motion_samples import NUM_KINDS, Segments
 from infgen.tokens.clustering.physical_limits import MotionLimits, limits_of, within
 from infgen.tokens.clustering.settings import VocabSettings
-from infgen.tokens.vocabulary import BOX_LW_M, ROAD_SAMPLES, MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import BOX_LW_M, ROAD_SAMPLES, MapVocabulary, MotionVocabulary
 
 ANCHOR_M = 0.5
 """Where logs show no move within this distance of a possible one, one is made."""
@@ -157,7 +157,7 @@ class _Shelf:
 
 def cluster_moves(
     segments: Segments, settings: VocabSettings
-) -> tuple[MotionCodebook, Int8[np.ndarray, "3 move"]]:
+) -> tuple[MotionVocabulary, Int8[np.ndarray, "3 move"]]:
     """Make the motion codebook from segments of logs (which may be none).
 
     Returns:
@@ -168,12 +168,12 @@ def cluster_moves(
     ]
     origin = np.array([shelf.origin for shelf in kinds], dtype=np.int8)
     path = np.stack([shelf.rows for shelf in kinds])
-    return MotionCodebook(BOX_LW_M, path, origin == Origin.LOGGED), origin
+    return MotionVocabulary(BOX_LW_M, path, origin == Origin.LOGGED), origin
 
 
 def cluster_roads(
     curve_m: Float32[np.ndarray, "piece 11 2"], settings: VocabSettings
-) -> tuple[RoadCodebook, Int8[np.ndarray, " road"], float]:
+) -> tuple[MapVocabulary, Int8[np.ndarray, " road"], float]:
     """Make the map codebook from pieces of lines (which may be none).
 
     Returns:
@@ -183,13 +183,13 @@ def cluster_roads(
     order = np.random.default_rng(settings.seed).permutation(len(logged))
     tolerance_m = settings.road_tolerance_m
     if tolerance_m == 0:
-        tolerance_m = _road_tolerance(space, logged, order, settings.num_roads)
-    shelf = _Shelf(space, settings.num_roads, logged[:0])
+        tolerance_m = _road_tolerance(space, logged, order, settings.num_map_tokens)
+    shelf = _Shelf(space, settings.num_map_tokens, logged[:0])
     shelf.cover(logged, order, tolerance_m, RARE_ROADS)
     mirrored = logged * np.array([1, -1], np.float32) if settings.mirror else logged[:0]
     shelf.fill(logged, order, tolerance_m, mirrored, line_arcs)
     origin = np.array(shelf.origin, dtype=np.int8)
-    return RoadCodebook(shelf.rows, origin == Origin.LOGGED), origin, tolerance_m
+    return MapVocabulary(shelf.rows, origin == Origin.LOGGED), origin, tolerance_m
 
 
 def _cluster_kind(
@@ -203,8 +203,8 @@ def _cluster_kind(
     mirrored = mirrored if settings.mirror else mirrored[:0]
 
     still = np.zeros((1, *path.shape[1:]), np.float32)
-    shelf = _Shelf(space, settings.num_moves, still, [Origin.MADE])
-    anchors = _anchors(space, logged, int(settings.num_moves * ANCHOR_SHARE))
+    shelf = _Shelf(space, settings.num_motion_tokens, still, [Origin.MADE])
+    anchors = _anchors(space, logged, int(settings.num_motion_tokens * ANCHOR_SHARE))
     tolerance_m = settings.tolerance_m
     shelf.cover(logged, order, tolerance_m, RARE_MOVES, spare=len(anchors))
     shelf.lay(anchors, None, tolerance_m, origin=Origin.MADE)

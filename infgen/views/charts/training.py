@@ -42,19 +42,19 @@ _OUTLIERS = 0.02
 
 LOSSES = {
     "motion": "Next move",
-    "stay": "Staying or leaving",
+    "keep": "Staying or leaving",
     "add": "Adding or beginning",
-    "cell": "Cell of a newcomer",
-    "place": "Place of a newcomer",
+    "position": "Cell of a newcomer",
+    "position_regression": "Place of a newcomer",
     "heading": "Heading of a newcomer",
     "offset": "Offset in the cell",
-    "kind": "Kind of a newcomer",
+    "agent_type": "Kind of a newcomer",
     "size": "Size of a newcomer",
-    "pattern": "Pattern of detection",
+    "validity_pattern": "Pattern of detection",
     "map": "Hidden map piece",
 }
 """Terms of the loss, in the order in which they are drawn; others follow."""
-_SQUARED = {"size", "offset", "place"}
+_SQUARED = {"size", "offset", "position_regression"}
 """Terms that are squared errors whatever the network."""
 _OTHERS = {
     "motion_accuracy": ("Accuracy of moves", "share right"),
@@ -62,7 +62,7 @@ _OTHERS = {
     "gradient_norm": ("Norm of the gradient", "norm"),
     "learning_rate": ("Learning rate", ""),
 }
-_EVENTS = {"stay": "Leaving", "add": "Adding"}
+_EVENTS = {"keep": "Leaving", "add": "Adding"}
 """Decisions with probabilities, and what happens where they say yes."""
 
 

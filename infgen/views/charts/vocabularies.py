@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int8
 
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.clustering.vocabularies import Origin
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 _WIDTH_PX = 920
 _MARGIN_PX = 24
@@ -37,9 +37,9 @@ svg { background: #fafafa; border: 1px solid #ddd; max-width: 100%; height: auto
 
 def codebook_page(
     report: Mapping[str, Any],
-    motion: MotionCodebook,
+    motion: MotionVocabulary,
     move_origin: Int8[np.ndarray, "3 move"],
-    roads: RoadCodebook,
+    roads: MapVocabulary,
     road_origin: Int8[np.ndarray, " road"],
 ) -> str:
     """Write the page (HTML) of a vocabulary report.
@@ -54,14 +54,15 @@ def codebook_page(
     parts = [
         "<h1>Vocabularies</h1>",
         f"<p>Made from {report['scenes']['learn']} scenes; coverage measured on "
-        f"{escape(report['held_out'])}. Moves are at least {report['tolerance_m']} m apart "
+        f"{escape(report['validation_split'])}. Motion tokens are at least "
+        f"{report['tolerance_m']} m apart "
         "(mean distance of box corners at their ends), unless a table says less.</p>",
         "<h2>Moves</h2>",
         _table(report["motion"]),
         _key(),
     ]
     for kind in range(len(motion.path)):
-        title = f"{AgentKind(kind).name.capitalize()}: paths of half a second"
+        title = f"{AgentType(kind).name.capitalize()}: paths of half a second"
         parts += [
             f"<h3>{title}</h3>",
             _picture(motion.path[kind, ..., :2], move_origin[kind]),

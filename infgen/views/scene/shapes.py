@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.views.scene.style import AGENTS
 
 _CORNER_POINTS = 5
@@ -33,13 +33,13 @@ class Shape(NamedTuple):
 def shape_of(kind: int, length_m: float, width_m: float) -> Shape:
     """Return what an agent looks like."""
     none, dot = np.zeros((0, 2)), (0.0, AGENTS.dot * width_m)
-    if kind == AgentKind.VEHICLE:
+    if kind == AgentType.VEHICLE:
         back = -AGENTS.dot_back * length_m
         return Shape(_car(length_m, width_m), _screen(length_m, width_m), (back, dot[1]))
-    if kind == AgentKind.PEDESTRIAN:
+    if kind == AgentType.PEDESTRIAN:
         return Shape(_walker(max(length_m, width_m) / 2), none, dot)
     half = max(width_m, length_m / 2) / 2
-    if kind == AgentKind.CYCLIST:
+    if kind == AgentType.CYCLIST:
         corners = [(length_m / 2, 0.0), (-length_m / 2, half), (-length_m / 4, 0.0)]
         return Shape(np.array([*corners, (-length_m / 2, -half)]), none, dot)
     diamond = [(length_m / 2, 0), (0, width_m / 2), (-length_m / 2, 0), (0, -width_m / 2)]

@@ -32,7 +32,7 @@ class Showing:
         name: ``log``, or ``rollout 3``.
         ego: Row of the recording car.
         id: Track ids.
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         role: ``Role``; in the log ``INSERTED`` are those first seen after now.
         size_lw_m: One box per agent.
         pose: x, y, heading; where ``valid`` is False it means nothing.

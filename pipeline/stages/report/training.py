@@ -25,7 +25,7 @@ from pipeline.stages.train.train_log import read_log
 
 LOG = "train.jsonl"
 _PLACES = ("", LOG, f"latest/train/{LOG}")
-_CONTROLS = ("stay", "add")
+_CONTROLS = ("keep", "add")
 
 Line = Mapping[str, Any]
 
@@ -34,7 +34,7 @@ def read_run(path: Path, name: str) -> Run:
     """Read the log of a run; figures it does not hold are left out."""
     lines = read_log(path)
     train = [line for line in lines if "learning_rate" in line]
-    held_out = [
+    validation_split = [
         {"step": line["step"], **line["validation"]}
         for line in lines
         if line.get("validation")
@@ -48,8 +48,8 @@ def read_run(path: Path, name: str) -> Run:
             for figure in curves
             if f"{_term(figure)}_count" in curves
         },
-        validation=_curves(held_out),
-        bins=_bins(held_out[-1]) if held_out else {},
+        validation=_curves(validation_split),
+        bins=_bins(validation_split[-1]) if validation_split else {},
     )
 
 

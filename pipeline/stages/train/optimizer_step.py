@@ -111,7 +111,9 @@ class Descent:
             torch.manual_seed(noise_of_part(step, settings.seed, number))  # For dropout.
             names = self._add(batch, weight, number)
         self._team.add_up(self._sums)
-        clipped = torch.nn.utils.clip_grad_norm_(network.parameters(), settings.clip_norm)
+        clipped = torch.nn.utils.clip_grad_norm_(
+            network.parameters(), settings.max_gradient_norm
+        )
         terms = self._all_terms(names)
         norm = float(clipped)
         self._check(norm, terms)
@@ -124,7 +126,7 @@ class Descent:
     def _prepared(self, part: Batch) -> Batch:
         """Put a part where it is computed, and play it if it is to be played."""
         here = to_device(part, self._sums.device)
-        top = self._settings.closed_loop_top
+        top = self._settings.closed_loop_top_k
         return close_loop(self._training.network, here, top) if top else here
 
     def _add(self, batch: Batch, weight: Tensor, number: int) -> list[str]:

@@ -101,7 +101,9 @@ class Journal:
 
     def _is_due(self) -> bool:
         how = self._course.train
-        by_step = how.checkpoint_every and self._done % how.checkpoint_every == 0
+        by_step = (
+            how.checkpoint_every_steps and self._done % how.checkpoint_every_steps == 0
+        )
         after_s = how.checkpoint_minutes * S_PER_MINUTE
         return bool(by_step or 0 < after_s <= time.monotonic() - self._saved_at)
 
@@ -113,4 +115,4 @@ class Journal:
 
 def is_validated(how: TrainSettings, done: int) -> bool:
     """Whether the network is validated after so many steps; in the end it is once more."""
-    return bool(how.validate_every and done and done % how.validate_every == 0)
+    return bool(how.validate_every_steps and done and done % how.validate_every_steps == 0)

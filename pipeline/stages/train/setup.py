@@ -11,7 +11,7 @@ from infgen.config import ModelSettings, TokenSettings, TrainSettings
 from infgen.model.batching.batch import Limits
 from infgen.model.network import Network
 from infgen.tokens.scene_tokens import SceneTokens
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from pipeline.stages.train.loader import Recipe, TokenScenes
 from pipeline.stages.train.process_group import Team, own_device
 from pipeline.stages.train.sampler import Order
@@ -32,7 +32,7 @@ class Course:
         train: How.
         grid: How the scenes were tokenized.
         scenes: To learn from.
-        held_out: For the validation loss.
+        validation_split: For the validation loss.
         folder: Where checkpoints and the log go.
         start: Folder of the weights to begin with; None for fresh ones.
     """
@@ -41,7 +41,7 @@ class Course:
     train: TrainSettings
     grid: TokenSettings
     scenes: TokenScenes
-    held_out: Sequence[SceneTokens]
+    validation_split: Sequence[SceneTokens]
     folder: Path
     start: Path | None = None
 
@@ -72,7 +72,7 @@ class Course:
         return Recipe(self.scenes, self.limits, order, parts, own)
 
 
-def begin(course: Course, motion: MotionCodebook, roads: RoadCodebook) -> Training:
+def begin(course: Course, motion: MotionVocabulary, roads: MapVocabulary) -> Training:
     """Make a network with its first weights, and its optimiser.
 
     Raises:

@@ -55,7 +55,7 @@ def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
     how: TrainSettings = settings["train"]
     shards = {
         "scenes": _shards(inputs, how.split),
-        "held_out": _shards(inputs, how.held_out),
+        "validation_split": _shards(inputs, how.validation_split),
     }
     keys = {f"{use}/{d.name}": d.key for use, dones in shards.items() for d in dones}
     keys |= {source.name: source.fingerprint for source in inputs.sources}
@@ -110,7 +110,7 @@ def _train(
     return {
         "steps": how.steps,
         "scenes": len(course.scenes),
-        "held_out": len(course.held_out),
+        "validation_split": len(course.validation_split),
         "parameters": sum(p.numel() for p in training.network.parameters()),
         "weights": weights,
         "validation": found.validation,
@@ -149,7 +149,7 @@ def _prepare(
         train=settings["train"],
         grid=settings["tokenize"],
         scenes=TokenScenes([Path(path) for path in task["scenes"]]),
-        held_out=TokenScenes([Path(path) for path in task["held_out"]]),
+        validation_split=TokenScenes([Path(path) for path in task["validation_split"]]),
         folder=target,
         start=Path(task[START]) if START in task else None,
     )

@@ -33,7 +33,7 @@ def validate(course: Course, training: Training, forward: Pass) -> Found:
     bins: dict[str, Tensor] = {}
     surprise = torch.zeros(2, device=device)
     for batch in held_out_batches(
-        course.held_out,
+        course.validation_split,
         course.limits,
         max(1, settings.batch_scenes // settings.accumulate),
         settings.seed,

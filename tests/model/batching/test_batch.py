@@ -169,7 +169,9 @@ def test_details_decode_to_where_the_agent_is(
 
 @pytest.fixture(scope="module")
 def noise(codebooks):
-    return make_noise(TrainSettings(noise_moves=6, noise_roads=4), *codebooks())
+    return make_noise(
+        TrainSettings(motion_noise_neighbours=6, map_noise_neighbours=4), *codebooks()
+    )
 
 
 def with_a_gap(scene):
@@ -190,7 +192,9 @@ def pair(record, limits, noise):
 
 def test_noise_without_a_choice_leaves_a_batch_as_it_is(record, limits, codebooks):
     scenes = [with_a_gap(record(3, agents=12, tokens=9)), record(4)]
-    none = make_noise(TrainSettings(noise_moves=1, noise_roads=1), *codebooks())
+    none = make_noise(
+        TrainSettings(motion_noise_neighbours=1, map_noise_neighbours=1), *codebooks()
+    )
 
     plain, noisy = collate(scenes, limits, 7), collate(scenes, limits, 7, none)
 
@@ -417,7 +421,7 @@ def coming(record):
 
 def hidden(coming, known=2, enter_m=40.0):
     scene, part = coming
-    settings = TokenSettings(enter_distance_m=enter_m)
+    settings = TokenSettings(insertion_distance_m=enter_m)
     part = hide_far(part, settings, known)
     rows = [row_in(part, scene, row) for row in range(1, len(scene.pose))]
     return part, rows
@@ -459,7 +463,7 @@ def test_nobody_is_hidden_without_a_rim_or_within_it_or_after_the_history(
 
 
 def test_in_half_of_the_scenes_the_rim_is_bare(coming, limits):
-    rimmed = replace(limits, grid=TokenSettings(enter_distance_m=40.0))
+    rimmed = replace(limits, grid=TokenSettings(insertion_distance_m=40.0))
 
     bare = [
         not collate([coming[0]], rimmed, draw).agents.visible[0, 0, 1:].any()

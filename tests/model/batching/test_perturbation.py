@@ -18,7 +18,7 @@ from infgen.model.batching.perturbation import (
 )
 from infgen.tokens.motion_tokens import advance, make_move_table, nearest_moves
 from infgen.tokens.scene_tokens import NO_MOVE
-from infgen.tokens.vocabulary import BOX_LW_M, MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import BOX_LW_M, MapVocabulary, MotionVocabulary
 
 ITSELF = np.arange(9, dtype=np.int16)[:, None]
 
@@ -27,7 +27,7 @@ def straight_moves(step_m=0.1, count=31):
     """Row ``i`` goes ``i`` steps ahead."""
     path = np.zeros((3, count, 6, 3), np.float32)
     path[..., 0] = step_m * np.arange(count)[:, None] * np.linspace(0, 1, 6)
-    return MotionCodebook(BOX_LW_M, path, np.ones((3, count), bool))
+    return MotionVocabulary(BOX_LW_M, path, np.ones((3, count), bool))
 
 
 def fan_moves():
@@ -38,7 +38,7 @@ def fan_moves():
     ends = np.stack([ahead_m, left_m, turn_rad], axis=-1).reshape(-1, 3)
     path = ends[None, :, None] * np.linspace(0, 1, 6)[:, None]
     path = np.repeat(path.astype(np.float32), 3, axis=0)
-    return MotionCodebook(BOX_LW_M, path, np.ones(path.shape[:2], bool))
+    return MotionVocabulary(BOX_LW_M, path, np.ones(path.shape[:2], bool))
 
 
 def noise_of(codebook, moves, share=1.0, drift=0.0):
@@ -70,7 +70,9 @@ def random_drives(codebook, seed, agents=20, tokens=10):
     """Agents of all kinds on random moves, with gaps after which they start elsewhere."""
     random = np.random.default_rng(seed)
     kind = random.integers(3, size=agents).astype(np.int8)
-    move = random.integers(codebook.num_moves, size=(agents, tokens)).astype(np.int16)
+    move = random.integers(codebook.num_motion_tokens, size=(agents, tokens)).astype(
+        np.int16
+    )
     moving = random.random((agents, tokens)) < 0.8
     moving[:, 0] = False
     pose = random.normal(size=(agents, tokens, 3)).astype(np.float32)
@@ -240,7 +242,7 @@ def test_settings_that_ask_for_no_noise_make_none(metre_moves, bent_roads):
 
 
 def test_road_tokens_are_drawn_from_the_nearest_shapes(metre_moves, bent_roads):
-    noise = make_noise(TrainSettings(noise_roads=3), metre_moves, bent_roads)
+    noise = make_noise(TrainSettings(map_noise_neighbours=3), metre_moves, bent_roads)
 
     # Arcs that end 0, 5, 10, 20, 40 degrees to the left, then 5, 10, 20, 40 to the right.
     near = [set(row) for row in noise.near_roads.tolist()]
@@ -253,7 +255,7 @@ def test_road_tokens_are_drawn_from_the_nearest_shapes(metre_moves, bent_roads):
 def test_road_tokens_that_are_fixed_stay_and_others_become_what_is_near(
     metre_moves, bent_roads
 ):
-    noise = make_noise(TrainSettings(noise_roads=3), metre_moves, bent_roads)
+    noise = make_noise(TrainSettings(map_noise_neighbours=3), metre_moves, bent_roads)
     random = np.random.default_rng(0)
     token = random.integers(9, size=900).astype(np.int16)
     fixed = random.random(900) < 0.3
@@ -267,35 +269,39 @@ def test_road_tokens_that_are_fixed_stay_and_others_become_what_is_near(
 
 def test_shapes_that_are_alike_stand_for_themselves_first(metre_moves):
     curve_m = np.zeros((2, 11, 2), np.float32)
-    twins = RoadCodebook(curve_m, np.ones(2, bool))
+    twins = MapVocabulary(curve_m, np.ones(2, bool))
 
-    noise = make_noise(TrainSettings(noise_roads=1), metre_moves, twins)
+    noise = make_noise(TrainSettings(map_noise_neighbours=1), metre_moves, twins)
 
     assert noise.near_roads.tolist() == [[0], [1]]
 
 
 def test_of_more_tokens_than_the_codebook_has_all_are_drawn_from(metre_moves, bent_roads):
     noise = make_noise(
-        TrainSettings(noise_moves=99, noise_roads=99), metre_moves, bent_roads
+        TrainSettings(motion_noise_neighbours=99, map_noise_neighbours=99),
+        metre_moves,
+        bent_roads,
     )
 
-    assert noise.moves == metre_moves.num_moves
-    assert noise.near_roads.shape == (bent_roads.num_roads, bent_roads.num_roads)
+    assert noise.moves == metre_moves.num_motion_tokens
+    assert noise.near_roads.shape == (bent_roads.num_map_tokens, bent_roads.num_map_tokens)
 
 
-@pytest.mark.parametrize("noise", [{"noise_moves": 5}, {"noise_drift": 0.5}])
+@pytest.mark.parametrize(
+    "noise", [{"motion_noise_neighbours": 5}, {"lateral_drift_share": 0.5}]
+)
 def test_agents_are_led_astray_in_one_way_only(noise):
     with pytest.raises(ConfigError, match="set one of them to 0"):
-        TrainSettings(**noise, closed_loop_top=32)
+        TrainSettings(**noise, closed_loop_top_k=32)
 
 
 def test_drift_needs_no_other_noise(metre_moves, bent_roads):
-    noise = make_noise(TrainSettings(noise_drift=0.5), metre_moves, bent_roads)
+    noise = make_noise(TrainSettings(lateral_drift_share=0.5), metre_moves, bent_roads)
 
     assert (noise.moves, noise.drift) == (1, 0.5)
 
 
-@pytest.mark.parametrize("name", ["noise_share", "noise_drift"])
+@pytest.mark.parametrize("name", ["motion_noise_share", "lateral_drift_share"])
 @pytest.mark.parametrize("share", [-0.1, 1.1])
 def test_a_share_is_from_none_to_all(name, share):
     with pytest.raises(ConfigError, match=rf"train\.{name}"):

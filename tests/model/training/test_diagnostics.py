@@ -55,7 +55,7 @@ def test_decisions_are_those_the_losses_count(passed):
 
     found = decisions(outputs, batch)
 
-    assert set(found) == {"stay", "add"}
+    assert set(found) == {"keep", "add"}
     for name, (probability, happened) in found.items():
         assert len(probability) == float(terms[name].count) > 0
         assert float(probability.sum()) == pytest.approx(float(terms[name].right))
@@ -64,7 +64,7 @@ def test_decisions_are_those_the_losses_count(passed):
 
 def test_surprise_is_the_unsmoothed_unweighted_loss_of_moves(passed):
     outputs, batch = passed
-    plain = TrainSettings(label_smoothing=0.0, first_move_weight=1.0)
+    plain = TrainSettings(label_smoothing=0.0, first_motion_weight=1.0)
     motion = losses(outputs, batch, plain)["motion"]
 
     nats, count = move_surprise(outputs, batch).tolist()

@@ -10,13 +10,13 @@ from infgen.model.batching.batch import collate
 from infgen.model.training.loss_weights import TERMS, supervised
 from infgen.model.training.losses import losses
 
-HOW = TrainSettings(first_move_weight=3.0)
+HOW = TrainSettings(first_motion_weight=3.0)
 VARIANTS = {
     "whole": {},
-    "patterns": {"pattern_tokens": True},
-    "motion only": {"life_cycle": False},
-    "regressed": {"cell_token": False, "heading_token": False},
-    "nobody leaves": {"leave_token": False},
+    "patterns": {"validity_pattern_tokens": True},
+    "motion only": {"insertion_and_removal": False},
+    "regressed": {"position_token": False, "heading_token": False},
+    "nobody leaves": {"remove_token": False},
 }
 
 

@@ -104,7 +104,7 @@ def test_the_ego_never_decides_to_leave(record, limits):
 
 @pytest.fixture
 def settings():
-    return TrainSettings(first_move_weight=3.0, label_smoothing=0.0)
+    return TrainSettings(first_motion_weight=3.0, label_smoothing=0.0)
 
 
 def terms_of(network, scenes, limits, settings):
@@ -121,8 +121,8 @@ def test_add_is_asked_once_per_newcomer_and_begin_once(network, record, limits, 
 
     assert float(terms["add"].count) == 1 + 3 + 1
     assert float(terms["add"].event) == 2
-    assert float(terms["cell"].count) == 2
-    assert float(terms["kind"].count) == 2
+    assert float(terms["position"].count) == 2
+    assert float(terms["agent_type"].count) == 2
     assert float(terms["size"].count) == 2
 
 
@@ -147,7 +147,7 @@ def test_newcomers_outside_the_grid_are_not_asked_for(network, record, limits, s
     _, _, terms = terms_of(network, [far], limits, settings)
 
     assert float(terms["add"].event) == 0
-    assert float(terms["cell"].count) == 0
+    assert float(terms["position"].count) == 0
 
 
 def test_the_label_is_learned_and_not_the_move(network, record, limits, settings):
@@ -234,7 +234,7 @@ def test_figures_name_every_term_with_its_count(network, record, limits, setting
     assert 0 <= found["motion_accuracy"] <= 1
     assert 0 <= found["stay_predicted"] <= 1
     assert found["stay_logged"] == pytest.approx(
-        float(terms["stay"].event) / float(terms["stay"].count)
+        float(terms["keep"].event) / float(terms["keep"].count)
     )
 
 
@@ -262,7 +262,7 @@ def test_a_tiny_scene_can_be_learnt_by_heart(new_network, tiny, record, limits):
     found = figures(terms)
     assert found["motion"] < 0.2
     assert found["motion_accuracy"] > 0.95
-    for name in ("stay", "add", "cell", "kind", "heading"):
+    for name in ("keep", "add", "position", "agent_type", "heading"):
         assert found[name] < 0.1, name
     assert found["size"] < 0.02
     assert found["offset"] < 0.1

@@ -19,7 +19,7 @@ from infgen.exports.scenarionet import with_arrays
 from infgen.metrics.wosac.rollouts import RolloutsError
 from infgen.metrics.wosac.submission import read_submission
 from infgen.rollout.rollout import Rollout
-from infgen.scene import AgentKind, Scene, Signals, SignalState
+from infgen.scene import AgentType, Scene, Signals, SignalState
 from infgen.sources.tfrecord import iter_records
 from infgen.sources.womd import decode_scene
 from infgen.sources.womd_write import encode_scenario, write_tfrecord
@@ -243,7 +243,7 @@ def test_agents_that_no_model_plays_are_there_and_told_of(scenes, tmp_path):
     shown = np.flatnonzero(scene.tracks.valid[:, scene.now])
     row = int(np.setdiff1d(shown, [scene.ego, *scene.predict_row])[0])
     kind = scene.tracks.kind.copy()
-    kind[row] = AgentKind.OTHER
+    kind[row] = AgentType.OTHER
     scene = replace(scene, tracks=replace(scene.tracks, kind=kind))
     write_tfrecord(tmp_path / "logs.tfrecord", [encode_scenario(scene)])
     rollouts = [without(one, int(scene.tracks.id[row])) for one in many(scene)]

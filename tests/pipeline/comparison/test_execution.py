@@ -38,7 +38,7 @@ presets:
     plays: {long: {}, brief: {rollout: {mode: brief}}}
     arms:
       tuned: {start: plain, train: {steps: 1}, plays: [brief]}
-      plain: {plays: {long: {score: {enter_radius_m: 75}}, brief: {}}}
+      plain: {plays: {long: {score: {presence_radius_m: 75}}, brief: {}}}
       other: {train: {steps: 7}, plays: [long]}
 """
 

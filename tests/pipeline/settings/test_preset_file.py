@@ -14,7 +14,7 @@ stages:
   rollout: {deps: [train], params: [rollout]}
 profiles:
   small: {train: {steps: 9}}
-  motion: {model: {life_cycle: false}}
+  motion: {model: {insertion_and_removal: false}}
 presets:
   mini:
     profile: small
@@ -143,7 +143,7 @@ def test_the_packaged_presets_compare_all_methods_of_the_paper_and_all_ablations
         methods = [arm for arm in preset.arms.values() if arm.ablates is None]
         for arm in methods:
             assert set(arm.plays) == {"long", "motion-only", "wosac"}
-            radius = "score.enter_radius_m=75" in arm.plays["long"].words
+            radius = "score.presence_radius_m=75" in arm.plays["long"].words
             assert radius == (arm.published != "InfGen")
         assert preset.arms["catk"].start == "smart"
     assert file.preset("womd-mini").towns == {}

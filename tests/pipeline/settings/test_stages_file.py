@@ -83,7 +83,7 @@ def test_the_packaged_profile_small_has_a_million_parameters(metre_moves, bent_r
 
     network = Network(sizes, metre_moves, bent_roads, TokenSettings())
 
-    books = 2048 - metre_moves.num_moves + 1024 - bent_roads.num_roads
+    books = 2048 - metre_moves.num_motion_tokens + 1024 - bent_roads.num_map_tokens
     count = sum(p.numel() for p in network.parameters()) + books * (sizes.width + 1)
     assert 0.9e6 < count < 1.1e6
 
@@ -93,8 +93,10 @@ def test_the_papers_loss_weights_are_those_of_the_paper():
 
     weights = {k: v.value for k, v in chosen["train"].items() if k.endswith("_weight")}
     assert weights["motion_weight"] == weights["heading_weight"] == 1
-    assert weights["cell_weight"] == weights["stay_weight"] == weights["add_weight"] == 10
-    assert (weights["size_weight"], weights["kind_weight"]) == (0.2, 5)
+    assert (
+        weights["position_weight"] == weights["keep_weight"] == weights["add_weight"] == 10
+    )
+    assert (weights["size_weight"], weights["agent_type_weight"]) == (0.2, 5)
     assert chosen["model"]["width"].value == 48
 
 

@@ -22,7 +22,7 @@ PLAYED = RolloutSettings(seconds=3.0, max_agents=16, count=7, seed=3)
 SETTINGS = {
     "tokenize": TokenSettings(),
     "rollout": PLAYED,
-    "calibrate": CalibrateSettings(by="play", scenes=3, scenes_per_task=2),
+    "calibrate": CalibrateSettings(by="play", scenes=3, scenes_per_unit=2),
 }
 
 
@@ -116,7 +116,7 @@ def test_nothing_is_played_where_it_is_not_asked_for_or_nobody_comes(
 def test_rollouts_that_differ_in_number_alone_share_a_calibration():
     for values in ({"count": 32}, {"seed": 9}, {"scenes": 5}, {"split": "testing"}):
         assert stage.narrow(with_settings("rollout", **values)) == NARROW
-    for values in ({"move_nucleus": 0.5}, {"seconds": 9.0}, {"lights": "log"}):
+    for values in ({"motion_top_p": 0.5}, {"seconds": 9.0}, {"lights": "log"}):
         assert stage.narrow(with_settings("rollout", **values)) != NARROW
     plain = stage.narrow(with_settings("calibrate", by="odds"))
     other = {**with_settings("calibrate", by="odds"), "rollout": RolloutSettings()}
@@ -126,7 +126,7 @@ def test_rollouts_that_differ_in_number_alone_share_a_calibration():
 def test_a_unit_counts_rollouts_and_logs_and_names_what_cannot_be_played(
     inputs, tmp_path, quiet
 ):
-    every = stage.narrow(with_settings("calibrate", scenes=0, scenes_per_task=99))
+    every = stage.narrow(with_settings("calibrate", scenes=0, scenes_per_unit=99))
     unit = stage.plan(inputs, every)[0]
 
     report = stage.work(unit, tmp_path / "out", every, quiet)
@@ -148,7 +148,7 @@ def test_a_rollout_counts_until_its_ego_leaves_the_map(inputs, drive, tmp_path, 
     path = folder / "scenes-000.zarr"
     write_records(path, [scene], Scene, SCENES_SCHEMA, compress=True)
     short = Done("training.tfrecord-9", "key", folder, {"scenes": 1})
-    every = stage.narrow(with_settings("calibrate", scenes=0, scenes_per_task=99))
+    every = stage.narrow(with_settings("calibrate", scenes=0, scenes_per_unit=99))
     unit = stage.plan(Finished([short], inputs.weights), every)[0]
 
     report = stage.work(unit, tmp_path / "out", every, quiet)
@@ -171,7 +171,11 @@ def test_a_higher_bias_lets_more_in(inputs, tmp_path, quiet):
 def with_reach(reach):
     return stage.narrow(
         with_settings(
-            "calibrate", add_reach=reach, leave_reach=reach, scenes=0, scenes_per_task=99
+            "calibrate",
+            add_bias_range=reach,
+            remove_bias_range=reach,
+            scenes=0,
+            scenes_per_unit=99,
         )
     )
 

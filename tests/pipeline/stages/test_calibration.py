@@ -82,7 +82,7 @@ def test_weights_without_a_log_are_played_as_they_are(tmp_path):
 def test_biases_go_on_top_of_those_of_the_settings():
     played = Biases(add=0.5, leave=-0.25).over(RolloutSettings(add_bias=0.25))
 
-    assert (played.add_bias, played.leave_bias) == (0.75, -0.25)
+    assert (played.add_bias, played.remove_bias) == (0.75, -0.25)
 
 
 def test_biases_are_read_as_they_were_written(tmp_path):

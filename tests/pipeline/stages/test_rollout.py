@@ -17,7 +17,7 @@ from pipeline.storage.weights import save_network, state_of
 from pipeline.storage.zarr_store import write_records
 from tests.pipeline.finished import TINY, Finished
 
-SETTINGS = RolloutSettings(seconds=2.0, count=2, scenes_per_task=2, batch=3, max_agents=16)
+SETTINGS = RolloutSettings(seconds=2.0, count=2, scenes_per_unit=2, batch=3, max_agents=16)
 
 
 def no_progress(done, total, note=""):
@@ -69,7 +69,7 @@ def test_the_split_is_cut_into_units_of_a_few_scenes(inputs):
 )
 def test_units_are_of_about_equal_work(inputs, scenes, most, parts):
     shard = Done("validation.tfrecord-1", "key", inputs.scenes[1].path, {"scenes": scenes})
-    settings = dataclasses.replace(SETTINGS, scenes_per_task=most)
+    settings = dataclasses.replace(SETTINGS, scenes_per_unit=most)
 
     units = stage.STAGE.plan(Finished([shard], inputs.weights), settings)
 
@@ -99,7 +99,7 @@ def test_the_calibrated_biases_are_added_to_those_of_the_settings(inputs, tmp_pa
     report, _ = play(unit, tmp_path / "calibrated", settings)
 
     assert unit.task["biases"] == {"add": 0.75, "leave": -0.5}
-    assert (report["add_bias"], report["leave_bias"]) == (1.75, -0.5)
+    assert (report["add_bias"], report["remove_bias"]) == (1.75, -0.5)
 
 
 def test_of_limited_scenes_those_far_apart_are_played(inputs, tmp_path):
@@ -114,9 +114,12 @@ def test_of_limited_scenes_those_far_apart_are_played(inputs, tmp_path):
 @pytest.mark.parametrize(
     ("nobody", "idle"),
     [
-        ({"mode": "motion-only"}, {"add_bias": 1.0, "leave_bias": 1.0, "entry_tries": 9}),
-        ({"insert": False}, {"add_bias": 1.0, "max_entries": 3, "top_cells": 5}),
-        ({"remove": False}, {"leave_bias": 1.0, "leave_radius_m": 70.0}),
+        (
+            {"mode": "motion-only"},
+            {"add_bias": 1.0, "remove_bias": 1.0, "max_insertion_attempts": 9},
+        ),
+        ({"insert": False}, {"add_bias": 1.0, "max_insertions": 3, "position_top_k": 5}),
+        ({"remove": False}, {"remove_bias": 1.0, "removal_radius_m": 70.0}),
     ],
 )
 def test_what_is_about_who_enters_or_leaves_decides_nothing_where_nobody_does(
@@ -212,7 +215,7 @@ def test_agents_far_away_are_played_where_everyone_is_asked_for(
 
 @pytest.mark.parametrize(
     ("model", "plays"),
-    [({}, "motion, entries, exits"), ({"life_cycle": False}, "motion only")],
+    [({}, "motion, entries, exits"), ({"insertion_and_removal": False}, "motion only")],
 )
 def test_the_report_says_what_the_weights_play(
     inputs, tmp_path, metre_moves, bent_roads, model, plays

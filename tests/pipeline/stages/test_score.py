@@ -342,7 +342,7 @@ def test_without_rollouts_there_is_an_empty_table(tmp_path, scenes):
 def test_the_radius_setting_makes_agents_enter_and_leave(tmp_path, scenes):
     # The ego drives away from the parked cars: with a circle of 20 m they are left behind.
     leaving = replace(scenes[0], scenario_id="crossing")
-    settings = {**SETTINGS, "score": ScoreSettings(resamples=0, enter_radius_m=20.0)}
+    settings = {**SETTINGS, "score": ScoreSettings(resamples=0, presence_radius_m=20.0)}
     inputs = Inputs(
         [ingested(tmp_path / "l", scenes)], [played(tmp_path / "p", [as_rollout(leaving)])]
     )

@@ -11,7 +11,7 @@ from infgen.config import TokenSettings
 from infgen.scene import Scene
 from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from pipeline.engine.stage import Done, Unit
 from pipeline.stages import tokenize as stage
 from pipeline.stages import vocabulary
@@ -56,7 +56,7 @@ def codebooks(tmp_path, metre_moves, bent_roads):
         ("motion.zarr", metre_moves, vocabulary.MOTION_SCHEMA),
         ("roads.zarr", bent_roads, vocabulary.ROADS_SCHEMA),
     ):
-        kind = {"motion.zarr": MotionCodebook, "roads.zarr": RoadCodebook}[name]
+        kind = {"motion.zarr": MotionVocabulary, "roads.zarr": MapVocabulary}[name]
         write_records(folder / name, [book], kind, schema, compress=False)
     return folder
 
@@ -155,7 +155,7 @@ def test_the_index_says_where_each_scene_is_and_how_large(tokenized):
         assert row["group"] == "tokens-000.zarr"
         assert row["agents"] == tokens.num_agents
         assert row["tokens"] == tokens.num_tokens
-        assert row["roads"] == tokens.num_roads
+        assert row["roads"] == tokens.num_map_tokens
         assert row["words"] == len(tokens.word)
         assert row["entries"] == len(tokens.entry_agent)
 

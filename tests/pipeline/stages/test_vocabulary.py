@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from infgen.config import IngestSettings, VocabSettings
-from infgen.scene import AgentKind, Scene
-from infgen.tokens.vocabulary import MotionCodebook, RoadCodebook
+from infgen.scene import AgentType, Scene
+from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from pipeline.engine.atomic import StoreError
 from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import Done, Unit
@@ -18,7 +18,7 @@ from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.weights import vocabulary_fingerprint
 from pipeline.storage.zarr_store import write_records
 
-SETTINGS = VocabSettings(num_moves=96, num_roads=48)
+SETTINGS = VocabSettings(num_motion_tokens=96, num_map_tokens=48)
 SHARED = Path(__file__).parents[3] / "../shared/data/womd"
 
 
@@ -131,20 +131,20 @@ def test_codebooks_that_are_taken_need_nothing_to_learn_from(two_splits):
 
     assert (unit.name, unit.task["role"]) == ("validation.tfrecord-0", "held-out")
     with pytest.raises(PlanError, match="no file of split 'trainig'"):
-        vocabulary.plan(two_splits, dataclasses.replace(settings, held_out="none"))
+        vocabulary.plan(two_splits, dataclasses.replace(settings, validation_split="none"))
 
 
 def test_codebooks_come_back_as_they_were_written_with_a_report(two_splits, tmp_path):
     folder, figures = build(two_splits, tmp_path)
     motion, roads = load_codebooks(folder)
-    assert isinstance(motion, MotionCodebook)
-    assert isinstance(roads, RoadCodebook)
-    assert (motion.num_moves, roads.num_roads) == (96, 48)
+    assert isinstance(motion, MotionVocabulary)
+    assert isinstance(roads, MapVocabulary)
+    assert (motion.num_motion_tokens, roads.num_map_tokens) == (96, 48)
     report = json.loads((folder / "report.json").read_text())
     assert report["scenes"] == {"learn": 9, "held-out": 3}
-    assert report["held_out"] == "3 scenes of split validation"
-    for kind in AgentKind:
-        if kind != AgentKind.OTHER:
+    assert report["validation_split"] == "3 scenes of split validation"
+    for kind in AgentType:
+        if kind != AgentType.OTHER:
             row = report["motion"][kind.name.lower()]
             assert row["real"] + row["mirrored"] + row["made"] == 96
             assert row["real"] == motion.real[kind].sum() > 0
@@ -157,7 +157,7 @@ def test_codebooks_come_back_as_they_were_written_with_a_report(two_splits, tmp_
 def test_a_logged_speed_is_written_without_error(two_splits, tmp_path):
     folder, _ = build(two_splits, tmp_path)
     motion, _ = load_codebooks(folder)
-    ends = motion.end_pose[AgentKind.VEHICLE][motion.real[AgentKind.VEHICLE], 0]
+    ends = motion.end_pose[AgentType.VEHICLE][motion.real[AgentType.VEHICLE], 0]
     for speed_mps in (3.0, 4.7, 6.4, 8.1):
         assert np.abs(ends - speed_mps / 2).min() < 1e-3
 
@@ -196,10 +196,10 @@ def test_without_a_held_out_split_some_scenes_are_held_out_by_their_hash(tmp_pat
     files = ingested(tmp_path / "ingest", {"training.tfrecord-0": traffic(16)})
     folder, _ = build(files, tmp_path)
     report = json.loads((folder / "report.json").read_text())
-    held_out = report["scenes"]["held-out"]
-    assert 0 < held_out < 8
-    assert report["scenes"]["learn"] == 16 - held_out
-    assert "held out by the hash" in report["held_out"]
+    validation_split = report["scenes"]["held-out"]
+    assert 0 < validation_split < 8
+    assert report["scenes"]["learn"] == 16 - validation_split
+    assert "held out by the hash" in report["validation_split"]
     assert report["motion"]["vehicle"]["held_out_tokens"] > 0
 
 
@@ -217,7 +217,7 @@ def test_scenes_without_cyclists_or_maps_still_give_whole_codebooks(
     assert roads.curve_m.shape == (48, 11, 2)
     assert figures["real"]["cyclist"] == figures["roads_real"] == 0
     assert figures["error_m"]["cyclist"] is None
-    assert not motion.real[AgentKind.CYCLIST].any()
+    assert not motion.real[AgentType.CYCLIST].any()
 
 
 def test_scenes_that_cannot_be_tokenized_still_give_moves(tmp_path, drive):
@@ -267,7 +267,7 @@ def test_codebooks_from_a_few_real_files_write_held_out_scenes_closely(tmp_path)
     motion, _ = load_codebooks(folder)
     report = json.loads((folder / "report.json").read_text())
 
-    assert motion.num_moves == 2048
+    assert motion.num_motion_tokens == 2048
     for kind, most_m in (("vehicle", 0.07), ("pedestrian", 0.05), ("cyclist", 0.05)):
         row = report["motion"][kind]
         assert row["beyond_limits"] == 0

@@ -63,7 +63,7 @@ def test_the_packages_weights_are_small_and_load():
     files = {path.name: path.stat().st_size for path in builtin_weights().iterdir()}
     assert set(files) == {WEIGHTS, ABOUT}
     assert sum(files.values()) <= LARGEST_BYTES
-    assert network.settings.life_cycle
+    assert network.settings.insertion_and_removal
     assert sum(p.numel() for p in network.parameters()) > 900_000
 
 

@@ -8,7 +8,7 @@ from pipeline.engine.stage import Stage
 
 @dataclass(frozen=True, slots=True)
 class ScoreSettings:
-    enter_radius_m: float = 0.0
+    presence_radius_m: float = 0.0
 
 
 def plan(inputs, settings):
@@ -22,7 +22,7 @@ def work(unit, target, settings, progress):
 def finish(inputs, units, target, settings, progress):
     (target / "score.txt").write_text("scored")
     mode, weights = read_json(inputs.folder("rollout") / "played.json")
-    return {"mode": mode, "weights": weights, "radius_m": settings.enter_radius_m}
+    return {"mode": mode, "weights": weights, "radius_m": settings.presence_radius_m}
 
 
 STAGE = Stage(

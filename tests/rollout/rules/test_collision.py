@@ -7,10 +7,10 @@ import pytest
 
 from infgen.rollout.population import Population
 from infgen.rollout.rules.collision import find_hits, repeat
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence
 
-CAR, WALKER = AgentKind.VEHICLE, AgentKind.PEDESTRIAN
+CAR, WALKER = AgentType.VEHICLE, AgentType.PEDESTRIAN
 
 
 def everyone(*poses, kind=CAR) -> Population:

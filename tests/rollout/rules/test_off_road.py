@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from infgen.rollout.population import Population
 from infgen.rollout.rules.off_road import LANE_M, Kerbs, find_departures
-from infgen.scene import AgentKind, FeatureKind
+from infgen.scene import AgentType, FeatureKind
 from tests.conftest import EDGE_ID, LANE_ID, make_map, make_scene
 from tests.rollout.rules.test_collision import everyone, ways
 
-CAR, WALKER, RIDER = AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST
+CAR, WALKER, RIDER = AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST
 
 
 def street(*more, lane_y_m=0.0):

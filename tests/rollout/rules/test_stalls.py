@@ -10,14 +10,14 @@ from infgen.model.signal_features import StopLines
 from infgen.rollout.recording import NOBODY
 from infgen.rollout.rules.stalls import AWAY_M, IN_LANE_M, WAITS_M, Patience
 from infgen.rollout.session import Session
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence, SignalClass
 from infgen.tokens.signals import REMEMBERED
 from tests.model.test_signal_features import roads
 from tests.rollout.rules.test_collision import everyone
 from tests.rollout.rules.test_off_road import street
 
-CAR, WALKER, RIDER = AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST
+CAR, WALKER, RIDER = AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST
 LONG = 4
 """Half seconds that are long enough."""
 NO_LINES = StopLines.of(roads([(0, 0, 0)], [0], [[0]]))
@@ -126,7 +126,7 @@ def stood(playing, begin, tokens):
 
 def never_sets_off(player, metre_moves, **settings):
     """An untrained network to which all but standing is next to impossible."""
-    playing = player(insert=False, remove=False, top_moves=0, max_agents=1, **settings)
+    playing = player(insert=False, remove=False, motion_top_k=0, max_agents=1, **settings)
     step, standing = playing.stepper.motion_step, playing.tensor(metre_moves.standing)
 
     def still(memory, column):
@@ -141,11 +141,11 @@ def never_sets_off(player, metre_moves, **settings):
 
 def test_in_rollouts_who_has_stood_too_long_sets_off(drive, start, player, metre_moves):
     begin = [start(drive(), at) for at in range(8)]
-    settings = {"move_tries": 8}
+    settings = {"max_motion_samples": 8}
 
     for_good = never_sets_off(player, metre_moves, **settings)
-    patient = never_sets_off(player, metre_moves, patience_s=1.5, **settings)
-    careful = never_sets_off(player, metre_moves, patience_s=9.0, **settings)
+    patient = never_sets_off(player, metre_moves, max_stall_s=1.5, **settings)
+    careful = never_sets_off(player, metre_moves, max_stall_s=9.0, **settings)
 
     assert stood(for_good, begin, 8) == 8
     assert stood(patient, begin, 8) < 4
@@ -153,4 +153,4 @@ def test_in_rollouts_who_has_stood_too_long_sets_off(drive, start, player, metre
 
 
 def test_by_default_everybody_may_stand_for_ever():
-    assert RolloutSettings().patience_s == 0
+    assert RolloutSettings().max_stall_s == 0

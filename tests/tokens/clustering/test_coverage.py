@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from infgen.config import TokenSettings, VocabSettings
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.clustering.coverage import (
     Matches,
     describe_moves,
@@ -43,9 +43,11 @@ def test_no_scenes_have_no_matches(metre_moves):
 
 
 def test_the_report_of_moves_counts_what_was_used_on_either_side(drive, metre_moves):
-    held_out = match_paths(paths_of(drive(speed_mps=10.0)), metre_moves)
+    validation_split = match_paths(paths_of(drive(speed_mps=10.0)), metre_moves)
     familiar = match_paths(paths_of(drive(speed_mps=12.0)), metre_moves)
-    report = describe_moves(metre_moves, origins(metre_moves), held_out, familiar, SETTINGS)
+    report = describe_moves(
+        metre_moves, origins(metre_moves), validation_split, familiar, SETTINGS
+    )
     vehicle = report["vehicle"]
     assert vehicle["dead"] == 61 - 2
     assert vehicle["held_out_tokens"] == 17
@@ -71,8 +73,8 @@ def test_errors_of_who_moves_are_told_apart_from_those_of_who_stands(metre_moves
 
 def test_what_rows_are_made_from_is_counted(metre_moves):
     origin = origins(metre_moves)
-    origin[AgentKind.CYCLIST, :10] = Origin.MADE
-    origin[AgentKind.CYCLIST, 10:15] = Origin.MIRRORED
+    origin[AgentType.CYCLIST, :10] = Origin.MADE
+    origin[AgentType.CYCLIST, 10:15] = Origin.MIRRORED
     report = describe_moves(metre_moves, origin, NOTHING, NOTHING, SETTINGS)["cyclist"]
     assert (report["real"], report["mirrored"], report["made"]) == (46, 5, 10)
 

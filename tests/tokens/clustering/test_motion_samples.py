@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from infgen.config import VocabSettings
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.clustering.motion_samples import (
     NO_SEGMENTS,
     Segments,
@@ -29,7 +29,7 @@ def with_tracks(scene, **changes):
 def test_a_drive_of_nine_seconds_gives_eighteen_equal_moves(drive):
     found = segments_of(drive(speed_mps=10.0))
     assert found.num_segments == 18
-    assert (found.kind == AgentKind.VEHICLE).all()
+    assert (found.kind == AgentType.VEHICLE).all()
     straight = np.column_stack([np.arange(6), np.zeros(6), np.zeros(6)])
     np.testing.assert_allclose(found.path, np.broadcast_to(straight, (18, 6, 3)), atol=1e-4)
 
@@ -69,7 +69,7 @@ def test_who_stands_still_gives_no_moves(parked):
 
 
 def test_other_agents_give_no_moves(drive):
-    assert segments_of(drive(kind=AgentKind.OTHER)).num_segments == 0
+    assert segments_of(drive(kind=AgentType.OTHER)).num_segments == 0
 
 
 def test_a_teleport_gives_no_move(drive):
@@ -91,11 +91,11 @@ def test_headings_that_flip_are_mended_before_moves_are_cut(drive):
 
 
 def test_every_move_of_a_noisy_log_is_within_the_limits(drive):
-    scene = drive(speed_mps=12.0, kind=AgentKind.CYCLIST)
+    scene = drive(speed_mps=12.0, kind=AgentType.CYCLIST)
     noise = np.random.default_rng(0).normal(0, 0.03, scene.tracks.xyz_m.shape)
     found = segments_of(with_tracks(scene, xyz_m=scene.tracks.xyz_m + np.float32(noise)))
     assert found.num_segments > 9
-    assert within(found.path, AgentKind.CYCLIST, LIMITS).all()
+    assert within(found.path, AgentType.CYCLIST, LIMITS).all()
 
 
 def test_keys_name_scene_track_and_start(crossing):
@@ -129,17 +129,17 @@ def test_a_scene_that_is_met_twice_counts_once(drive):
 
 def test_box_corners_are_as_far_apart_as_the_box_has_moved():
     away = np.float32([[3.0, 4.0, 0.0]])
-    np.testing.assert_allclose(corner_gap_m(away, 0 * away, AgentKind.CYCLIST), [5.0])
+    np.testing.assert_allclose(corner_gap_m(away, 0 * away, AgentType.CYCLIST), [5.0])
     turned = np.float32([[0, 0, np.pi]])
     diagonal = np.hypot(4.8, 2.0)
     np.testing.assert_allclose(
-        corner_gap_m(turned, 0 * turned, AgentKind.VEHICLE), [diagonal], rtol=1e-6
+        corner_gap_m(turned, 0 * turned, AgentType.VEHICLE), [diagonal], rtol=1e-6
     )
 
 
 def test_paths_of_a_kind_are_seen_from_their_start(crossing):
     found = segments_of(crossing())
-    walked = found.of_kind(AgentKind.PEDESTRIAN)
+    walked = found.of_kind(AgentType.PEDESTRIAN)
     assert len(walked) == 12
     np.testing.assert_allclose(walked[:, -1, 0], 0.7, atol=1e-4)
     assert not walked[:, 0].any()

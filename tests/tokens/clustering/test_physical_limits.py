@@ -5,12 +5,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from infgen.config import VocabSettings
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.clustering.physical_limits import ease, limits_of, plausible, within
 
 LIMITS = limits_of(VocabSettings())
 STEPS = np.arange(6)
-KINDS = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST)
+KINDS = (AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST)
 
 
 def moves(*steps_xyh):
@@ -33,22 +33,22 @@ def test_a_kind_may_go_as_fast_as_its_limit_and_no_faster(kind, top_mps):
 
 def test_braking_at_twice_the_limit_is_not_possible():
     slowing = 20 * 0.1 * STEPS - 0.5 * 24 * (0.1 * STEPS) ** 2
-    assert not within(moves((slowing, 0, 0)), AgentKind.VEHICLE, LIMITS).any()
-    assert not plausible(moves((slowing, 0, 0)), AgentKind.VEHICLE, LIMITS).any()
+    assert not within(moves((slowing, 0, 0)), AgentType.VEHICLE, LIMITS).any()
+    assert not plausible(moves((slowing, 0, 0)), AgentType.VEHICLE, LIMITS).any()
 
 
 def test_a_jump_of_two_metres_within_a_drive_is_not_plausible():
     jumped = 10 * 0.1 * STEPS + 2.0 * (STEPS > 2)
-    assert not plausible(moves((jumped, 0, 0)), AgentKind.VEHICLE, LIMITS).any()
+    assert not plausible(moves((jumped, 0, 0)), AgentType.VEHICLE, LIMITS).any()
 
 
 def test_a_vehicle_neither_slips_sideways_nor_speeds_backwards():
     aside = moves((0.1 * STEPS, 0.1 * STEPS, 0))
-    assert not plausible(aside, AgentKind.VEHICLE, LIMITS).any()
-    assert not plausible(aside, AgentKind.CYCLIST, LIMITS).any()
-    assert plausible(aside, AgentKind.PEDESTRIAN, LIMITS).all()
-    assert plausible(straight(-3), AgentKind.VEHICLE, LIMITS).all()
-    assert not plausible(straight(-7), AgentKind.VEHICLE, LIMITS).any()
+    assert not plausible(aside, AgentType.VEHICLE, LIMITS).any()
+    assert not plausible(aside, AgentType.CYCLIST, LIMITS).any()
+    assert plausible(aside, AgentType.PEDESTRIAN, LIMITS).all()
+    assert plausible(straight(-3), AgentType.VEHICLE, LIMITS).all()
+    assert not plausible(straight(-7), AgentType.VEHICLE, LIMITS).any()
 
 
 def test_a_vehicle_that_turns_tightly_swings_its_centre_out():
@@ -57,28 +57,28 @@ def test_a_vehicle_that_turns_tightly_swings_its_centre_out():
     turn = 0.46 * share
     x = 2.0 * share * np.cos(turn / 2) + 1.4 * (np.cos(turn) - 1)
     y = 2.0 * share * np.sin(turn / 2) + 1.4 * np.sin(turn)
-    assert within(moves((x, y, turn)), AgentKind.VEHICLE, LIMITS).all()
-    assert not within(moves((x, -y, turn)), AgentKind.VEHICLE, LIMITS).any()
+    assert within(moves((x, y, turn)), AgentType.VEHICLE, LIMITS).all()
+    assert not within(moves((x, -y, turn)), AgentType.VEHICLE, LIMITS).any()
 
 
 def test_a_pedestrian_may_turn_round_and_a_vehicle_may_not():
     about = moves((0, 0, 3.0 * STEPS / 5))
-    assert within(about, AgentKind.PEDESTRIAN, LIMITS).all()
-    assert not within(about, AgentKind.VEHICLE, LIMITS).any()
+    assert within(about, AgentType.PEDESTRIAN, LIMITS).all()
+    assert not within(about, AgentType.VEHICLE, LIMITS).any()
 
 
 def test_what_is_within_the_limits_is_left_alone():
     path = straight(12.3)
-    np.testing.assert_array_equal(ease(path, AgentKind.VEHICLE, LIMITS), path)
+    np.testing.assert_array_equal(ease(path, AgentType.VEHICLE, LIMITS), path)
 
 
 def test_jitter_is_eased_until_it_is_within_the_limits_and_the_end_stays():
     jitter = 0.08 * np.array([0, 1, -1, 1, -1, 0])
     path = moves((0.8 * STEPS, jitter, 0.15 * jitter))
-    assert plausible(path, AgentKind.VEHICLE, LIMITS).all()
-    assert not within(path, AgentKind.VEHICLE, LIMITS).any()
-    eased = ease(path, AgentKind.VEHICLE, LIMITS)
-    assert within(eased, AgentKind.VEHICLE, LIMITS).all()
+    assert plausible(path, AgentType.VEHICLE, LIMITS).all()
+    assert not within(path, AgentType.VEHICLE, LIMITS).any()
+    eased = ease(path, AgentType.VEHICLE, LIMITS)
+    assert within(eased, AgentType.VEHICLE, LIMITS).all()
     np.testing.assert_allclose(eased[:, [0, -1]], path[:, [0, -1]], atol=1e-6)
     assert 0 < np.abs(eased[:, 1:5, 1]).max() < np.abs(path[:, 1:5, 1]).max()
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from infgen.config import ConfigError, VocabSettings
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.tokens.clustering.kdisks import gap_m
 from infgen.tokens.clustering.made_map_samples import line_arcs
 from infgen.tokens.clustering.made_motion_samples import fan
@@ -21,7 +21,7 @@ from infgen.tokens.clustering.vocabularies import (
 )
 from infgen.tokens.vocabulary import STAND_STILL
 
-SETTINGS = VocabSettings(num_moves=128, num_roads=64)
+SETTINGS = VocabSettings(num_motion_tokens=128, num_map_tokens=64)
 LIMITS = limits_of(SETTINGS)
 KINDS = range(3)
 
@@ -81,7 +81,7 @@ def test_no_move_is_beyond_the_limits_and_no_two_are_within_the_tolerance(cluste
 
 
 def test_enough_logs_leave_only_anchors_and_the_stand_still_to_be_made(clustered):
-    origin = clustered[1][AgentKind.VEHICLE]
+    origin = clustered[1][AgentType.VEHICLE]
     assert (origin == Origin.MIRRORED).sum() == 0
     assert (origin == Origin.MADE).sum() <= 1 + 128 * ANCHOR_SHARE
     assert (origin == Origin.LOGGED).sum() >= 128 * (1 - ANCHOR_SHARE) - 1
@@ -113,7 +113,7 @@ def test_without_any_log_codebooks_are_full_of_arcs_within_the_limits():
 
 
 def test_a_codebook_larger_than_the_tolerance_allows_is_filled_at_less_of_it():
-    settings = VocabSettings(num_moves=96, tolerance_m=2.0)
+    settings = VocabSettings(num_motion_tokens=96, tolerance_m=2.0)
     codebook, _ = cluster_moves(NO_SEGMENTS, settings)
     for kind in KINDS:
         gaps = least_gaps(MoveSpace(kind, LIMITS), codebook.path[kind])
@@ -141,7 +141,7 @@ def test_another_seed_lays_other_disks():
 
 
 def test_headings_are_averaged_round_the_circle():
-    space = MoveSpace(AgentKind.PEDESTRIAN, LIMITS)
+    space = MoveSpace(AgentType.PEDESTRIAN, LIMITS)
     path = np.zeros((2, 6, 3), np.float32)
     path[0, :, 2], path[1, :, 2] = np.pi - 0.1, -np.pi + 0.1
     assert np.abs(space.mean(path)[:, 2]) == pytest.approx(np.pi)
@@ -189,7 +189,7 @@ def test_a_fan_is_as_wide_to_the_left_as_to_the_right(kind):
 
 
 def test_a_fan_begins_with_the_most_ordinary_move():
-    path = fan(AgentKind.VEHICLE, LIMITS, 0.1)
+    path = fan(AgentType.VEHICLE, LIMITS, 0.1)
     assert np.abs(path[:20, -1, 2]).max() < 0.3
     assert 0 <= path[:20, -1, 0].max() < 5
 
@@ -207,8 +207,8 @@ def test_arcs_of_lines_begin_straight_and_lie_along_x():
     ("name", "value"),
     [
         ("tolerance_m", 0.0),
-        ("num_moves", 1),
-        ("num_roads", 40_000),
+        ("num_motion_tokens", 1),
+        ("num_map_tokens", 40_000),
         ("max_accel_mps2", -1.0),
     ],
 )

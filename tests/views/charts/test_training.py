@@ -15,8 +15,8 @@ def line(y):
     return Series("", 10 * np.arange(1.0, len(y) + 1), y)
 
 
-def run(name="a", held_out=None, **train):
-    validation = {figure: line(y) for figure, y in (held_out or {}).items()}
+def run(name="a", validation_split=None, **train):
+    validation = {figure: line(y) for figure, y in (validation_split or {}).items()}
     curves = {figure: line(y) for figure, y in train.items()}
     return Run(name, curves, validation=validation)
 
@@ -66,7 +66,7 @@ def test_unknown_values_do_not_count_in_a_running_mean():
 def test_a_chart_has_a_bold_line_its_span_and_a_dashed_one_with_dots():
     falling = 1 + 5 / np.arange(1, 101)
 
-    root = drawn([run(motion=falling, held_out={"motion": [4.0, 2.0, 1.5]})])
+    root = drawn([run(motion=falling, validation_split={"motion": [4.0, 2.0, 1.5]})])
 
     assert len(looks(root, "band", "c0")) == 1
     assert len(looks(root, "line", "c0", "d2")) == 1
@@ -141,7 +141,7 @@ def test_all_that_was_logged_is_drawn_in_a_fixed_order_and_nothing_else():
         "a",
         {name: line([2.0, 1.0]) for name in ("add", "motion", "motion_accuracy", "odd")},
         validation={"total": line([9.0])},
-        bins={"stay": bins, "add": bins},
+        bins={"keep": bins, "add": bins},
     )
 
     assert titles(training_charts([full])) == [

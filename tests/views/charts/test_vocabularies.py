@@ -20,7 +20,7 @@ def page(metre_moves, bent_roads):
     curves = bent_roads.curve_m
     report = {
         "scenes": {"learn": 7, "held-out": 0},
-        "held_out": "0 scenes of split <none>",
+        "validation_split": "0 scenes of split <none>",
         "tolerance_m": 0.05,
         "road_tolerance_m": 0.1,
         "motion": describe_moves(

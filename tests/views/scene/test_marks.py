@@ -4,7 +4,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from infgen.scene import AgentKind, FeatureKind, RoadLineType, SignalState
+from infgen.scene import AgentType, FeatureKind, RoadLineType, SignalState
 from infgen.views.scene.agent_marks import Crowd
 from infgen.views.scene.drawn_map import draw_map, find_lights
 from infgen.views.scene.map_marks import dashes, light_marks, map_marks, within
@@ -41,18 +41,18 @@ def test_the_view_shows_fifty_two_metres_around_the_ego(drive):
     assert view.centre_m == pytest.approx((20.0, 0.0))
 
 
-@pytest.mark.parametrize("kind", AgentKind)
+@pytest.mark.parametrize("kind", AgentType)
 def test_a_shape_fills_its_box_and_points_ahead(kind):
     body = shape_of(kind, 4.0, 2.0).body
 
-    wide = 4.0 if kind == AgentKind.PEDESTRIAN else 2.0  # A disc, drawn with 16 corners.
+    wide = 4.0 if kind == AgentType.PEDESTRIAN else 2.0  # A disc, drawn with 16 corners.
     assert np.ptp(body[:, 1]) == pytest.approx(wide, rel=0.02)
     assert body[:, 0].max() >= 2.0 - 1e-9
     assert abs(body[body[:, 0].argmax(), 1]) <= 1.0
 
 
 def test_a_car_is_as_long_and_wide_as_its_box_and_its_windscreen_is_ahead():
-    shape = shape_of(AgentKind.VEHICLE, 4.6, 2.0)
+    shape = shape_of(AgentType.VEHICLE, 4.6, 2.0)
 
     np.testing.assert_allclose(np.ptp(shape.body, axis=0), [4.6, 2.0])
     assert 0 < shape.mark[:, 0].min() < shape.mark[:, 0].max() < 2.3
@@ -86,7 +86,7 @@ def test_the_ego_wears_a_ring_and_who_came_later_a_dot(crossing):
 def test_whoever_is_small_is_drawn_large_enough_to_be_seen(build_scene):
     path = np.zeros((2, 20, 3))
     path[1, :, 0] = 20.0
-    scene = build_scene(path, [AgentKind.VEHICLE, AgentKind.PEDESTRIAN])
+    scene = build_scene(path, [AgentType.VEHICLE, AgentType.PEDESTRIAN])
     far = View((0.0, 0.0), 1.0, 100.0, 100.0)
 
     (body,) = filled(crowd_marks(show_log(scene), view=far), LIGHT.initial)

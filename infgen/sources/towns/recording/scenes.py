@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from infgen.clock import CLOCK
 from infgen.geometry import rotate, wrap_angle
-from infgen.scene import AgentKind, RoadMap, Scene, Tracks
+from infgen.scene import AgentType, RoadMap, Scene, Tracks
 from infgen.sources.towns.recording.signals import draw_signals
 from infgen.sources.towns.recording.tracks_to_predict import of_interest, to_predict
 from infgen.sources.towns.recording.viewpoints import View
@@ -221,7 +221,7 @@ def _measured(
     """Add what a tracker errs: nothing about vehicles that stand, nor about itself."""
     count, steps = actors.present.shape
     speed_mps = np.linalg.norm(velocity_mps, axis=-1)
-    walking = actors.kind == AgentKind.PEDESTRIAN
+    walking = actors.kind == AgentType.PEDESTRIAN
     share = np.where(walking[:, None], 1.0, np.clip(speed_mps / _SURE_MPS, 0.0, 1.0))
     share[ego] = 0.0
     sway_m = np.where(walking, _SWAY_M, 0.0)[:, None]

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Int8, Int32
 
-from infgen.scene import AgentKind, Tracks
+from infgen.scene import AgentType, Tracks
 
 MAX_PREDICT = 8
 
@@ -24,7 +24,7 @@ def to_predict(
     order = np.lexsort((able, -speed_mps, ~foremost))
     chosen = np.sort(able[order][:MAX_PREDICT])
     turned_rad = np.ptp(np.where(tracks.valid, np.unwrap(tracks.heading_rad), 0.0), axis=1)
-    hard = (tracks.kind != AgentKind.VEHICLE) | (turned_rad > 0.5)
+    hard = (tracks.kind != AgentType.VEHICLE) | (turned_rad > 0.5)
     return chosen.astype(np.int32), np.where(hard[chosen], 2, 1).astype(np.int8)
 
 

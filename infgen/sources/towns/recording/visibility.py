@@ -40,7 +40,7 @@ class Actors:
     """Everyone and everything with a box, while a scene is recorded.
 
     Attributes:
-        kind: ``AgentKind``.
+        kind: ``AgentType``.
         size_lwh_m: Boxes.
         pose: Where they are, present or not.
         present: Whether they are there.

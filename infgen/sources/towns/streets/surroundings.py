@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.sources.towns.road_users import Body, draw_size
 from infgen.sources.towns.streets import curves
 from infgen.sources.towns.streets.boxes import Boxes
@@ -119,9 +119,9 @@ def _on_pavement(edge: Edge, per_km: float, rng: np.random.Generator) -> Boxes:
 
 
 def kinds_of(surroundings: Surroundings) -> Int64[np.ndarray, " thing"]:
-    """``AgentKind`` of parked cars, then of people."""
-    parked = np.full(len(surroundings.parked), AgentKind.VEHICLE, np.int64)
-    people = np.full(len(surroundings.people), AgentKind.PEDESTRIAN, np.int64)
+    """``AgentType`` of parked cars, then of people."""
+    parked = np.full(len(surroundings.parked), AgentType.VEHICLE, np.int64)
+    people = np.full(len(surroundings.people), AgentType.PEDESTRIAN, np.int64)
     return np.concatenate([parked, people])
 
 

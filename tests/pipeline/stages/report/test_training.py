@@ -54,7 +54,7 @@ def test_a_figure_that_a_step_lacks_is_unknown_there(path):
 
 
 def test_bins_are_those_of_the_last_validation(path):
-    bins = read_run(path, "mine").bins["stay"]
+    bins = read_run(path, "mine").bins["keep"]
 
     assert (bins.count.tolist(), bins.happened.tolist()) == ([6, 4], [1, 2])
 

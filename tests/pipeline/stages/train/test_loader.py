@@ -69,7 +69,7 @@ def test_noise_is_the_same_whoever_makes_it_and_never_in_held_out_scenes(
     course, books, workers
 ):
     recipe = course.recipe(Team())
-    noise = make_noise(replace(course.train, noise_moves=3), *books)
+    noise = make_noise(replace(course.train, motion_noise_neighbours=3), *books)
     noisy = replace(recipe, noise=noise)
 
     made = list(train_batches(noisy, range(3), workers))
@@ -79,8 +79,8 @@ def test_noise_is_the_same_whoever_makes_it_and_never_in_held_out_scenes(
         logged = recipe[step][0].agents
         assert torch.equal(logged.presence, parts[0].agents.presence)
         assert not torch.equal(logged.label, parts[0].agents.label)
-    (held_out,) = held_out_batches(course.held_out, course.limits, 9, 0, 9)
-    assert torch.equal(held_out.agents.label, held_out.agents.move)
+    (validation_split,) = held_out_batches(course.validation_split, course.limits, 9, 0, 9)
+    assert torch.equal(validation_split.agents.label, validation_split.agents.move)
 
 
 @pytest.mark.parametrize("workers", [0, 1])
@@ -112,7 +112,10 @@ def test_parts_of_a_batch_are_together_the_batch(course):
 
 def test_held_out_batches_are_the_same_each_time_and_no_more_than_asked_for(course):
     first, again = (
-        [b.scenario_ids for b in held_out_batches(course.held_out, course.limits, 2, 0, 3)]
+        [
+            b.scenario_ids
+            for b in held_out_batches(course.validation_split, course.limits, 2, 0, 3)
+        ]
         for _ in range(2)
     )
 
@@ -142,7 +145,7 @@ from pipeline.stages.train.loader import TokenScenes, train_batches
 def main():
     shards, count, workers = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
     scenes = TokenScenes([shards] * count)
-    grid = TokenSettings(grid_radius_m=60.0, grid_step_m=4.0)
+    grid = TokenSettings(grid_radius_m=60.0, grid_cell_m=4.0)
     how = TrainSettings(batch_scenes=3 * count)
     recipe = Course(ModelSettings(), how, grid, scenes, [], shards).recipe(Team())
     ids = [parts[0].scenario_ids for parts in train_batches(recipe, range(2), workers)]

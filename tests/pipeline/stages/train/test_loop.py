@@ -66,12 +66,12 @@ def test_noise_is_learned_from_if_it_is_asked_for(course, books, quiet, monkeypa
         return train_batches(recipe, *others)
 
     monkeypatch.setattr("pipeline.stages.train.loop.train_batches", batches)
-    how = replace(course.train, steps=1, noise_moves=3)
+    how = replace(course.train, steps=1, motion_noise_neighbours=3)
 
     train(replace(course, train=how), begin(course, *books), quiet)
 
     assert given[0].moves == 3
-    assert given[0].table.codebook.num_moves == books[0].num_moves
+    assert given[0].table.codebook.num_motion_tokens == books[0].num_motion_tokens
 
 
 def test_no_scenes_to_train_on_is_said(course, books, quiet):
@@ -90,14 +90,16 @@ def test_who_does_no_steps_needs_no_scenes_to_train_on(course, books, quiet):
 
 
 def test_without_held_out_scenes_there_is_no_validation(course, books, quiet):
-    found = train(replace(course, held_out=[]), begin(course, *books), quiet)
+    found = train(replace(course, validation_split=[]), begin(course, *books), quiet)
 
     assert found.validation == {}
 
 
 def test_the_loss_goes_down(course, books, quiet):
     how = replace(course.train, steps=30, learning_rate=1e-2, label_smoothing=0.0)
-    longer = replace(course, train=replace(how, checkpoint_every=0, validate_every=0))
+    longer = replace(
+        course, train=replace(how, checkpoint_every_steps=0, validate_every_steps=0)
+    )
 
     train(longer, begin(longer, *books), quiet)
 

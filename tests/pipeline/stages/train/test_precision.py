@@ -80,7 +80,7 @@ model = ModelSettings(
     width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4,
     dropout=0.0,
 )
-grid = TokenSettings(grid_radius_m=60.0, grid_step_m=4.0)
+grid = TokenSettings(grid_radius_m=60.0, grid_cell_m=4.0)
 course = Course(model, TrainSettings(batch_scenes=2), grid, scenes, [], shards)
 network = begin(course, *load_codebooks(shards / "vocab")).network
 batch = course.recipe(Team())[0][0]

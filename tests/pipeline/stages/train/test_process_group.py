@@ -145,7 +145,7 @@ def test_two_processes_end_with_the_weights_of_one(start, how, train_unit, quiet
 
 @pytest.mark.slow
 def test_a_stopped_pair_saves_once_and_goes_on(start, tmp_path):
-    pair = start(tmp_path, steps=100_000, checkpoint_every=1)
+    pair = start(tmp_path, steps=100_000, checkpoint_every_steps=1)
     wait_for_step(pair, tmp_path, 2)
     pair[0].send_signal(signal.SIGTERM)  # The other one hears of it from the first.
     codes, said = wait(pair)
@@ -161,7 +161,7 @@ def test_a_stopped_pair_saves_once_and_goes_on(start, tmp_path):
 
 @pytest.mark.slow
 def test_a_process_that_dies_makes_the_run_fail_and_keeps_its_weights(start, tmp_path):
-    pair = start(tmp_path, steps=100_000, checkpoint_every=0, checkpoint_minutes=0.0)
+    pair = start(tmp_path, steps=100_000, checkpoint_every_steps=0, checkpoint_minutes=0.0)
     pair[0].stdout.readline()  # At least one step is done.
     pair[1].kill()
     codes, said = wait(pair)

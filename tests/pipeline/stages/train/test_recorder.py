@@ -41,7 +41,7 @@ def saved(course):
 
 
 def test_checkpoints_come_by_steps(journal, course, stepped):
-    with journal(checkpoint_every=2, checkpoint_minutes=0.0) as kept:
+    with journal(checkpoint_every_steps=2, checkpoint_minutes=0.0) as kept:
         found = []
         for done in (1, 2, 3):
             kept.add(done, stepped)
@@ -52,7 +52,7 @@ def test_checkpoints_come_by_steps(journal, course, stepped):
 
 
 def test_checkpoints_come_by_time(journal, course, stepped):
-    with journal(checkpoint_every=0, checkpoint_minutes=1e-9) as kept:
+    with journal(checkpoint_every_steps=0, checkpoint_minutes=1e-9) as kept:
         for done in (1, 2):
             kept.add(done, stepped)
             kept.keep_up(stepped)
@@ -60,7 +60,7 @@ def test_checkpoints_come_by_time(journal, course, stepped):
 
 
 def test_checkpoints_need_not_come_at_all(journal, course, stepped):
-    with journal(checkpoint_every=0, checkpoint_minutes=0.0) as kept:
+    with journal(checkpoint_every_steps=0, checkpoint_minutes=0.0) as kept:
         kept.add(1, stepped)
         kept.keep_up(stepped)
 

@@ -68,7 +68,7 @@ def test_a_run_leaves_weights_their_page_and_their_log(whole):
 
     assert sorted(p.name for p in folder.iterdir()) == sorted([*OUTPUTS, RUN_FOLDER])
     assert report["steps"] == 6
-    assert report["scenes"] == report["held_out"] == 3
+    assert report["scenes"] == report["validation_split"] == 3
     assert report["weights"] == read_about(folder)["weights"]
     assert report["validation"]["total"] > 0
     assert report["run"]["processes"] == 1
@@ -105,7 +105,7 @@ def test_the_same_run_gives_the_same_bytes(whole, make, tmp_path):
 def test_how_often_checkpoints_are_written_and_by_whom_batches_are_made_is_free(
     whole, make, tmp_path
 ):
-    make(tmp_path, checkpoint_every=0, checkpoint_minutes=0.0, loader_workers=1)
+    make(tmp_path, checkpoint_every_steps=0, checkpoint_minutes=0.0, loader_workers=1)
 
     assert contents(tmp_path) == contents(whole[0])
 
@@ -155,7 +155,7 @@ LAST_MOMENTS = (
     "pipeline.engine.atomic.sync_tree",
 )
 """What is called after the last step, in this order."""
-RARELY = {"checkpoint_every": 0, "checkpoint_minutes": 0.0}
+RARELY = {"checkpoint_every_steps": 0, "checkpoint_minutes": 0.0}
 
 
 def happen_after(patch, name, call, happen):
@@ -181,7 +181,7 @@ def test_a_stop_after_the_last_step_waits_until_the_unit_has_its_name(
     happen_after(monkeypatch, moment, 1, stop)
 
     with signals.listening(), pytest.raises(Stopped):
-        do_unit(tmp_path / "unit", **RARELY, steps=1, validate_every=0)
+        do_unit(tmp_path / "unit", **RARELY, steps=1, validate_every_steps=0)
 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["unit"]
     assert (tmp_path / "unit" / MANIFEST).is_file()
@@ -231,9 +231,9 @@ def test_a_kill_after_the_last_step_costs_no_step_and_changes_no_byte(
 def test_a_kill_where_the_last_step_is_validated_twice_changes_no_byte(
     make, do_twice, tmp_path
 ):
-    make(tmp_path / "whole", validate_every=3)
+    make(tmp_path / "whole", validate_every_steps=3)
 
-    folder, _ = do_twice("pipeline.storage.weights.save_network", 1, validate_every=3)
+    folder, _ = do_twice("pipeline.storage.weights.save_network", 1, validate_every_steps=3)
 
     log = (folder / "train.jsonl").read_bytes()
     assert log == (tmp_path / "whole" / "train.jsonl").read_bytes()
@@ -267,7 +267,7 @@ def start(train_unit, train_settings):
 
     def start_in(folder):
         plain = {name: asdict(value) for name, value in train_settings.items()}
-        plain["train"]["checkpoint_every"] = 1
+        plain["train"]["checkpoint_every_steps"] = 1
         words = [json.dumps(dict(train_unit.task)), str(folder), json.dumps(plain)]
         # Sums of several threads have other bytes: as many as there are in this process.
         threads = str(torch.get_num_threads())
@@ -385,7 +385,7 @@ def test_the_plan_is_one_unit_of_the_two_splits(train_settings):
     tokens = "/tokens/"
     training = [f"{tokens}training.tfrecord-0", f"{tokens}training.tfrecord-1"]
     assert unit.task["scenes"] == training
-    assert unit.task["held_out"] == [f"{tokens}validation.tfrecord-0"]
+    assert unit.task["validation_split"] == [f"{tokens}validation.tfrecord-0"]
     assert unit.inputs["codebooks"] == "build-vocab-motion.zarr-roads.zarr"
     assert unit.inputs["scenes/training.tfrecord-1"] == "key-training.tfrecord-1"
     assert STAGE.resumes

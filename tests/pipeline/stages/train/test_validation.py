@@ -31,7 +31,7 @@ def test_reliability_bins_add_up_to_the_overall_rates(found, name):
 
 
 def test_fresh_weights_are_about_as_perplexed_as_there_are_moves(found, metre_moves):
-    assert 0.5 < found["motion_perplexity"] / metre_moves.num_moves < 2.5
+    assert 0.5 < found["motion_perplexity"] / metre_moves.num_motion_tokens < 2.5
 
 
 def test_smaller_parts_find_the_same(course, books, found):
@@ -53,7 +53,7 @@ def test_the_log_holds_all_of_it(course, books, quiet):
 
 
 def test_scenes_are_played_before_they_are_learned_from(course, books, quiet):
-    how = replace(course.train, steps=2, closed_loop_top=4, checkpoint_every=0)
+    how = replace(course.train, steps=2, closed_loop_top_k=4, checkpoint_every_steps=0)
     played = replace(course, train=how)
 
     train(played, begin(played, *books), quiet)

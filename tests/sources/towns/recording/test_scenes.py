@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from infgen.geometry import to_world
-from infgen.scene import AgentKind, FeatureKind, SignalState
+from infgen.scene import AgentType, FeatureKind, SignalState
 from infgen.sources.towns.recording.scenes import NOW, Place, record
 from infgen.sources.towns.recording.signals import SEEN_M, draw_signals
 from infgen.sources.towns.recording.viewpoints import View, draw_views
@@ -42,7 +42,7 @@ def town(crossing):
             people=np.array([[0.0, -12.0, 0.0, 0.9, 0.9, 1.7]]),
             driveways=(),
         ),
-        kind=np.full(2, AgentKind.VEHICLE, np.int64),
+        kind=np.full(2, AgentType.VEHICLE, np.int64),
         size_lwh_m=np.array([[4.8, 2.0, 1.6]] * 2),
         car=np.array([True, True]),
         bodies=Bodies(pose, velocity_mps, np.ones((2, STEPS), bool)),
@@ -117,7 +117,7 @@ def test_nobody_records_near_the_rim_of_the_town(town):
 def test_everyone_in_sight_is_in_the_scene_the_ego_last(scene):
     assert scene.tracks.num_agents == 4
     assert scene.ego == 3
-    assert sorted(scene.tracks.kind) == [0, 0, 0, AgentKind.PEDESTRIAN]
+    assert sorted(scene.tracks.kind) == [0, 0, 0, AgentType.PEDESTRIAN]
     assert scene.tracks.valid[scene.ego].all()
 
 
@@ -145,7 +145,7 @@ def test_cars_that_stand_do_not_tremble_and_people_do(scene):
     for row in range(3):
         xy_m = tracks.xyz_m[row, tracks.valid[row], :2]
         moved_m = np.ptp(xy_m, axis=0).max()
-        assert (moved_m > 0.01) == (tracks.kind[row] == AgentKind.PEDESTRIAN)
+        assert (moved_m > 0.01) == (tracks.kind[row] == AgentType.PEDESTRIAN)
 
 
 def test_the_map_is_of_the_same_place(scene):

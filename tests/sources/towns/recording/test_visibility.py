@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.sources.towns.recording.visibility import (
     LONGEST_LOSS_STEPS,
     Actors,
@@ -23,7 +23,7 @@ def standing(*places, sizes=None, kinds=None):
     pose = np.zeros((count, STEPS, 3))
     pose[..., :2] = np.array(places)[:, None]
     return Actors(
-        kind=np.array(kinds or [AgentKind.VEHICLE] * count, np.int64),
+        kind=np.array(kinds or [AgentType.VEHICLE] * count, np.int64),
         size_lwh_m=np.array(sizes or [CAR] * count),
         pose=pose,
         present=np.ones((count, STEPS), bool),
@@ -61,7 +61,7 @@ def test_a_truck_hides_and_a_car_does_not():
 
 
 def test_people_on_foot_are_not_seen_as_far_as_cars():
-    kinds = [AgentKind.VEHICLE, AgentKind.VEHICLE, AgentKind.PEDESTRIAN]
+    kinds = [AgentType.VEHICLE, AgentType.VEHICLE, AgentType.PEDESTRIAN]
     found = np.mean(
         [
             shares(standing((0, 0), (62, 0), (62, 5), kinds=kinds), seed=seed)

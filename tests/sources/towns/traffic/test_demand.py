@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from infgen.scene import AgentKind
+from infgen.scene import AgentType
 from infgen.sources.towns.road_users import (
     Body,
     draw_hesitation,
@@ -80,7 +80,7 @@ def test_all_kinds_set_out_by_their_time(town_trips):
     kinds = {trip.person.body.kind for trip in town_trips}
     departs_s = [trip.depart_s for trip in town_trips]
 
-    assert kinds == {AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST}
+    assert kinds == {AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST}
     assert departs_s == sorted(departs_s)
     assert max(departs_s) < 120.0
 
