@@ -232,8 +232,8 @@ def test_figures_name_every_term_with_its_count(network, record, limits, setting
     assert {*names.split()} <= found.keys()
     assert {f"{name}_count" for name in names.split()} <= found.keys()
     assert 0 <= found["motion_accuracy"] <= 1
-    assert 0 <= found["stay_predicted"] <= 1
-    assert found["stay_logged"] == pytest.approx(
+    assert 0 <= found["keep_predicted"] <= 1
+    assert found["keep_logged"] == pytest.approx(
         float(terms["keep"].event) / float(terms["keep"].count)
     )
 

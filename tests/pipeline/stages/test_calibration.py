@@ -63,7 +63,7 @@ def test_the_last_validation_of_the_log_counts(tmp_path):
         "step": 2,
         "validation": {
             "add_bins": bins([400], [200], [300]),
-            "stay_bins": bins([400], [200], [100]),
+            "keep_bins": bins([400], [200], [100]),
         },
     }
     lines = [{"step": 1, "motion": 2.0}, first, last, {"step": 2, "validation": {}}]
@@ -91,7 +91,7 @@ def test_biases_are_read_as_they_were_written(tmp_path):
     assert read_found(tmp_path) == Biases(add=0.1234, leave=-2.0)
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"add": "much"}', '{"stay": 1}'])
+@pytest.mark.parametrize("text", ["", "[]", '{"add": "much"}', '{"keep": 1}'])
 def test_a_damaged_file_of_biases_is_named(tmp_path, text):
     (tmp_path / "biases.json").write_text(text)
 

@@ -159,7 +159,7 @@ def finished(root: Path) -> Inputs:
     lines = [
         {"step": step, "learning_rate": 0.1, "motion": 7.0 / step} for step in (1, 2, 3)
     ]
-    validation_split = {"stay_count": 40.0, "stay_predicted": 0.2, "stay_logged": 0.25}
+    validation_split = {"keep_count": 40.0, "keep_predicted": 0.2, "keep_logged": 0.25}
     text = "".join(
         json.dumps(line) + "\n"
         for line in [*lines, {"step": 3, "validation": validation_split}]

@@ -35,7 +35,7 @@ def path(tmp_path):
         step(20, motion=5.0, motion_count=300.0, motion_accuracy=0.3, add=0.5),
         {"step": 20, "validation": {"motion": 6.0, "total": 9.0}},
         step(30, motion=4.0, motion_count=200.0, motion_accuracy=0.5),
-        {"step": 30, "validation": {"motion": 5.0, "total": 8.0, "stay_bins": BINS}},
+        {"step": 30, "validation": {"motion": 5.0, "total": 8.0, "keep_bins": BINS}},
         {"step": 30, "validation": {}},
     )
 

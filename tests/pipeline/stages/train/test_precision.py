@@ -37,7 +37,7 @@ def test_bf16_gives_nearly_the_same_losses_in_float32(network, batch):
         assert outputs.motion.move_logits.dtype == torch.float32
         terms[precision] = figures(losses(outputs, batch, how))
 
-    for name in ("motion", "stay", "add", "cell", "kind", "heading", "map"):
+    for name in ("motion", "keep", "add", "position", "agent_type", "heading", "map"):
         sharp, rough = terms["float32"][name], terms["bf16"][name]
         assert rough == pytest.approx(sharp, rel=0.02), name
         assert rough != sharp, name

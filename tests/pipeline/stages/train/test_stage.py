@@ -38,7 +38,10 @@ from pipeline.stages.train.train_log import read_log
 from pipeline.storage.checkpoint import POINTER
 from pipeline.storage.weights import read_about
 
-TERMS = ("motion", "stay", "add", "cell", "kind", "size", "heading", "offset", "map")
+TERMS = (
+    *("motion", "keep", "add", "position", "agent_type"),
+    *("size", "heading", "offset", "map"),
+)
 
 
 def contents(folder):

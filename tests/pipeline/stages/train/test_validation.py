@@ -18,7 +18,7 @@ def found(course, books):
     return validate(course, training, Pass(training.network, course.train))
 
 
-@pytest.mark.parametrize("name", ["stay", "add"])
+@pytest.mark.parametrize("name", ["keep", "add"])
 def test_reliability_bins_add_up_to_the_overall_rates(found, name):
     bins = found[f"{name}_bins"]
 
