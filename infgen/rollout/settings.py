@@ -170,8 +170,8 @@ class RolloutSettings:
         if self.max_stall_s and self.max_motion_samples < 2:
             raise ConfigError(
                 f"rollout.max_stall_s is {self.max_stall_s}, but "
-                f"rollout.max_motion_samples is {self.max_motion_samples}: a released vehicle may collide; say "
-                "rollout.max_motion_samples=32 too"
+                f"rollout.max_motion_samples is {self.max_motion_samples}: a released "
+                "vehicle may collide; say rollout.max_motion_samples=32 too"
             )
         self._check_numbers()
 
