@@ -38,7 +38,7 @@ from pipeline.commands.verbs import (
 )
 from pipeline.engine import artefacts, signals
 from pipeline.engine.garbage import find_garbage
-from pipeline.engine.garbage import sweep as remove_garbage
+from pipeline.engine.garbage import remove_garbage as remove_garbage
 from pipeline.engine.layout import find_root
 from pipeline.engine.manifest import verify as find_damage
 from pipeline.settings import described

@@ -43,7 +43,7 @@ from infgen.tokens.tracks import TokensError
 from pipeline.commands.screen import show_table
 from pipeline.engine.manifest import read_manifest
 from pipeline.storage.rollouts import read_rollouts
-from pipeline.storage.scene_lookup import open_logs, unit_folders
+from pipeline.storage.scene_lookup import open_scene_lookup, unit_folders
 
 DRIVING_MPS = 1.0
 """Vehicles that are faster drive."""
@@ -205,7 +205,7 @@ def measure(root: Path, look: Look) -> tuple[Side, Side]:
     Raises:
         FileNotFoundError: if there are none.
     """
-    logs = open_logs([str((root / "latest" / "ingest").resolve())])
+    logs = open_scene_lookup([str((root / "latest" / "ingest").resolve())])
     tokens = _tokens_of(root / "latest" / "tokenize")
     units = unit_folders(root / "latest" / "rollout") or []
     rollouts = (one for unit in units for one in read_rollouts(unit))

@@ -31,7 +31,7 @@ from infgen.tokens.scene_tokens import SceneTokens
 from pipeline.commands.screen import show_table
 from pipeline.engine.events import Events
 from pipeline.engine.layout import Root
-from pipeline.engine.runner import Orders, run
+from pipeline.engine.runner import RunOptions, run
 from pipeline.settings.request import Request
 from pipeline.settings.stages_file import DEFAULT_FILE
 from pipeline.stages.train.loader import Recipe, TokenScenes, train_batches
@@ -47,7 +47,7 @@ def tokenized(records: Sequence[str], folder: Path) -> Path:
     """Make the token shards of some records, uncounted."""
     request = Request(Root(folder / "root"), DEFAULT_FILE, None, tuple(records), FEW_MOVES)
     request.root.path.mkdir(parents=True)
-    for result in run(request.plan(["tokenize"], {}), Orders(), Events(request.root)):
+    for result in run(request.plan(["tokenize"], {}), RunOptions(), Events(request.root)):
         if result.errors:
             raise SystemExit("\n".join(result.errors))
     return request.root.path

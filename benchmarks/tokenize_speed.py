@@ -23,12 +23,12 @@ from infgen.tokens.tokenizer import tokenize_scene
 from pipeline.engine.events import Events
 from pipeline.engine.inputs import FinishedInputs
 from pipeline.engine.layout import Root
-from pipeline.engine.plan import Planned
-from pipeline.engine.runner import Orders, run
+from pipeline.engine.plan import PlannedStage
+from pipeline.engine.runner import RunOptions, run
 from pipeline.engine.stage import Inputs, Unit
 from pipeline.settings.request import Request
 from pipeline.settings.stages_file import DEFAULT_FILE
-from pipeline.stages.vocabulary import load_codebooks
+from pipeline.stages.vocabulary import load_vocabularies
 from pipeline.storage.scenes import read_scenes
 from pipeline.storage.source_files import BUILTIN
 
@@ -67,21 +67,23 @@ def default_records() -> list[str]:
     return [str(path) for words in DEFAULT_RECORDS for path in sorted(SHARED.glob(words))]
 
 
-def prepare(root: Root, records: Sequence[str]) -> tuple[Planned, Inputs]:
+def prepare(root: Root, records: Sequence[str]) -> tuple[PlannedStage, Inputs]:
     """Ingest the records and build the vocabularies, uncounted."""
     request = Request(root, DEFAULT_FILE, None, tuple(records), ())
     root.path.mkdir(parents=True)
-    for result in run(request.plan(["build-vocab"], {}), Orders(), Events(root, ())):
+    for result in run(request.plan(["build-vocab"], {}), RunOptions(), Events(root, ())):
         if result.errors:
             sys.exit("\n".join(result.errors))
     planned = request.plan(["tokenize"], {})["tokenize"]
     return planned, FinishedInputs(root, planned)
 
 
-def measure(units: Sequence[Unit], planned: Planned, target: Path, passes: int) -> Timing:
+def measure(
+    units: Sequence[Unit], planned: PlannedStage, target: Path, passes: int
+) -> Timing:
     """Time reading, tokenizing in memory, and the stage's own work, each on its own."""
     folders = [Path(unit.task["scenes"]) for unit in units]
-    motion, roads = load_codebooks(Path(units[0].task["codebooks"]))
+    motion, roads = load_vocabularies(Path(units[0].task["codebooks"]))
     scenes = [scene for folder in folders for scene in read_scenes(folder)]
 
     def read() -> None:

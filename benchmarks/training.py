@@ -47,7 +47,7 @@ from pipeline.commands.screen import show_table
 from pipeline.stages.train.optimizer_step import Descent
 from pipeline.stages.train.process_group import Team
 from pipeline.stages.train.setup import repeatable
-from pipeline.storage.checkpoint import Training
+from pipeline.storage.checkpoint import TrainingState
 
 FEW_NEIGHBOURS = 5
 """Map tokens per agent that the public reference sees."""
@@ -82,7 +82,7 @@ class Case:
     meeting: str = ""
 
 
-def prepare(case: Case) -> tuple[Descent, Batch, Training]:
+def prepare(case: Case) -> tuple[Descent, Batch, TrainingState]:
     """Make the network, its optimiser, and a batch of one scene several times."""
     model = SIZES[case.size]
     if case.neighbours:
@@ -97,7 +97,7 @@ def prepare(case: Case) -> tuple[Descent, Batch, Training]:
     network = Network(model, motion, roads, grid).to(device)
     optimiser = torch.optim.AdamW(network.parameters(), fused=True)
     average = {name: p.detach().clone() for name, p in network.named_parameters()}
-    training = Training(network, average, optimiser)
+    training = TrainingState(network, average, optimiser)
     descent = Descent(training, how, team, case.team)
     return descent, to_device(batch, device), training
 

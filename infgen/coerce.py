@@ -24,7 +24,7 @@ def free(default: T) -> T:
     return made
 
 
-def decisive(settings: Any) -> dict[str, Any]:
+def key_values(settings: Any) -> dict[str, Any]:
     """Settings that decide what comes out, by name: all but the ``free`` ones."""
     return {
         f.name: getattr(settings, f.name)

@@ -6,7 +6,7 @@ runs. A value that follows from others is a property, not a setting.
 
 from infgen.coerce import ConfigError as ConfigError
 from infgen.coerce import build as build
-from infgen.coerce import decisive as decisive
+from infgen.coerce import key_values as key_values
 from infgen.coerce import settle as settle
 from infgen.metrics.settings import ReferenceSettings as ReferenceSettings
 from infgen.metrics.settings import ScoreSettings as ScoreSettings

@@ -91,7 +91,7 @@ def test_a_watcher_sees_a_run_begin_go_on_and_end(start):
     row = half["rows"][0]
     assert (row["stage"], row["units"]) == ("count", 3)
     assert 0 < row["per_s"] < 3
-    assert 0 < row["left_s"] < 10
+    assert 0 < row["remaining_s"] < 10
     assert row["memory_bytes"] > 10 << 20
     assert row["run"].startswith(f"process {running.pid} on ")
     assert not last["trouble"]

@@ -17,7 +17,7 @@ from typing import Any, get_type_hints
 import typer
 
 import cli
-from pipeline.settings.described import documented, one_line, sections
+from pipeline.settings.described import docstring_parts, one_line, sections
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
 
 _DIRECTIVE = re.compile(r"^<!-- (commands|settings|fields: \S+) -->$", re.MULTILINE)
@@ -86,7 +86,7 @@ def settings() -> Iterator[str]:
 
 def record(kind: type) -> Iterator[str]:
     """Write the fields of a record: type, shape, meaning."""
-    hints, (_, described) = get_type_hints(kind, include_extras=True), documented(kind)
+    hints, (_, described) = get_type_hints(kind, include_extras=True), docstring_parts(kind)
     rows = [
         [f"`{field.name}`", *_shape(hints[field.name]), described.get(field.name, "")]
         for field in fields(kind)

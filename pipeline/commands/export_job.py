@@ -24,7 +24,7 @@ from pipeline.engine.atomic import (
 from pipeline.engine.events import Event
 from pipeline.engine.locks import locked
 from pipeline.engine.manifest import read_manifest
-from pipeline.storage.scene_lookup import Logs, unit_folders
+from pipeline.storage.scene_lookup import SceneLookup, unit_folders
 
 REQUEST = "request.json"
 _SAFE_ID = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
@@ -51,7 +51,7 @@ class Order:
 
     to: str
     rollouts: Path
-    logs: Logs
+    logs: SceneLookup
     out: Path
     about: About | None = None
     scenes_per_shard: int = 300

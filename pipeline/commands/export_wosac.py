@@ -41,7 +41,7 @@ _LISTS = ("authors", "public_model_names")
 _ENDINGS = (".tar.gz", ".tgz")
 
 
-def read_about(path: Path, root: Root) -> About:
+def read_description(path: Path, root: Root) -> About:
     """Read who submits what from a YAML file; the root knows the number of parameters.
 
     Raises:
@@ -61,7 +61,7 @@ def read_about(path: Path, root: Root) -> About:
     needed = [name for name in _needed() if name not in given]
     if needed:
         raise ConfigError(f"{path}: {', '.join(needed)} missing; expected {_asked()}")
-    about, trained = About(**given), root.pointed("train")
+    about, trained = About(**given), root.latest_folder("train")
     count = read_manifest(trained)["report"].get("parameters") if trained else None
     return about.with_parameters(count) if count else about
 

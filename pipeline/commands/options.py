@@ -14,8 +14,8 @@ from infgen.config import ConfigError
 from pipeline.comparison.runs import PRESET, REPORT, Comparison
 from pipeline.engine.layout import find_root
 from pipeline.engine.plan import Plan, PlanError
-from pipeline.engine.runner import Orders
-from pipeline.settings.request import Request, complete, find_file, recall
+from pipeline.engine.runner import RunOptions
+from pipeline.settings.request import Request, complete_request, find_file, read_request
 from pipeline.settings.stages_file import load_stages
 from pipeline.storage.source_files import absolute
 from pipeline.workers.dask_cluster import choose_workers
@@ -77,7 +77,7 @@ class Asked:
 
     def request(self, records: Sequence[str] = ()) -> Request:
         """Fill in from the root's memory what was not named."""
-        return complete(
+        return complete_request(
             find_root(self.root),
             file=self.file,
             profile=self.profile,
@@ -134,7 +134,7 @@ class Running:
         ),
     ] = False
 
-    def orders(self, targets: Sequence[str], plan: Plan) -> Orders:
+    def run_options(self, targets: Sequence[str], plan: Plan) -> RunOptions:
         """Say which stages are made again, and how the units are done."""
         again = set(targets or plan.stages) if self.force else set()
         if self.begin is not None:
@@ -142,7 +142,7 @@ class Running:
                 there = ", ".join(plan.stages)
                 raise PlanError(f"--from {self.begin}: not on the way; there is {there}")
             again.add(self.begin)
-        return Orders(
+        return RunOptions(
             force=frozenset(again),
             keep_going=self.keep_going,
             wait=self.wait,
@@ -194,7 +194,7 @@ class Comparing:
             ConfigError: for a preset that does not exist.
         """
         root, name = find_root(asked.root), self.preset or ""
-        before = recall(root, f"{PRESET}.{name}")
+        before = read_request(root, f"{PRESET}.{name}")
         path = find_file(asked.file, before)
         file = load_stages(path, os.environ)
         records = [absolute(pattern) for pattern in asked.named_records]

@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pipeline.engine.events import Event
-from pipeline.engine.progress import Gauge, figures
+from pipeline.engine.progress import ProgressMeter, figures
 
 QUIET_S = 10.0
 PLAIN_WIDTH = 160
@@ -116,7 +116,7 @@ class Screen:
 
     def __init__(self) -> None:
         self._console = Console(stderr=True)
-        self._gauge: Gauge | None = None
+        self._gauge: ProgressMeter | None = None
         self._bars: Progress | None = None
         self._bar: TaskID | None = None
         self._said_at = time.monotonic()
@@ -149,22 +149,22 @@ class Screen:
 
     def _start(self, event: Event) -> None:
         what = event.get("what", "steps")
-        self._gauge = Gauge(event["stage"], event["units"], event["made"], what)
+        self._gauge = ProgressMeter(event["stage"], event["units"], event["made"], what)
         self._said_at = time.monotonic()
         if self._bars is not None:
             self._bar = self._bars.add_task(event["stage"], total=None, words="")
 
     def _go_on(self, event: Event) -> None:
-        gauge = self._gauge
-        if gauge is None:
+        meter = self._gauge
+        if meter is None:
             return
         if self._bars is not None and self._bar is not None:
             self._bars.update(
-                self._bar, completed=gauge.done, total=gauge.total, words=gauge.words()
+                self._bar, completed=meter.done, total=meter.total, words=meter.words()
             )
         elif time.monotonic() - self._said_at >= QUIET_S:
             self._said_at = time.monotonic()
-            self._say(f"{gauge.stage}: {gauge.words()}")
+            self._say(f"{meter.stage}: {meter.words()}")
 
     def _say(self, line: str) -> None:
         if self._bars is None:
@@ -182,7 +182,7 @@ _LINES = {
     "worker-full": "{stage}: worker {worker} is restarted, as it fills its memory "
     "({memory_gib} GiB)",
     "worker-lost": "{stage}: worker {worker} is lost; what it had under way begins again",
-    "workers-missing": "{stage}: there are no workers; waiting {patience_min:g} minutes "
+    "workers-missing": "{stage}: there are no workers; waiting {timeout_min:g} minutes "
     "for one",
     "stage-done": "{stage}: made; {figures}",
     "stage-failed": "{stage}: failed; the log tells more, and the next run tries again",

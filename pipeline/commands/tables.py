@@ -13,8 +13,8 @@ from pipeline.engine.garbage import Garbage
 from pipeline.engine.layout import KEY_DIGITS, Root, read_json
 from pipeline.engine.plan import StageEntry
 from pipeline.engine.progress import amount, clock_time, rate
-from pipeline.engine.runner import Result
-from pipeline.engine.status import Standing
+from pipeline.engine.runner import StageResult
+from pipeline.engine.status import StageStatus
 
 if TYPE_CHECKING:
     from pipeline.commands.export_job import Exported
@@ -31,7 +31,7 @@ _AT_ONCE = ("claims", "against-the-logs")
 """Tables of a comparison that are printed; all are in its folder."""
 
 
-def show_standings(found: Sequence[Standing]) -> None:
+def show_standings(found: Sequence[StageStatus]) -> None:
     """Print how stages stand."""
     rows = [
         (each.stage, each.state, each.progress, each.key[:KEY_DIGITS], each.why)
@@ -70,7 +70,7 @@ def _watched(row: Row) -> tuple[str | int | None, ...]:
         row.state,
         _done(row),
         rate(row.per_s) if row.per_s is not None else None,
-        clock_time(row.left_s) if row.left_s is not None else None,
+        clock_time(row.remaining_s) if row.remaining_s is not None else None,
         gibibytes(row.memory_bytes) if row.memory_bytes is not None else None,
         row.at_work or None,
         row.quarantined,
@@ -104,7 +104,7 @@ def graph_text(stages: Iterable[StageEntry], *, mermaid: bool) -> str:
     return "\n".join(f"{each.name:<12} <- {', '.join(each.deps)}" for each in stages)
 
 
-def show_results(root: Root, results: Sequence[Result], log: Path) -> None:
+def show_results(root: Root, results: Sequence[StageResult], log: Path) -> None:
     """Print what became of stages, what failed and why, and the scores if there are any."""
     rows = [
         (each.stage, each.state, each.units, each.made, each.seconds, each.words)
@@ -156,7 +156,7 @@ def show_runs(ran: "Sequence[Ran]", shown: Path | None, log: Path) -> None:
     console().print(f"comparison: {shown / PAGE}", soft_wrap=True)
 
 
-def _show_scores(root: Root, results: Sequence[Result]) -> None:
+def _show_scores(root: Root, results: Sequence[StageResult]) -> None:
     whole = [each for each in results if each.state in ("made", "cached")]
     table = root.path / "report" / SCORES
     if any(each.stage == "report" for each in whole) and table.is_file():

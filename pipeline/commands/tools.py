@@ -97,16 +97,16 @@ class Exporting:
         """Export; tells how far it is."""
         from pipeline.commands.export import export  # noqa: PLC0415
         from pipeline.commands.export_job import Order  # noqa: PLC0415
-        from pipeline.commands.export_wosac import read_about  # noqa: PLC0415
-        from pipeline.storage.scene_lookup import open_logs  # noqa: PLC0415
+        from pipeline.commands.export_wosac import read_description  # noqa: PLC0415
+        from pipeline.storage.scene_lookup import open_scene_lookup  # noqa: PLC0415
 
         root = find_root(self.root)
         logs = split_names(self.records) if self.records else [str(root.latest / "ingest")]
-        about = read_about(self.about, root) if self.about else None
+        about = read_description(self.about, root) if self.about else None
         order = Order(
             to=self.to,
             rollouts=self.rollouts or root.latest / "rollout",
-            logs=open_logs(logs),
+            logs=open_scene_lookup(logs),
             out=self.out,
             about=about,
             scenes_per_shard=self.scenes_per_shard,
@@ -199,7 +199,7 @@ def towns(json_: Json = False, *, building: Building) -> None:
 
     A run that was killed goes on where it stopped, if the same is asked for again.
     """
-    with signals.listening(), Screen() as screen:
+    with signals.handling_signals(), Screen() as screen:
         found = building.write(screen)
     if json_:
         print_json(found.to_json())
@@ -214,7 +214,7 @@ def wosac(json_: Json = False, *, scoring: Scoring) -> None:
 
     Example: infgen wosac 'validation.tfrecord-*' submission.tar.gz --per-scene
     """
-    with signals.listening(), Screen() as screen:
+    with signals.handling_signals(), Screen() as screen:
         found = scoring.official(screen)
     if json_:
         print_json(found.to_json())
@@ -236,7 +236,7 @@ def export(json_: Json = False, *, exporting: Exporting) -> None:
     A submission (wosac) needs a file --about with account_name, unique_method_name, authors
     and acknowledge_complies_with_closed_loop_requirement.
     """
-    with signals.listening(), Screen() as screen:
+    with signals.handling_signals(), Screen() as screen:
         found = exporting.write(screen)
     if json_:
         print_json(found.to_json())
@@ -255,7 +255,7 @@ def view(json_: Json = False, *, viewing: Viewing) -> None:
 
     Example: infgen view R --video scene.mp4 --strip scene.svg
     """
-    with signals.listening(), Screen() as screen:
+    with signals.handling_signals(), Screen() as screen:
         found = viewing.write(screen)
     if json_:
         print_json(found.to_json())

@@ -28,9 +28,9 @@ from pipeline.engine.events import Events
 from pipeline.engine.layout import Root
 from pipeline.engine.locks import LockedError
 from pipeline.engine.plan import Plan, PlanError
-from pipeline.engine.runner import Orders, Result
+from pipeline.engine.runner import RunOptions, StageResult
 from pipeline.engine.runner import run as make
-from pipeline.engine.status import Standing, standings
+from pipeline.engine.status import StageStatus, stage_statuses
 from pipeline.settings.request import Request
 
 FAILED, WRONG, STALE, LOCKED = 1, 2, 3, 75
@@ -45,15 +45,15 @@ def run_stages(
 ) -> None:
     """Run, show what became of it, and leave with the exit code that says so."""
     plan = request.plan(targets, os.environ)
-    orders = running.orders(targets, plan)
+    run_options = running.run_options(targets, plan)
     if running.dry_run:
-        found = standings(plan, request.made(), strict_code=running.strict_code)
-        again = plan.after(orders.force)
+        found = stage_statuses(plan, request.made(), strict_code=running.strict_code)
+        again = plan.after(run_options.force)
         tell_standings([_asked_again(each, again) for each in found], as_json=as_json)
         return
-    with request.remembered(plan), signals.listening(), Screen() as screen:
+    with request.remembered(plan), signals.handling_signals(), Screen() as screen:
         events = Events(request.root, (screen,))
-        results = make(plan, orders, events)
+        results = make(plan, run_options, events)
     if as_json:
         log = str(events.log)
         print_json({"stages": [asdict(each) for each in results], "log": log})
@@ -82,7 +82,7 @@ def compare_arms(
     if running.dry_run:
         _tell_outlook(look_ahead(comparison, legs), as_json=as_json)
         return
-    with signals.listening(), Screen() as screen:
+    with signals.handling_signals(), Screen() as screen:
         events = Events(comparison.root, (screen,))
         ready = find_records(comparison, screen)
         comparison.remember({})
@@ -101,12 +101,12 @@ def compare_arms(
 
 def _orders(
     running: Running, comparison: Comparison, targets: Sequence[str]
-) -> Callable[[Plan], Orders]:
-    def order(plan: Plan) -> Orders:
+) -> Callable[[Plan], RunOptions]:
+    def order(plan: Plan) -> RunOptions:
         # What some runs do not come by is no mistake, if others do.
         elsewhere = running.begin in comparison.stages and running.begin not in plan.stages
         own = replace(running, begin=None) if elsewhere else running
-        return own.orders(targets, plan)
+        return own.run_options(targets, plan)
 
     return order
 
@@ -128,13 +128,13 @@ def _tell_runs(
         tables.show_runs(ran, shown, events.log)
 
 
-def _asked_again(standing: Standing, again: Container[str]) -> Standing:
+def _asked_again(standing: StageStatus, again: Container[str]) -> StageStatus:
     if standing.state != "cached" or standing.stage not in again:
         return standing
     return replace(standing, state="stale", why="made again, as it is asked to be", made=0)
 
 
-def tell_standings(found: Sequence[Standing], *, as_json: bool) -> None:
+def tell_standings(found: Sequence[StageStatus], *, as_json: bool) -> None:
     """Print how stages stand."""
     if as_json:
         print_json({"stages": [asdict(standing) for standing in found]})
@@ -142,10 +142,10 @@ def tell_standings(found: Sequence[Standing], *, as_json: bool) -> None:
         tables.show_standings(found)
 
 
-def find_standings(request: Request, *, strict_code: bool) -> list[Standing]:
+def find_standings(request: Request, *, strict_code: bool) -> list[StageStatus]:
     """Find how all stages stand."""
     plan = request.plan([], os.environ)
-    return standings(plan, request.made(), strict_code=strict_code)
+    return stage_statuses(plan, request.made(), strict_code=strict_code)
 
 
 def watch_stages(asked: Asked, every_s: float, *, as_json: bool, check: bool) -> None:
@@ -159,7 +159,7 @@ def watch_stages(asked: Asked, every_s: float, *, as_json: bool, check: bool) ->
     """
     watcher = Watcher(asked.request, os.environ)
     show, shown = _lookers(as_json=as_json)
-    with signals.listening(), shown:
+    with signals.handling_signals(), shown:
         idle = 0  # Looks in a row. Between two stages, too, nothing runs for a moment.
         while True:
             look = watcher.look()
@@ -182,7 +182,7 @@ def _lookers(
     return partial(tables.show_look, table), table
 
 
-def _check_quarantine(root: Root, results: Sequence[Result], max_bad: float) -> None:
+def _check_quarantine(root: Root, results: Sequence[StageResult], max_bad: float) -> None:
     for result in results:
         bad, good = result.report.get("quarantined", 0), result.report.get("scenes", 0)
         if result.stage != "ingest" or not bad:

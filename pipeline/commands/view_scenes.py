@@ -41,7 +41,7 @@ def find_in_root(root: Root, prefix: str, rollouts: Sequence[int] | None) -> See
     Raises:
         ConfigError: if there is no such scene or rollout, naming some that there are.
     """
-    played = root.pointed("rollout") if rollouts is None or rollouts else None
+    played = root.latest_folder("rollout") if rollouts is None or rollouts else None
     if played is None:
         if rollouts:
             raise ConfigError(
@@ -140,9 +140,9 @@ def _unit_folder(root: Root, stage: str, made: Path, unit: str) -> Path:
 
 
 def _find_log(root: Root, prefix: str) -> Scene:
-    from pipeline.storage.scene_lookup import open_logs  # noqa: PLC0415
+    from pipeline.storage.scene_lookup import open_scene_lookup  # noqa: PLC0415
 
-    made = root.pointed("ingest")
+    made = root.latest_folder("ingest")
     if made is None:
         raise ConfigError(
             f"{root.path} holds no scenes; `infgen demo` makes some, "
@@ -151,7 +151,7 @@ def _find_log(root: Root, prefix: str) -> Scene:
     units = _units_of_scenes(made, "source")
     scenario_id = choose(units, prefix, str(root.path))
     folder = _unit_folder(root, "ingest", made, units[scenario_id])
-    return open_logs([str(folder)]).find(scenario_id)
+    return open_scene_lookup([str(folder)]).find(scenario_id)
 
 
 def _read_rollouts(

@@ -18,7 +18,7 @@ from pipeline.engine.locks import holder
 from pipeline.engine.manifest import read_manifest
 from pipeline.engine.plan import PlanError
 from pipeline.engine.run_log import RunLog
-from pipeline.engine.status import Standing, standings
+from pipeline.engine.status import StageStatus, stage_statuses
 from pipeline.settings.request import LAST, Request
 from pipeline.workers.processes import memory_bytes
 
@@ -38,7 +38,7 @@ class Row:
         done: How many of them are done, in part counting in part.
         what: ``units``, or what the steps are.
         per_s: Units or steps a second of late; None where nothing was done yet.
-        left_s: Seconds to go at this rate.
+        remaining_s: Seconds to go at this rate.
         memory_bytes: Of the run's process and all below it; None if it runs elsewhere.
         at_work: Units under way.
         quarantined: Records set aside; None in a stage that sets none aside.
@@ -53,7 +53,7 @@ class Row:
     done: float | int | None
     what: str
     per_s: float | None
-    left_s: float | None
+    remaining_s: float | None
     memory_bytes: int | None
     at_work: int
     quarantined: int | None
@@ -125,50 +125,52 @@ class Watcher:
         named = request.records or request.profile
         if not named and not (request.root.refs / LAST).exists():
             return ()
-        found = standings(request.plan([], self._environ), request.made())
+        found = stage_statuses(request.plan([], self._environ), request.made())
         return tuple(self._row(request.root, each) for each in found)
 
-    def _row(self, root: Root, standing: Standing) -> Row:
-        attempt = _attempt(root, standing.stage)
+    def _row(self, root: Root, stage_status: StageStatus) -> Row:
+        attempt = _attempt(root, stage_status.stage)
         keys = _keys(attempt)
-        if standing.state == "running":
-            return self._running(root, standing, keys)
-        mine = attempt.get("key") == standing.key
+        if stage_status.state == "running":
+            return self._running(root, stage_status, keys)
+        mine = attempt.get("key") == stage_status.key
         return Row(
-            stage=standing.stage,
-            state=standing.state,
-            units=standing.units,
-            done=standing.made,
+            stage=stage_status.stage,
+            state=stage_status.state,
+            units=stage_status.units,
+            done=stage_status.made,
             what="units",
             per_s=None,
-            left_s=None,
+            remaining_s=None,
             memory_bytes=None,
             at_work=0,
-            quarantined=self._count_set_aside(root, standing, keys if mine else {}),
+            quarantined=self._count_set_aside(root, stage_status, keys if mine else {}),
             failed=len(attempt.get("failed", {})) if mine else 0,
             run="",
-            note=standing.why,
+            note=stage_status.why,
         )
 
-    def _running(self, root: Root, standing: Standing, keys: Mapping[str, str]) -> Row:
-        about = holder(root.lock(standing.stage))
+    def _running(
+        self, root: Root, stage_status: StageStatus, keys: Mapping[str, str]
+    ) -> Row:
+        about = holder(root.lock(stage_status.stage))
         log = self._follow(root, about.get("pid"))
-        gauge = log.gauge if log and log.stage == standing.stage else None
+        meter = log.meter if log and log.stage == stage_status.stage else None
         here = about.get("host") == gethostname()
         return Row(
-            stage=standing.stage,
-            state=standing.state,
-            units=gauge.total if gauge else standing.units,
-            done=gauge.done if gauge else standing.made,
-            what=gauge.what if gauge and gauge.in_steps else "units",
-            per_s=gauge.per_s if gauge else None,
-            left_s=gauge.left_s if gauge else None,
+            stage=stage_status.stage,
+            state=stage_status.state,
+            units=meter.total if meter else stage_status.units,
+            done=meter.done if meter else stage_status.made,
+            what=meter.what if meter and meter.in_steps else "units",
+            per_s=meter.per_s if meter else None,
+            remaining_s=meter.remaining_s if meter else None,
             memory_bytes=memory_bytes(about["pid"]) if here else None,
-            at_work=_count_at_work(root, standing.stage, keys),
-            quarantined=self._count_set_aside(root, standing, keys),
-            failed=log.failed if log and gauge else 0,
+            at_work=_count_at_work(root, stage_status.stage, keys),
+            quarantined=self._count_set_aside(root, stage_status, keys),
+            failed=log.failed if log and meter else 0,
             run=_who(about, log),
-            note=gauge.remark if gauge else "",
+            note=meter.remark if meter else "",
         )
 
     def _follow(self, root: Root, pid: object) -> RunLog | None:
@@ -181,12 +183,12 @@ class Watcher:
         return run
 
     def _count_set_aside(
-        self, root: Root, standing: Standing, keys: Mapping[str, str]
+        self, root: Root, stage_status: StageStatus, keys: Mapping[str, str]
     ) -> int | None:
         """Count records set aside: by the whole stage, or by the units made so far."""
-        folders = [root.unit(standing.stage, key) for key in keys.values()]
-        if standing.state == "cached":
-            folders = [root.folder(standing.stage, standing.key)]
+        folders = [root.unit(stage_status.stage, key) for key in keys.values()]
+        if stage_status.state == "cached":
+            folders = [root.folder(stage_status.stage, stage_status.key)]
         counts = [self._set_aside_by(folder) for folder in folders]
         known = [count for count in counts if count is not None]
         return sum(known) if known else None

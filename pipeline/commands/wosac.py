@@ -16,7 +16,7 @@ from infgen.metrics.wosac.versions import VERSIONS
 from pipeline.engine import signals
 from pipeline.engine.atomic import StoreError
 from pipeline.engine.events import Event
-from pipeline.storage.scene_lookup import Logs, open_logs, unit_folders
+from pipeline.storage.scene_lookup import SceneLookup, open_scene_lookup, unit_folders
 
 SUBMISSION_FILES = "*binproto*"
 
@@ -93,7 +93,7 @@ def score_files(
             "go on from a log: name another metric"
         )
     try:
-        logs = open_logs(records)
+        logs = open_scene_lookup(records)
         official = score_futures(logs, read_futures(rollouts, num_rollouts), metric, tell)
     except OSError as error:
         raise ConfigError(str(error)) from error
@@ -103,7 +103,7 @@ def score_files(
 
 
 def score_futures(
-    logs: Logs, futures: Iterator[Future], metric: str, tell: Callable[[Event], None]
+    logs: SceneLookup, futures: Iterator[Future], metric: str, tell: Callable[[Event], None]
 ) -> Official:
     """Score scene after scene; a wrong one is refused with the reason."""
     scores: dict[str, wosac.Scores] = {}
@@ -125,7 +125,7 @@ def score_futures(
 
 
 def _score(
-    logs: Logs, rollouts: Rollouts | Refused, metric: str, known: Container[str]
+    logs: SceneLookup, rollouts: Rollouts | Refused, metric: str, known: Container[str]
 ) -> wosac.Scores | Refused:
     """Score one scene, or say why it cannot be."""
     if isinstance(rollouts, Refused):

@@ -63,9 +63,9 @@ class _Ahead:
         makes = tuple(
             name
             for name, key in keys.items()
-            if (name, key) not in self.done and not root.is_made(name, key)
+            if (name, key) not in self.done and not root.is_finished(name, key)
         )
-        if TRAIN in keys and root.is_made(TRAIN, keys[TRAIN]):
+        if TRAIN in keys and root.is_finished(TRAIN, keys[TRAIN]):
             self.weights[leg.arm.name, leg.seed] = keys[TRAIN]
         self.done.update(keys.items())
         return Outlook(leg.words, makes, f"after {leg.arm.start}" if waits else note)

@@ -11,7 +11,7 @@ from pipeline.comparison.runs import TRAIN, Comparison, Leg
 from pipeline.engine.atomic import StoreError
 from pipeline.engine.events import Events
 from pipeline.engine.plan import Plan
-from pipeline.engine.runner import Orders, Result, run
+from pipeline.engine.runner import RunOptions, StageResult, run
 
 State = Literal["cached", "made", "failed", "skipped"]
 
@@ -32,7 +32,7 @@ class Ran:
     state: State
     why: str = ""
     plan: Plan | None = None
-    results: tuple[Result, ...] = ()
+    results: tuple[StageResult, ...] = ()
 
     @property
     def is_whole(self) -> bool:
@@ -63,7 +63,7 @@ class Ran:
 def run_legs(
     comparison: Comparison,
     legs: Sequence[Leg],
-    orders: Callable[[Plan], Orders],
+    run_options: Callable[[Plan], RunOptions],
     events: Events,
 ) -> list[Ran]:
     """Make all runs that can be made.
@@ -71,7 +71,7 @@ def run_legs(
     Args:
         comparison: How they are planned.
         legs: The runs, each after those whose weights it goes on from.
-        orders: How each is run.
+        run_options: How each is run.
         events: Told of everything.
 
     Raises:
@@ -80,7 +80,7 @@ def run_legs(
     """
     for leg in legs:  # Days may lie before the last of them.
         comparison.plan(leg, None)
-    runs = _Runs(comparison, orders, events)
+    runs = _Runs(comparison, run_options, events)
     ran: list[Ran] = []
     for leg in legs:
         events.emit("leg-started", leg=leg.words, number=len(ran) + 1, legs=len(legs))
@@ -101,7 +101,7 @@ class _Runs:
     """
 
     comparison: Comparison
-    orders: Callable[[Plan], Orders]
+    run_options: Callable[[Plan], RunOptions]
     events: Events
     weights: dict[tuple[str, int], str] = field(default_factory=dict)
     failed: dict[tuple[str, str], str] = field(default_factory=dict)
@@ -124,14 +124,14 @@ class _Runs:
             return Ran(leg, "failed", str(error), plan)
         return self._note(leg, plan, results)
 
-    def _orders(self, plan: Plan) -> Orders:
+    def _orders(self, plan: Plan) -> RunOptions:
         """Make nothing again that was made again in this call."""
-        orders = self.orders(plan)
-        again = plan.after(orders.force & plan.stages.keys())
+        run_options = self.run_options(plan)
+        again = plan.after(run_options.force & plan.stages.keys())
         left = {name for name in again if (name, plan[name].key) not in self.remade}
-        return replace(orders, force=frozenset(left))
+        return replace(run_options, force=frozenset(left))
 
-    def _note(self, leg: Leg, plan: Plan, results: Sequence[Result]) -> Ran:
+    def _note(self, leg: Leg, plan: Plan, results: Sequence[StageResult]) -> Ran:
         why = ""
         for result in results:
             key = (result.stage, result.key)

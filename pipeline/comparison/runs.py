@@ -11,10 +11,10 @@ from pathlib import Path
 from infgen.config import ConfigError
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import Root
-from pipeline.engine.plan import SOURCES, Plan, make_plan, needed
-from pipeline.settings.overlay import Overlay, Value, lay, read_words
+from pipeline.engine.plan import SOURCES, Plan, make_plan, stages_in_order
+from pipeline.settings.overlay import Overlay, SettingValue, merge_overlays, read_overrides
 from pipeline.settings.presets import Arm, Preset
-from pipeline.settings.request import Request, recall, ref
+from pipeline.settings.request import Request, read_request, request_file
 from pipeline.settings.stages_file import DEFAULT_FILE, StagesFile
 
 TRAIN, ROLLOUT, SCORE, REPORT = "train", "rollout", "score", "report"
@@ -56,7 +56,7 @@ class Leg:
     @property
     def settings(self) -> Overlay:
         """What the arm and its play set."""
-        return self.arm.plays[self.play] if self.play else self.arm.settings
+        return self.arm.rollout_sets[self.play] if self.play else self.arm.settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ class Comparison:
 
     def request(self, leg: Leg, start: str | None = None) -> Request:
         """Write one run as if it had been asked for by itself."""
-        over = lay(self._over(leg, start))
+        over = merge_overlays(self._over(leg, start))
         return Request(
             root=self.root,
             file=self.path,
@@ -126,7 +126,7 @@ class Comparison:
     @property
     def stages(self) -> list[str]:
         """Stages that its runs make, each after those it reads."""
-        return needed(self.file.stages, self._last)
+        return stages_in_order(self.file.stages, self._last)
 
     def remember(self, keys: Mapping[str, str]) -> None:
         """Let the root know what was asked, for a command that does not name it."""
@@ -134,9 +134,9 @@ class Comparison:
         about = {
             "records": self.records,
             "file": None if self.path == DEFAULT_FILE else str(self.path),
-            "keys": {**recall(self.root, name).get("keys", {}), **keys},
+            "keys": {**read_request(self.root, name).get("keys", {}), **keys},
         }
-        path = ref(self.root, name)
+        path = request_file(self.root, name)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, about)
 
@@ -159,16 +159,24 @@ class Comparison:
 
     def _over(self, leg: Leg, start: str | None) -> list[Overlay]:
         """What is laid over the profiles, from the bottom up."""
-        own: dict[str, dict[str, Value]] = {
-            section: {"seed": Value(leg.seed, f"--seeds: {section}")} for section in _SEEDED
+        own: dict[str, dict[str, SettingValue]] = {
+            section: {"seed": SettingValue(leg.seed, f"--seeds: {section}")}
+            for section in _SEEDED
         }
         if start is not None:
-            own[TRAIN]["start"] = Value(start, f"weights of arm {leg.arm.start}: {TRAIN}")
-        words = read_words(self.overrides, self.file.sections)
+            own[TRAIN]["start"] = SettingValue(
+                start, f"weights of arm {leg.arm.start}: {TRAIN}"
+            )
+        words = read_overrides(self.overrides, self.file.sections)
         for section in _SEEDED:
             if "seed" in words.values.get(section, {}):
                 raise ConfigError(f"-s {section}.seed: {_NO_SEED}")
-        return [leg.settings, *self.file.laid(self.profile), words, Overlay((), own)]
+        return [
+            leg.settings,
+            *self.file.profile_overlays(self.profile),
+            words,
+            Overlay((), own),
+        ]
 
 
 def legs_of(comparison: Comparison, arms: Sequence[Arm], seeds: int) -> list[Leg]:
@@ -182,7 +190,7 @@ def legs_of(comparison: Comparison, arms: Sequence[Arm], seeds: int) -> list[Leg
         seeds: How many.
     """
     plays = ROLLOUT in comparison.stages
-    starts = comparison.preset.starts_of(arms)
+    starts = comparison.preset.initial_arms(arms)
     found = []
     for seed in range(seeds):
         for arm in comparison.preset.arms.values():
@@ -190,6 +198,7 @@ def legs_of(comparison: Comparison, arms: Sequence[Arm], seeds: int) -> list[Leg
                 found.append(Leg(comparison.preset.name, arm, seed))
             elif arm in arms:
                 found += [
-                    Leg(comparison.preset.name, arm, seed, play) for play in arm.plays
+                    Leg(comparison.preset.name, arm, seed, play)
+                    for play in arm.rollout_sets
                 ]
     return found

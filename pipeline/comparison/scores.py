@@ -11,7 +11,7 @@ from infgen.metrics.long_term.table import make_row
 from infgen.views.sheets import Measured
 from pipeline.comparison.execution import Ran
 from pipeline.comparison.runs import ROLLOUT, SCORE, TRAIN
-from pipeline.engine.inputs import FinishedInputs, units_of
+from pipeline.engine.inputs import FinishedInputs, finished_units
 from pipeline.engine.layout import read_json
 from pipeline.engine.manifest import read_manifest
 from pipeline.engine.plan import Plan
@@ -146,7 +146,7 @@ def _tally(plan: Plan) -> Tally:
     """Gather what the units of a stage ``score`` tallied, and the official scores."""
     tally = Tally()
     manifest = read_manifest(plan.root.folder(SCORE, plan[SCORE].key))
-    for unit in units_of(plan.root, SCORE, manifest):
+    for unit in finished_units(plan.root, SCORE, manifest):
         tally.merge(read_tally(unit.path, unit.report["rollouts"]))
         for one in read_json(unit.path / WOSAC):
             scores = one.get("scores", {})

@@ -21,7 +21,7 @@ from pipeline.comparison.tables import caveats, standing_alone, tables
 from pipeline.engine.atomic import MANIFEST, publish, remove_folder, write_file, write_json
 from pipeline.engine.code_hash import code_hash
 from pipeline.engine.layout import link
-from pipeline.engine.manifest import Run, package_versions, seal
+from pipeline.engine.manifest import Run, package_versions, write_manifest
 from pipeline.engine.plan import digest
 from pipeline.settings.presets import Preset
 
@@ -65,7 +65,7 @@ def write_comparison(comparison: Comparison, ran: Sequence[Ran], *, again: bool)
         started, begun = datetime.now(UTC).isoformat(timespec="seconds"), time.monotonic()
         with publish(folder) as partial:
             _write(partial, compare(preset, ran))
-            seal(partial, about, Run(started, time.monotonic() - begun, {}))
+            write_manifest(partial, about, Run(started, time.monotonic() - begun, {}))
     root.point(STAGE, about["key"])
     shown = root.path / PRESETS / preset.name
     link(shown, folder)

@@ -18,9 +18,9 @@ def find(root: Root, key: str) -> Path:
     Raises:
         PlanError: if there is none, or more than one.
     """
-    pointed = root.pointed(key)
-    if pointed is not None:
-        return pointed
+    latest_folder = root.latest_folder(key)
+    if latest_folder is not None:
+        return latest_folder
     found = [folder for _, folder in root.made() if folder.name.startswith(key[:16])]
     if len(key) < LEAST_DIGITS or not found:
         raise PlanError(

@@ -46,27 +46,27 @@ def publish(target: Path, *, resume: bool = False) -> Iterator[Path]:
     partial = target.with_name(f"{target.name}{mark}{PARTIAL}")
     partial.mkdir(parents=True, exist_ok=resume)
     if resume:
-        _drop_half_written(partial)
+        _remove_partial_files(partial)
     handle = os.open(partial, os.O_RDONLY)
     try:
         yield partial
         sync_tree(partial)
         with signals.whole():
-            _check_own(handle, partial)
-            _rename_first(partial, target)
+            _check_not_replaced(handle, partial)
+            _rename_unless_finished(partial, target)
     finally:
         os.close(handle)
         if not resume:
             shutil.rmtree(partial, ignore_errors=True)
 
 
-def _drop_half_written(folder: Path) -> None:
+def _remove_partial_files(folder: Path) -> None:
     for path in sorted(folder.rglob(f"*{PARTIAL}")):
         if path.is_file():
             path.unlink()
 
 
-def _check_own(handle: int, partial: Path) -> None:
+def _check_not_replaced(handle: int, partial: Path) -> None:
     """Make sure that all of a folder was written by who began it.
 
     Another run may have removed it; what is written next makes it anew, with a part of the
@@ -79,7 +79,7 @@ def _check_own(handle: int, partial: Path) -> None:
         raise StoreError(f"{partial} was removed by another run while it was written")
 
 
-def _rename_first(partial: Path, target: Path) -> None:
+def _rename_unless_finished(partial: Path, target: Path) -> None:
     try:
         partial.rename(target)
     except OSError as error:

@@ -31,7 +31,7 @@ def code_hash(modules: Sequence[str]) -> str:
     return _code_hash(tuple(sorted(modules)))
 
 
-def modules_of(modules: Iterable[str]) -> dict[str, Path]:
+def imported_modules(modules: Iterable[str]) -> dict[str, Path]:
     """Find the files of modules, and of all that they import of the library.
 
     Raises:
@@ -55,7 +55,7 @@ def modules_of(modules: Iterable[str]) -> dict[str, Path]:
 @cache
 def _code_hash(modules: tuple[str, ...]) -> str:
     digest = hashlib.sha256()
-    for name, path in sorted(modules_of(modules).items()):
+    for name, path in sorted(imported_modules(modules).items()):
         source = path.read_bytes()
         digest.update(f"{name}\0{len(source)}\0".encode() + source)
     return digest.hexdigest()

@@ -17,7 +17,7 @@ Event = Mapping[str, Any]
 ``unit-failed`` (error, trace), ``finish-started``, ``progress`` (done, total, note; logged
 where nothing was for some seconds), ``worker-full`` (worker, memory_gib: restarted, as it
 fills its memory), ``worker-lost`` (worker, units that begin again), ``workers-missing``
-(patience_min), ``stage-done`` (report), ``stage-failed``, ``stage-skipped``, ``run-ended``
+(timeout_min), ``stage-done`` (report), ``stage-failed``, ``stage-skipped``, ``run-ended``
 or ``run-stopped`` (why). Around the runs of a preset: ``leg-started`` (leg, number, legs),
 ``leg-failed`` (leg, why).
 """

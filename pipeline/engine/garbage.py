@@ -41,7 +41,7 @@ def find_garbage(root: Root, initial_weights: Collection[str] = ()) -> list[Garb
     """
     found = []
     for stage in root.stages():
-        kept = _kept(root, stage, initial_weights)
+        kept = _needed_names(root, stage, initial_weights)
         for folder in _folders(root, stage):
             if folder.name.endswith(PARTIAL):
                 if folder.name.startswith(TRASH) or _age_s(folder) > PARTIAL_AGE_S:
@@ -52,7 +52,7 @@ def find_garbage(root: Root, initial_weights: Collection[str] = ()) -> list[Garb
     return found
 
 
-def sweep(root: Root, initial_weights: Collection[str] = ()) -> list[Garbage]:
+def remove_garbage(root: Root, initial_weights: Collection[str] = ()) -> list[Garbage]:
     """Remove the garbage while holding the locks of all stages.
 
     Args:
@@ -71,12 +71,12 @@ def sweep(root: Root, initial_weights: Collection[str] = ()) -> list[Garbage]:
     return found
 
 
-def _kept(root: Root, stage: str, initial_weights: Collection[str]) -> set[str]:
+def _needed_names(root: Root, stage: str, initial_weights: Collection[str]) -> set[str]:
     """Names of folders that are needed, of the stage itself and of its units."""
     folders = {key[:KEY_DIGITS] for key in _remembered(root, stage)}
-    pointed = root.pointed(stage)
-    if pointed is not None:
-        folders.add(pointed.name)
+    latest_folder = root.latest_folder(stage)
+    if latest_folder is not None:
+        folders.add(latest_folder.name)
     if stage == WEIGHTS_STAGE:
         folders |= _named(root, initial_weights)
     units = set()
@@ -84,7 +84,7 @@ def _kept(root: Root, stage: str, initial_weights: Collection[str]) -> set[str]:
         if (root.stage(stage) / folder / MANIFEST).is_file():
             manifest = read_manifest(root.stage(stage) / folder)
             units |= {unit["key"][:KEY_DIGITS] for unit in manifest["units"]}
-    return folders | units | _under_way(root, stage)
+    return folders | units | _unfinished_units(root, stage)
 
 
 def _remembered(root: Root, stage: str) -> Iterator[str]:
@@ -107,7 +107,7 @@ def _named(root: Root, initial_weights: Collection[str]) -> set[str]:
     return found
 
 
-def _under_way(root: Root, stage: str) -> set[str]:
+def _unfinished_units(root: Root, stage: str) -> set[str]:
     try:
         attempt = read_json(root.attempt(stage))
     except StoreError:

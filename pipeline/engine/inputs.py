@@ -7,8 +7,8 @@ from typing import Any
 
 from pipeline.engine.layout import Root
 from pipeline.engine.manifest import read_manifest
-from pipeline.engine.plan import Plan, PlanError, Planned, digest
-from pipeline.engine.stage import Done, Source
+from pipeline.engine.plan import Plan, PlanError, PlannedStage, digest
+from pipeline.engine.stage import FinishedUnit, Source
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +16,7 @@ class FinishedInputs:
     """The ``Inputs`` of one stage. To ask for a stage not among its deps is an error."""
 
     root: Root
-    planned: Planned
+    planned: PlannedStage
 
     @property
     def sources(self) -> Sequence[Source]:
@@ -40,13 +40,13 @@ class FinishedInputs:
         """Finished folder of an input stage."""
         return self.root.folder(stage, self.key(stage))
 
-    def units(self, stage: str) -> Sequence[Done]:
+    def units(self, stage: str) -> Sequence[FinishedUnit]:
         """Finished units of an input stage, by name."""
         manifest = read_manifest(self.folder(stage))
         more = manifest["report"].get("units", {})
         return [
             replace(done, report={**done.report, **more.get(done.name, {})})
-            for done in units_of(self.root, stage, manifest)
+            for done in finished_units(self.root, stage, manifest)
         ]
 
     def content(self, stage: str, *names: str) -> str:
@@ -63,10 +63,14 @@ class FinishedInputs:
         return digest(found)
 
 
-def units_of(root: Root, stage: str, manifest: Mapping[str, Any]) -> list[Done]:
+def finished_units(
+    root: Root, stage: str, manifest: Mapping[str, Any]
+) -> list[FinishedUnit]:
     """Finished units that a stage's manifest lists."""
     return [
-        Done(unit["name"], unit["key"], root.unit(stage, unit["key"]), unit["report"])
+        FinishedUnit(
+            unit["name"], unit["key"], root.unit(stage, unit["key"]), unit["report"]
+        )
         for unit in manifest["units"]
     ]
 
@@ -76,6 +80,6 @@ def _below(files: Iterable[str], names: Sequence[str]) -> list[str]:
     return [path for path in files if path in names or path.startswith(folders)]
 
 
-def are_made(plan: Plan, planned: Planned) -> bool:
+def inputs_finished(plan: Plan, planned: PlannedStage) -> bool:
     """Whether all stages that one reads are finished, so that its work can be cut."""
-    return all(plan.root.is_made(name, key) for name, key in planned.inputs.items())
+    return all(plan.root.is_finished(name, key) for name, key in planned.inputs.items())

@@ -91,7 +91,7 @@ class Root:
         """Record of a stage's last try."""
         return self.stage(stage) / "attempt.json"
 
-    def is_made(self, stage: str, key: str) -> bool:
+    def is_finished(self, stage: str, key: str) -> bool:
         """Whether a stage is whole on disk."""
         return (self.folder(stage, key) / MANIFEST).is_file()
 
@@ -116,7 +116,7 @@ class Root:
         if stage == "report":
             link(self.path / "report", folder)
 
-    def pointed(self, stage: str) -> Path | None:
+    def latest_folder(self, stage: str) -> Path | None:
         """Return the folder that ``latest/<stage>`` leads to, if it is whole."""
         folder = (self.latest / stage).resolve()
         return folder if (folder / MANIFEST).is_file() else None

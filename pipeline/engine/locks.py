@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 POLL_S = 0.1
-PATIENCE_S = 0.5
+LOCK_TIMEOUT_S = 0.5
 """How long a lock is tried before it counts as held: ``is_locked`` takes it briefly."""
 
 
@@ -37,12 +37,12 @@ def locked(path: Path, *, wait: bool = False) -> Iterator[None]:
     handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     try:
         begun = time.monotonic()
-        while not _try(handle, fcntl.LOCK_EX):
-            if not wait and time.monotonic() - begun > PATIENCE_S:
-                raise LockedError(_who(path))
+        while not _try_lock(handle, fcntl.LOCK_EX):
+            if not wait and time.monotonic() - begun > LOCK_TIMEOUT_S:
+                raise LockedError(_locked_message(path))
             time.sleep(POLL_S)
         os.ftruncate(handle, 0)
-        os.pwrite(handle, json.dumps(_me()).encode(), 0)
+        os.pwrite(handle, json.dumps(_this_process()).encode(), 0)
         yield
         os.ftruncate(handle, 0)
     finally:
@@ -55,7 +55,7 @@ def is_locked(path: Path) -> bool:
         return False
     handle = os.open(path, os.O_RDONLY)  # Whoever may read may look.
     try:
-        return not _try(handle, fcntl.LOCK_SH)
+        return not _try_lock(handle, fcntl.LOCK_SH)
     finally:
         os.close(handle)
 
@@ -69,7 +69,7 @@ def holder(path: Path) -> dict[str, Any]:
     return about if isinstance(about, dict) else {}
 
 
-def _try(handle: int, kind: int) -> bool:
+def _try_lock(handle: int, kind: int) -> bool:
     try:
         fcntl.flock(handle, kind | fcntl.LOCK_NB)
     except OSError as error:
@@ -79,12 +79,12 @@ def _try(handle: int, kind: int) -> bool:
     return True
 
 
-def _me() -> dict[str, Any]:
+def _this_process() -> dict[str, Any]:
     now = datetime.now(UTC).isoformat(timespec="seconds")
     return {"host": socket.gethostname(), "pid": os.getpid(), "since": now}
 
 
-def _who(path: Path) -> str:
+def _locked_message(path: Path) -> str:
     about = holder(path)
     who = "another process"
     if about:

@@ -51,7 +51,7 @@ def split_report(report: Report) -> tuple[Report, Report]:
     return same, dict(report.get("run", {}))
 
 
-def seal(folder: Path, about: Mapping[str, Any], run: Run) -> None:
+def write_manifest(folder: Path, about: Mapping[str, Any], run: Run) -> None:
     """Write ``run.json`` and, as the very last file, ``manifest.json``."""
     run.write(folder)
     write_json(folder / MANIFEST, {**about, "files": list_files(folder)})
@@ -90,14 +90,14 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     try:
         manifest = read_json(folder / MANIFEST)
     except StoreError as error:
-        raise StoreError(f"{error}{_way_out(folder)}") from error
+        raise StoreError(f"{error}{_remedy(folder)}") from error
     if not isinstance(manifest, dict) or "files" not in manifest:
         path = folder / MANIFEST
-        raise StoreError(f"{path} is damaged: it lists no files{_way_out(folder)}")
+        raise StoreError(f"{path} is damaged: it lists no files{_remedy(folder)}")
     return manifest
 
 
-def _way_out(folder: Path) -> str:
+def _remedy(folder: Path) -> str:
     """Say how a damaged stage, or one of its units, comes right; nothing of others."""
     stage = folder.resolve().parent
     stage = stage.parent if stage.name == "units" else stage
@@ -119,7 +119,7 @@ def verify(root: Root, *, full: bool) -> Iterator[str]:
         except StoreError as error:
             yield str(error)
             continue
-        way = _way_out(folder)
+        way = _remedy(folder)
         for line in _damage(folder, manifest["files"], full=full):
             yield f"{line}{way}"
         for unit in manifest.get("units", []):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, Protocol, runtime_checkable
 
-from infgen.config import decisive
+from infgen.config import key_values
 from pipeline.engine.layout import Root
 from pipeline.engine.registry import load_stage
 from pipeline.engine.stage import Source, Stage, Unit
@@ -63,7 +63,7 @@ class Choice(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
+class PlannedStage:
     """One stage with everything settled.
 
     Attributes:
@@ -98,7 +98,7 @@ class Planned:
                 "settings": self.values,
                 "unit": unit.name,
                 "inputs": dict(unit.inputs),
-                "task": placeless(unit.task),
+                "task": without_locations(unit.task),
             }
         )
 
@@ -108,9 +108,9 @@ class Plan:
     """Stages to make, each after those it reads."""
 
     root: Root
-    stages: Mapping[str, Planned]
+    stages: Mapping[str, PlannedStage]
 
-    def __getitem__(self, name: str) -> Planned:
+    def __getitem__(self, name: str) -> PlannedStage:
         return self.stages[name]
 
     def after(self, names: Iterable[str]) -> set[str]:
@@ -135,16 +135,16 @@ def make_plan(
             source files that are not there.
         PlanError: for a stage that does not exist, or stages that need each other.
     """
-    order = needed(entries, targets)
+    order = stages_in_order(entries, targets)
     reads_sources = any(SOURCES in entries[name].deps for name in order)
     sources = chosen.find_sources(root) if reads_sources else ()
-    stages: dict[str, Planned] = {}
+    stages: dict[str, PlannedStage] = {}
     for name in order:
-        stages[name] = _settle(entries[name], chosen, sources, stages, root)
+        stages[name] = _plan_stage(entries[name], chosen, sources, stages, root)
     return Plan(root, stages)
 
 
-def needed(entries: Mapping[str, StageEntry], targets: Sequence[str]) -> list[str]:
+def stages_in_order(entries: Mapping[str, StageEntry], targets: Sequence[str]) -> list[str]:
     """List the targets and all they read, each after what it reads.
 
     Raises:
@@ -152,21 +152,25 @@ def needed(entries: Mapping[str, StageEntry], targets: Sequence[str]) -> list[st
     """
     order: list[str] = []
     for target in targets:
-        _visit(target, "the command", entries, order, ())
+        _add_with_dependencies(target, "the command", entries, order, ())
     return order
 
 
-def _visit(
+def _add_with_dependencies(
     name: str,
-    asker: str,
+    requested_by: str,
     entries: Mapping[str, StageEntry],
     order: list[str],
     above: tuple[str, ...],
 ) -> None:
     if name not in entries:
         near = get_close_matches(name, list(entries), n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"there is {', '.join(entries)}"
-        raise PlanError(f"{asker} asks for stage {name!r}, which does not exist; {hint}")
+        did_you_mean = (
+            f"did you mean {near[0]!r}?" if near else f"there is {', '.join(entries)}"
+        )
+        raise PlanError(
+            f"{requested_by} asks for stage {name!r}, which does not exist; {did_you_mean}"
+        )
     if name in above:
         circle = " -> ".join([*above[above.index(name) :], name])
         raise PlanError(f"{entries[name].where}: stages need each other: {circle}")
@@ -174,24 +178,24 @@ def _visit(
         return
     for dep in entries[name].deps:
         if dep != SOURCES:
-            _visit(dep, entries[name].where, entries, order, (*above, name))
+            _add_with_dependencies(dep, entries[name].where, entries, order, (*above, name))
     order.append(name)
 
 
-def _settle(
+def _plan_stage(
     entry: StageEntry,
     chosen: Choice,
     sources: tuple[Source, ...],
-    before: Mapping[str, Planned],
+    before: Mapping[str, PlannedStage],
     root: Root,
-) -> Planned:
+) -> PlannedStage:
     stage = _load(entry)
     sections: Mapping[str, Any] = {
         section: chosen.build(section, kind) for section, kind in stage.settings.items()
     }
-    if stage.narrow is not None:
-        sections = stage.narrow(sections)
-    values = {section: decisive(settings) for section, settings in sections.items()}
+    if stage.normalize is not None:
+        sections = stage.normalize(sections)
+    values = {section: key_values(settings) for section, settings in sections.items()}
     only = next(iter(sections.values())) if len(sections) == 1 else sections
     read = sources if SOURCES in entry.deps else ()
     if stage.reads is not None:
@@ -206,7 +210,7 @@ def _settle(
             "sources": {source.name: source.fingerprint for source in read},
         }
     )
-    return Planned(stage, entry.module, only, values, inputs, read, key)
+    return PlannedStage(stage, entry.module, only, values, inputs, read, key)
 
 
 def _load(entry: StageEntry) -> Stage:
@@ -234,12 +238,12 @@ def digest(value: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def placeless(value: Any) -> Any:
+def without_locations(value: Any) -> Any:
     """Replace every absolute path and URL in a JSON-able value by nothing."""
     if isinstance(value, Mapping):
-        return {name: placeless(part) for name, part in value.items()}
+        return {name: without_locations(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [placeless(part) for part in value]
+        return [without_locations(part) for part in value]
     if isinstance(value, str) and (value.startswith("/") or "://" in value):
         return None
     return value

@@ -8,16 +8,16 @@ from typing import Any
 
 from pipeline.engine.events import Event
 
-LONGEST_WORD = 36
+MAX_VALUE_LENGTH = 36
 RECENT_S = 120.0
 """Rates are those of about the last two minutes."""
-MARK_S = 1.0
-LEAST = 0.05
+MIN_SAMPLE_S = 1.0
+MIN_PROGRESS = 0.05
 """Less of a unit says nothing of the rate: beginning takes longer than going on."""
 
 
 @dataclass
-class Gauge:
+class ProgressMeter:
     """Reads the events of one stage.
 
     Units count one each; what units under way say of themselves counts as parts of them. A
@@ -38,32 +38,32 @@ class Gauge:
     note: str = ""
     finishing: bool = False
     _done: int = 0
-    _part: tuple[float, float] = (0.0, 1.0)
-    _first_part: float | None = None
-    _marks: deque[tuple[float, float]] = field(default_factory=deque)
+    _unit_progress: tuple[float, float] = (0.0, 1.0)
+    _first_step: float | None = None
+    _samples: deque[tuple[float, float]] = field(default_factory=deque)
 
     def __post_init__(self) -> None:
         """Start the clock."""
-        self._marks.append((self.clock(), 0.0))
+        self._samples.append((self.clock(), 0.0))
 
     def take(self, event: Event) -> None:
         """Note a unit's end, or how far it is."""
         if event["event"] in ("unit-done", "unit-failed"):
             self._done += 1
-            self._part, self.note = (0.0, 1.0), ""
+            self._unit_progress, self.note = (0.0, 1.0), ""
         elif event["event"] == "finish-started":
-            self.finishing, self._part, self.note = True, (0.0, 1.0), ""
+            self.finishing, self._unit_progress, self.note = True, (0.0, 1.0), ""
         elif event["event"] == "progress" and event["total"]:
-            self._part = (float(event["done"]), float(event["total"]))
+            self._unit_progress = (float(event["done"]), float(event["total"]))
             self.note = str(event["note"])
-            if self._first_part is None:
-                self._first_part = self._part[0]
-        self._mark()
+            if self._first_step is None:
+                self._first_step = self._unit_progress[0]
+        self._add_sample()
 
-    def _mark(self) -> None:
+    def _add_sample(self) -> None:
         """Note how much is done by now, and forget what no longer counts for the rate."""
-        now, marks = self.clock(), self._marks
-        if len(marks) > 1 and now - marks[-1][0] < MARK_S:
+        now, marks = self.clock(), self._samples
+        if len(marks) > 1 and now - marks[-1][0] < MIN_SAMPLE_S:
             marks[-1] = (marks[-1][0], self._made)
         else:
             marks.append((now, self._made))
@@ -73,7 +73,7 @@ class Gauge:
     @property
     def in_steps(self) -> bool:
         """Whether the stage is told in the steps of its only unit."""
-        return self.units - self.before <= 1 and self._first_part is not None
+        return self.units - self.before <= 1 and self._first_step is not None
 
     @property
     def done(self) -> float:
@@ -81,32 +81,32 @@ class Gauge:
         if self.finishing:
             return self.total
         if self.in_steps:
-            return self._part[0]
+            return self._unit_progress[0]
         return min(float(self.units), self.before + self._done + self._fraction)
 
     @property
     def total(self) -> float:
         """Units, or steps, in all."""
-        return self._part[1] if self.in_steps else float(self.units)
+        return self._unit_progress[1] if self.in_steps else float(self.units)
 
     @property
     def _fraction(self) -> float:
-        return self._part[0] / self._part[1]
+        return self._unit_progress[0] / self._unit_progress[1]
 
     @property
     def _made(self) -> float:
         """What of ``done`` this run did itself."""
-        return self.done - (self._first_part or 0.0 if self.in_steps else self.before)
+        return self.done - (self._first_step or 0.0 if self.in_steps else self.before)
 
     @property
     def per_s(self) -> float | None:
         """Units, or steps, per second of late; None as long as next to nothing is done."""
-        since, before = self._marks[0]
+        since, before = self._samples[0]
         taken, made = self.clock() - since, self._made - before
-        return made / taken if made >= LEAST and taken > 0 else None
+        return made / taken if made >= MIN_PROGRESS and taken > 0 else None
 
     @property
-    def left_s(self) -> float | None:
+    def remaining_s(self) -> float | None:
         """Seconds to go at this rate."""
         rate = self.per_s
         return max(0.0, self.total - self.done) / rate if rate else None
@@ -117,8 +117,8 @@ class Gauge:
             return self.remark
         what = self.what if self.in_steps else "units"
         parts = [f"{amount(self.done)} of {amount(self.total)} {what}"]
-        if self.per_s is not None and self.left_s is not None:
-            parts += [rate(self.per_s), f"{clock_time(self.left_s)} left"]
+        if self.per_s is not None and self.remaining_s is not None:
+            parts += [rate(self.per_s), f"{clock_time(self.remaining_s)} left"]
         return ", ".join([*parts, *self._notes])
 
     @property
@@ -162,4 +162,4 @@ def figures(report: dict[str, Any], most: int = 6) -> str:
 
 def _short(value: Any) -> str:
     text = f"{value:.4g}" if isinstance(value, float) else str(value)
-    return text if len(text) <= LONGEST_WORD else f"{text[: LONGEST_WORD - 3]}..."
+    return text if len(text) <= MAX_VALUE_LENGTH else f"{text[: MAX_VALUE_LENGTH - 3]}..."

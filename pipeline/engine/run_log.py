@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.engine.events import Event
-from pipeline.engine.progress import Gauge
+from pipeline.engine.progress import ProgressMeter
 
 
 class LogTail:
@@ -45,7 +45,7 @@ class RunLog:
     Attributes:
         workers: Who does the units, as ``--dask`` said.
         stage: The stage it is making; empty in between.
-        gauge: How far that is.
+        meter: How far that is.
         failed: Units of it that failed in this run.
     """
 
@@ -54,7 +54,7 @@ class RunLog:
         self._now_s = 0.0
         self.workers = "none"
         self.stage = ""
-        self.gauge: Gauge | None = None
+        self.meter: ProgressMeter | None = None
         self.failed = 0
 
     def follow(self, now_s: float) -> None:
@@ -72,12 +72,12 @@ class RunLog:
         elif kind == "stage-started":
             self.stage, self.failed = str(event["stage"]), 0
             units, made = int(event["units"]), int(event["made"])
-            self.gauge = Gauge(self.stage, units, made, clock=lambda: self._now_s)
+            self.meter = ProgressMeter(self.stage, units, made, clock=lambda: self._now_s)
         elif kind in _ENDS:
-            self.stage, self.gauge = "", None
-        elif self.gauge is not None:
+            self.stage, self.meter = "", None
+        elif self.meter is not None:
             self.failed += kind == "unit-failed"
-            self.gauge.take(event)
+            self.meter.take(event)
 
 
 _ENDS = ("stage-done", "stage-failed", "run-ended", "run-stopped")

@@ -16,20 +16,20 @@ from typing import Any, Literal
 from pipeline.engine import signals
 from pipeline.engine.atomic import MANIFEST, PARTIAL, publish, remove_folder, write_json
 from pipeline.engine.events import Events
-from pipeline.engine.inputs import FinishedInputs, units_of
+from pipeline.engine.inputs import FinishedInputs, finished_units
 from pipeline.engine.layout import KEY_DIGITS, Root
 from pipeline.engine.locks import LockedError, locked
 from pipeline.engine.manifest import (
     Run,
     read_manifest,
-    seal,
     split_report,
+    write_manifest,
 )
-from pipeline.engine.plan import Plan, Planned
+from pipeline.engine.plan import Plan, PlannedStage
 from pipeline.engine.progress import figures
-from pipeline.engine.stage import Done, Progress, Report
-from pipeline.engine.status import has_other_code
-from pipeline.engine.tasks import about_stage, cut_tasks
+from pipeline.engine.stage import FinishedUnit, Progress, Report
+from pipeline.engine.status import code_differs
+from pipeline.engine.tasks import make_tasks, stage_manifest
 from pipeline.engine.units import (
     DriverWorkers,
     OpenWorkers,
@@ -45,7 +45,7 @@ FINISH = "finish"
 
 
 @dataclass(frozen=True, slots=True)
-class Orders:
+class RunOptions:
     """How to run; none of it decides bytes.
 
     Attributes:
@@ -65,7 +65,7 @@ class Orders:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class StageResult:
     """What became of one stage.
 
     Attributes:
@@ -94,7 +94,7 @@ class Result:
         return figures(self.report)
 
 
-def run(plan: Plan, orders: Orders, events: Events) -> list[Result]:
+def run(plan: Plan, run_options: RunOptions, events: Events) -> list[StageResult]:
     """Make every planned stage that is not whole, each after those it reads.
 
     Raises:
@@ -103,9 +103,9 @@ def run(plan: Plan, orders: Orders, events: Events) -> list[Result]:
         StoreError: if what a stage should read is damaged.
         WorkersLostError: if the workers are gone, with what they had under way.
     """
-    events.emit("run-started", stages=list(plan.stages), workers=orders.workers.words)
+    events.emit("run-started", stages=list(plan.stages), workers=run_options.workers.words)
     try:
-        results = _make_all(plan, orders, events)
+        results = _make_stages(plan, run_options, events)
     except (signals.Stopped, LockedError, WorkersLostError) as error:
         events.emit("run-stopped", why=str(error))
         raise
@@ -114,37 +114,37 @@ def run(plan: Plan, orders: Orders, events: Events) -> list[Result]:
     return results
 
 
-def _make_all(plan: Plan, orders: Orders, events: Events) -> list[Result]:
-    force = plan.after(orders.force | _made_by_other_code(plan, orders))
-    results: list[Result] = []
-    with orders.workers.open() as workers:
+def _make_stages(plan: Plan, run_options: RunOptions, events: Events) -> list[StageResult]:
+    force = plan.after(run_options.force | _made_with_other_code(plan, run_options))
+    results: list[StageResult] = []
+    with run_options.workers.open() as workers:
         for planned in plan.stages.values():
             unmet = {result.stage for result in results if result.state in _NOT_MADE}
-            if unmet and (not orders.keep_going or unmet & planned.inputs.keys()):
-                results.append(Result(planned.name, "skipped", planned.key))
+            if unmet and (not run_options.keep_going or unmet & planned.inputs.keys()):
+                results.append(StageResult(planned.name, "skipped", planned.key))
                 events.emit("stage-skipped", stage=planned.name)
                 continue
-            making = _Making(plan, planned, orders, events, planned.name in force)
-            results.append(making.ensure(workers))
+            making = _StageRun(plan, planned, run_options, events, planned.name in force)
+            results.append(making.find_or_make(workers))
     return results
 
 
 _NOT_MADE = ("failed", "skipped")
 
 
-def _made_by_other_code(plan: Plan, orders: Orders) -> frozenset[str]:
-    if not orders.strict_code:
+def _made_with_other_code(plan: Plan, run_options: RunOptions) -> frozenset[str]:
+    if not run_options.strict_code:
         return frozenset()
-    return frozenset(name for name in plan.stages if has_other_code(plan, name))
+    return frozenset(name for name in plan.stages if code_differs(plan, name))
 
 
 @dataclass(frozen=True, slots=True)
-class _Making:
+class _StageRun:
     """One stage on its way."""
 
     plan: Plan
-    planned: Planned
-    orders: Orders
+    planned: PlannedStage
+    run_options: RunOptions
     events: Events
     forced: bool
 
@@ -160,12 +160,12 @@ class _Making:
     def folder(self) -> Path:
         return self.root.folder(self.name, self.planned.key)
 
-    def ensure(self, workers: OpenWorkers) -> Result:
+    def find_or_make(self, workers: OpenWorkers) -> StageResult:
         """Find the stage whole, or make it, alone."""
         begun = time.monotonic()
         if self._is_whole():
             return self._cached()
-        with locked(self.root.lock(self.name), wait=self.orders.wait):
+        with locked(self.root.lock(self.name), wait=self.run_options.wait):
             if self._is_whole():
                 return self._cached()
             result = self._make(workers)
@@ -173,25 +173,25 @@ class _Making:
         return replace(result, seconds=round(taken, 3))
 
     def _is_whole(self) -> bool:
-        return not self.forced and self.root.is_made(self.name, self.planned.key)
+        return not self.forced and self.root.is_finished(self.name, self.planned.key)
 
-    def _cached(self) -> Result:
+    def _cached(self) -> StageResult:
         manifest = read_manifest(self.folder)
         self.root.point(self.name, self.planned.key)
         units = len(manifest["units"])
         self.events.emit("stage-cached", stage=self.name, units=units)
         report = manifest["report"]
-        return Result(self.name, "cached", self.planned.key, units, report=report)
+        return StageResult(self.name, "cached", self.planned.key, units, report=report)
 
-    def _make(self, workers: OpenWorkers) -> Result:
+    def _make(self, workers: OpenWorkers) -> StageResult:
         inputs = FinishedInputs(self.root, self.planned)
         units = self.planned.stage.plan(inputs, self.planned.settings)
-        tasks = cut_tasks(self.root, self.planned, units)
+        tasks = make_tasks(self.root, self.planned, units)
         if self.forced:
-            self._forget(tasks)
-        self._clear()
+            self._remove_outputs(tasks)
+        self._remove_leftovers()
         todo = [task for task in tasks if not (task.target / MANIFEST).is_file()]
-        self._note_attempt(tasks, {})
+        self._write_attempt(tasks, {})
         self.events.emit(
             "stage-started",
             stage=self.name,
@@ -203,9 +203,9 @@ class _Making:
         errors = {outcome.name: outcome.error for outcome in outcomes if outcome.error}
         report: Report = {}
         if not errors:
-            self._clear()  # Of workers that died, too: others did their units.
+            self._remove_leftovers()  # Of workers that died, too: others did their units.
             report, errors = self._finish(inputs, tasks)
-        self._note_attempt(tasks, errors)
+        self._write_attempt(tasks, errors)
         made = sum(outcome.report is not None for outcome in outcomes)
         if errors:
             self.events.emit("stage-failed", stage=self.name, errors=errors)
@@ -215,7 +215,7 @@ class _Making:
             self.root.point(self.name, self.planned.key)
             self.events.emit("stage-done", stage=self.name, report=report)
             state = "made"
-        return Result(
+        return StageResult(
             self.name, state, self.planned.key, len(tasks), made, 0.0, report, errors
         )
 
@@ -224,17 +224,19 @@ class _Making:
         if not todo:
             return outcomes
 
-        def go_on() -> bool:
-            return self.orders.keep_going or not any(outcome.error for outcome in outcomes)
+        def may_start() -> bool:
+            return self.run_options.keep_going or not any(
+                outcome.error for outcome in outcomes
+            )
 
         self.root.units(self.name).mkdir(parents=True, exist_ok=True)
         executor = workers.executor(here=self.planned.stage.in_driver)
-        for outcome in executor.run(todo, go_on, self._progress(), self._tell_more):
+        for outcome in executor.run(todo, may_start, self._progress(), self._emit):
             outcomes.append(outcome)
-            self._tell(outcome)
+            self._emit_outcome(outcome)
         return outcomes
 
-    def _tell(self, outcome: Outcome) -> None:
+    def _emit_outcome(self, outcome: Outcome) -> None:
         seconds = round(outcome.seconds, 3)
         about: dict[str, Any] = {
             "stage": self.name,
@@ -248,7 +250,7 @@ class _Making:
         else:
             self.events.emit("unit-done", **about, report=outcome.report)
 
-    def _tell_more(self, event: str, **figures: Any) -> None:
+    def _emit(self, event: str, **figures: Any) -> None:
         self.events.emit(event, stage=self.name, **figures)
 
     def _finish(
@@ -258,25 +260,27 @@ class _Making:
         begun = time.monotonic()
         self.events.emit("finish-started", stage=self.name)
         try:
-            return self._gather(inputs, tasks), {}
+            return self._write_stage(inputs, tasks), {}
         except Exception as error:  # Recorded as a failed unit would be; others go on.
             trace, seconds = traceback.format_exc(), time.monotonic() - begun
             outcome = failure(FINISH, error, trace, seconds)
-            self._tell(outcome)
+            self._emit_outcome(outcome)
             return {}, {FINISH: outcome.error}
 
-    def _gather(self, inputs: FinishedInputs, tasks: Sequence[Task]) -> Report:
+    def _write_stage(self, inputs: FinishedInputs, tasks: Sequence[Task]) -> Report:
         started, begun = datetime.now(UTC).isoformat(timespec="seconds"), time.monotonic()
-        about = about_stage(self.planned, tasks)
-        dones: list[Done] = units_of(self.root, self.name, about)
+        about = stage_manifest(self.planned, tasks)
+        finished: list[FinishedUnit] = finished_units(self.root, self.name, about)
         settings = self.planned.settings
         with publish(self.folder) as partial:
             report = self.planned.stage.finish(
-                inputs, dones, partial, settings, self._progress()
+                inputs, finished, partial, settings, self._progress()
             )
             same, varying = split_report(report)
             seconds = time.monotonic() - begun
-            seal(partial, {**about, "report": same}, Run(started, seconds, varying))
+            write_manifest(
+                partial, {**about, "report": same}, Run(started, seconds, varying)
+            )
         return same
 
     def _progress(self) -> Progress:
@@ -286,18 +290,18 @@ class _Making:
 
         return tell
 
-    def _note_attempt(self, tasks: Sequence[Task], failed: dict[str, str]) -> None:
+    def _write_attempt(self, tasks: Sequence[Task], failed: dict[str, str]) -> None:
         """Say on disk what is under way, for ``status`` and ``gc``."""
         units = {task.unit.name: task.about["key"] for task in tasks}
         about = {"key": self.planned.key, "units": units, "failed": failed}
         write_json(self.root.attempt(self.name), about)
 
-    def _forget(self, tasks: Sequence[Task]) -> None:
+    def _remove_outputs(self, tasks: Sequence[Task]) -> None:
         """Remove what is to be made again, the stage before its units."""
         for folder in (self.folder, *[task.target for task in tasks]):
             remove_folder(folder)
 
-    def _clear(self) -> None:
+    def _remove_leftovers(self) -> None:
         """Remove what killed runs left behind, but what this stage can go on from."""
         stage = self.root.stage(self.name)
         for path in [*stage.glob("*"), *stage.glob("units/*")]:

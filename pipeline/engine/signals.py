@@ -1,8 +1,8 @@
 """Stopping on SIGTERM and SIGINT without leaving anything half done.
 
 The first signal raises ``Stopped`` at once, except inside ``whole()`` (a write that must
-be finished; it is raised at its end) and inside ``patient()`` (work that saves its state;
-it is raised by the next ``check()``). A second signal raises at once inside ``patient()``
+be finished; it is raised at its end) and inside ``deferred()`` (work that saves its state;
+it is raised by the next ``check()``). A second signal raises at once inside ``deferred()``
 too.
 """
 
@@ -33,14 +33,14 @@ class _State:
 
     pending: int = 0
     whole: int = 0
-    patient: int = 0
+    deferred: int = 0
 
 
 _STATE = _State()
 
 
 @contextmanager
-def listening() -> Iterator[None]:
+def handling_signals() -> Iterator[None]:
     """Turn SIGTERM and SIGINT into ``Stopped`` for the length of the block."""
     before = {number: signal.signal(number, _note) for number in SIGNALS}
     _STATE.pending = 0
@@ -49,7 +49,7 @@ def listening() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        if not (_STATE.whole or _STATE.patient):
+        if not (_STATE.whole or _STATE.deferred):
             _STATE.pending = 0  # Who comes after is not asked to stop.
 
 
@@ -61,18 +61,18 @@ def whole() -> Iterator[None]:
         yield
     finally:
         _STATE.whole -= 1
-    if _STATE.pending and not _STATE.whole and not _STATE.patient:
+    if _STATE.pending and not _STATE.whole and not _STATE.deferred:
         raise Stopped(_STATE.pending)
 
 
 @contextmanager
-def patient() -> Iterator[None]:
+def deferred() -> Iterator[None]:
     """Leave it to the block to call ``check`` where it can stop well."""
-    _STATE.patient += 1
+    _STATE.deferred += 1
     try:
         yield
     finally:
-        _STATE.patient -= 1
+        _STATE.deferred -= 1
     check()
 
 
@@ -94,5 +94,5 @@ def check() -> None:
 def _note(number: int, frame: FrameType | None) -> None:
     again = bool(_STATE.pending)
     _STATE.pending = number
-    if not _STATE.whole and (again or not _STATE.patient):
+    if not _STATE.whole and (again or not _STATE.deferred):
         raise Stopped(number)

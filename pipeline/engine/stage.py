@@ -59,7 +59,7 @@ class Unit:
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class FinishedUnit:
     """A finished unit: its folder on disk and what it reported."""
 
     name: str
@@ -76,7 +76,7 @@ class Inputs(Protocol):
     def sources(self) -> Sequence[Source]:
         """Source files, by name."""
 
-    def units(self, stage: str) -> Sequence[Done]:
+    def units(self, stage: str) -> Sequence[FinishedUnit]:
         """Finished units of an input stage, by name."""
 
     def folder(self, stage: str) -> Path:
@@ -123,7 +123,7 @@ class Stage:
         finish: Gathers the units into the stage's own folder ``target`` (index, tables).
         reads: Finds what the stage's settings name that no other stage of the plan makes,
             in the root folder of the experiment or elsewhere; it then counts as a source.
-        narrow: Sets what decides nothing here to its default, section by section, before
+        normalize: Sets what decides nothing here to its default, section by section, before
             there is a key: what other settings make idle, or what is another stage's.
         modules: Modules whose code decides the bytes, but what they import of the library;
             the hash of all is recorded.
@@ -136,9 +136,9 @@ class Stage:
     settings: Mapping[str, type]
     plan: "Callable[[Inputs, Any], Sequence[Unit]]"
     work: "Callable[[Unit, Path, Any, Progress], Report]"
-    finish: "Callable[[Inputs, Sequence[Done], Path, Any, Progress], Report]"
+    finish: "Callable[[Inputs, Sequence[FinishedUnit], Path, Any, Progress], Report]"
     reads: "Callable[[Path, Any], Sequence[Source]] | None" = None
-    narrow: "Callable[[Mapping[str, Any]], Mapping[str, Any]] | None" = None
+    normalize: "Callable[[Mapping[str, Any]], Mapping[str, Any]] | None" = None
     modules: Sequence[str] = field(default=())
     resumes: bool = False
     in_driver: bool = False

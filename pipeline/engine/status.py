@@ -6,11 +6,11 @@ from typing import Any, Literal
 
 from pipeline.engine.atomic import MANIFEST, StoreError
 from pipeline.engine.code_hash import code_hash
-from pipeline.engine.inputs import FinishedInputs, are_made
+from pipeline.engine.inputs import FinishedInputs, inputs_finished
 from pipeline.engine.layout import read_json
 from pipeline.engine.locks import holder, is_locked
 from pipeline.engine.manifest import read_manifest
-from pipeline.engine.plan import Plan, PlanError, Planned
+from pipeline.engine.plan import Plan, PlanError, PlannedStage
 
 State = Literal["cached", "stale", "missing", "running", "failed"]
 OTHER_CODE = "code differs from the run that made this"
@@ -18,7 +18,7 @@ MAX_NAMES = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class StageStatus:
     """How one stage stands.
 
     Attributes:
@@ -45,9 +45,9 @@ class Standing:
         return "" if self.units is None else f"{self.made}/{self.units}"
 
 
-def standings(
+def stage_statuses(
     plan: Plan, made: Mapping[str, str], *, strict_code: bool = False
-) -> list[Standing]:
+) -> list[StageStatus]:
     """Tell how every planned stage stands.
 
     Args:
@@ -55,24 +55,26 @@ def standings(
         made: Keys of the stages made last; what is stale is compared with these.
         strict_code: Whether other code makes a stage stale.
     """
-    return [_standing(plan, name, made, strict_code) for name in plan.stages]
+    return [_stage_status(plan, name, made, strict_code) for name in plan.stages]
 
 
-def _standing(
+def _stage_status(
     plan: Plan, name: str, made: Mapping[str, str], strict_code: bool
-) -> Standing:
+) -> StageStatus:
     planned, root = plan[name], plan.root
-    other_code = has_other_code(plan, name)
-    if root.is_made(name, planned.key) and not (strict_code and other_code):
+    other_code = code_differs(plan, name)
+    if root.is_finished(name, planned.key) and not (strict_code and other_code):
         units = len(read_manifest(root.folder(name, planned.key))["units"])
         why = OTHER_CODE if other_code else ""
-        return Standing(name, "cached", why, planned.key, units, units)
+        return StageStatus(name, "cached", why, planned.key, units, units)
     try:
         total, done = count_units(plan, planned)
     except PlanError as error:  # It cannot be cut as asked: the user must know, not stop.
-        return Standing(name, "missing", str(error), planned.key, None, None)
+        return StageStatus(name, "missing", str(error), planned.key, None, None)
     reasons = (
-        [OTHER_CODE] if other_code else why_remade(plan, name, _last(plan, name, made))
+        [OTHER_CODE]
+        if other_code
+        else stale_reasons(plan, name, _last_manifest(plan, name, made))
     )
     state: State = "stale" if reasons else "missing"
     reasons = reasons or ["not made yet"]
@@ -85,10 +87,10 @@ def _standing(
         reasons = [f"process {about.get('pid')} on {about.get('host')}"]
     if done and not other_code:
         reasons = [*reasons, f"{done} of {total} units made"]
-    return Standing(name, state, "; ".join(reasons), planned.key, total, done)
+    return StageStatus(name, state, "; ".join(reasons), planned.key, total, done)
 
 
-def has_other_code(plan: Plan, name: str) -> bool:
+def code_differs(plan: Plan, name: str) -> bool:
     """Whether a stage was made as asked, but by code that has changed since."""
     folder = plan.root.folder(name, plan[name].key)
     if not (folder / MANIFEST).is_file():
@@ -105,9 +107,9 @@ def last_attempt(plan: Plan, name: str) -> Mapping[str, Any]:
     return attempt if attempt.get("key") == plan[name].key else {}
 
 
-def count_units(plan: Plan, planned: Planned) -> tuple[int | None, int | None]:
+def count_units(plan: Plan, planned: PlannedStage) -> tuple[int | None, int | None]:
     """Count units, and those made; None where inputs must be made before this is known."""
-    if not are_made(plan, planned):
+    if not inputs_finished(plan, planned):
         return None, None
     units = planned.stage.plan(FinishedInputs(plan.root, planned), planned.settings)
     folders = [plan.root.unit(planned.name, planned.unit_key(unit)) for unit in units]
@@ -120,16 +122,18 @@ def _failures(failed: Mapping[str, str]) -> list[str]:
     return [f"{name}: {error}{more}"]
 
 
-def _last(plan: Plan, name: str, made: Mapping[str, str]) -> Mapping[str, Any] | None:
+def _last_manifest(
+    plan: Plan, name: str, made: Mapping[str, str]
+) -> Mapping[str, Any] | None:
     """Manifest of the stage as it was made last: under this profile, or else at all."""
     root = plan.root
-    if name in made and root.is_made(name, made[name]):
+    if name in made and root.is_finished(name, made[name]):
         return read_manifest(root.folder(name, made[name]))
-    folder = root.pointed(name)
+    folder = root.latest_folder(name)
     return read_manifest(folder) if folder is not None else None
 
 
-def why_remade(plan: Plan, name: str, old: Mapping[str, Any] | None) -> list[str]:
+def stale_reasons(plan: Plan, name: str, old: Mapping[str, Any] | None) -> list[str]:
     """Tell why a stage's key is not that of an old manifest; nothing if there is none."""
     if old is None:
         return []
@@ -154,9 +158,9 @@ def why_remade(plan: Plan, name: str, old: Mapping[str, Any] | None) -> list[str
 def _input_reasons(plan: Plan, dep: str, was: str | None) -> list[str]:
     if was is None:
         return [f"new input {dep}"]
-    if not plan.root.is_made(dep, was):
+    if not plan.root.is_finished(dep, was):
         return [f"input {dep}: differs from what it was"]
-    reasons = why_remade(plan, dep, read_manifest(plan.root.folder(dep, was)))
+    reasons = stale_reasons(plan, dep, read_manifest(plan.root.folder(dep, was)))
     return [
         reason if reason.startswith("input ") else f"input {dep}: {reason}"
         for reason in reasons

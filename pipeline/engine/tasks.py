@@ -7,7 +7,7 @@ from typing import Any
 from pipeline.engine.code_hash import code_hash
 from pipeline.engine.layout import Root
 from pipeline.engine.manifest import package_versions, read_manifest
-from pipeline.engine.plan import PlanError, Planned, placeless
+from pipeline.engine.plan import PlanError, PlannedStage, without_locations
 from pipeline.engine.stage import Unit
 from pipeline.engine.units import Task
 
@@ -15,7 +15,7 @@ UNIT_SCHEMA = "infgen.unit/1"
 STAGE_SCHEMA = "infgen.stage/1"
 
 
-def cut_tasks(root: Root, planned: Planned, units: Sequence[Unit]) -> list[Task]:
+def make_tasks(root: Root, planned: PlannedStage, units: Sequence[Unit]) -> list[Task]:
     """Name the folder of every unit, and write down how it comes about.
 
     Raises:
@@ -28,7 +28,7 @@ def cut_tasks(root: Root, planned: Planned, units: Sequence[Unit]) -> list[Task]
     return [_task(root, planned, unit, common) for unit in units]
 
 
-def _task(root: Root, planned: Planned, unit: Unit, common: dict[str, Any]) -> Task:
+def _task(root: Root, planned: PlannedStage, unit: Unit, common: dict[str, Any]) -> Task:
     key = planned.unit_key(unit)
     about = {
         "schema": UNIT_SCHEMA,
@@ -36,13 +36,13 @@ def _task(root: Root, planned: Planned, unit: Unit, common: dict[str, Any]) -> T
         "name": unit.name,
         "key": key,
         "inputs": dict(unit.inputs),
-        "task": placeless(unit.task),
+        "task": without_locations(unit.task),
     }
     target = root.unit(planned.name, key)
     return Task(planned.module, unit, target, planned.settings, about)
 
 
-def about_stage(planned: Planned, tasks: Sequence[Task]) -> dict[str, Any]:
+def stage_manifest(planned: PlannedStage, tasks: Sequence[Task]) -> dict[str, Any]:
     """Say how a stage comes about, once all its units are made: by name, with reports."""
     ordered = sorted(tasks, key=lambda task: task.unit.name)
     return {
@@ -51,11 +51,11 @@ def about_stage(planned: Planned, tasks: Sequence[Task]) -> dict[str, Any]:
         "key": planned.key,
         "inputs": dict(planned.inputs),
         "sources": {source.name: source.fingerprint for source in planned.sources},
-        "units": [_made_unit(task) for task in ordered],
+        "units": [_unit_entry(task) for task in ordered],
     }
 
 
-def _common(planned: Planned) -> dict[str, Any]:
+def _common(planned: PlannedStage) -> dict[str, Any]:
     """What the manifests of a stage and of its units have in common."""
     stage = planned.stage
     return {
@@ -67,6 +67,6 @@ def _common(planned: Planned) -> dict[str, Any]:
     }
 
 
-def _made_unit(task: Task) -> dict[str, Any]:
+def _unit_entry(task: Task) -> dict[str, Any]:
     report = read_manifest(task.target)["report"]
     return {"name": task.unit.name, "key": task.about["key"], "report": report}

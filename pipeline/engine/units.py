@@ -11,7 +11,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from pipeline.engine import signals
 from pipeline.engine.atomic import MANIFEST, publish
-from pipeline.engine.manifest import Run, read_manifest, seal, split_report
+from pipeline.engine.manifest import Run, read_manifest, split_report, write_manifest
 from pipeline.engine.registry import load_stage
 from pipeline.engine.stage import Progress, Report, Unit
 
@@ -72,11 +72,11 @@ class Executor(Protocol):
     def run(
         self,
         tasks: Sequence[Task],
-        go_on: Callable[[], bool],
+        may_start: Callable[[], bool],
         progress: Progress,
         tell: Tell,
     ) -> Iterator[Outcome]:
-        """Do all tasks; begin no more once ``go_on()`` is False."""
+        """Do all tasks; begin no more once ``may_start()`` is False."""
 
 
 class InProcess:
@@ -85,13 +85,13 @@ class InProcess:
     def run(
         self,
         tasks: Sequence[Task],
-        go_on: Callable[[], bool],
+        may_start: Callable[[], bool],
         progress: Progress,
         tell: Tell,
     ) -> Iterator[Outcome]:
-        """Do all tasks; begin no more once ``go_on()`` is False."""
+        """Do all tasks; begin no more once ``may_start()`` is False."""
         for task in tasks:
-            if not go_on():
+            if not may_start():
                 return
             yield attempt(task, progress)
 
@@ -156,11 +156,13 @@ def do(task: Task, progress: Progress) -> Outcome:
         return Outcome(task.unit.name, read_manifest(task.target)["report"], 0.0)
     stage = load_stage(task.module)
     started, begun = datetime.now(UTC).isoformat(timespec="seconds"), time.monotonic()
-    patience = signals.patient() if stage.resumes else nullcontext()
+    patience = signals.deferred() if stage.resumes else nullcontext()
     # A stop that finds the work done waits until it has its name: it would be lost.
     with patience, publish(task.target, resume=stage.resumes) as partial:
         report = stage.work(task.unit, partial, task.settings, progress)
         same, varying = split_report(report)
         seconds = time.monotonic() - begun
-        seal(partial, {**task.about, "report": same}, Run(started, seconds, varying))
+        write_manifest(
+            partial, {**task.about, "report": same}, Run(started, seconds, varying)
+        )
     return Outcome(task.unit.name, same, time.monotonic() - begun)

@@ -11,7 +11,7 @@ from typing import Any
 
 from infgen.config import ConfigError
 from pipeline.engine.registry import load_stage
-from pipeline.settings.lined_yaml import hint
+from pipeline.settings.lined_yaml import did_you_mean
 from pipeline.settings.stages_file import StagesFile
 
 _ATTRIBUTE = re.compile(r"^    (\w+(?:,\s+\w+)*): ((?:.|\n     )*)", re.MULTILINE)
@@ -74,18 +74,22 @@ def find_sections(file: StagesFile, named: str | None) -> list[Section]:
     name, _, setting = named.partition(".")
     by_name = {section.name: section for section in found}
     if name not in by_name:
-        raise ConfigError(f"no section {name!r} of settings{hint(name, list(by_name))}")
+        raise ConfigError(
+            f"no section {name!r} of settings{did_you_mean(name, list(by_name))}"
+        )
     if not setting:
         return [by_name[name]]
     wanted = [each for each in by_name[name].settings if each.name == named]
     if not wanted:
-        there = hint(setting, [each.name.split(".")[1] for each in by_name[name].settings])
+        there = did_you_mean(
+            setting, [each.name.split(".")[1] for each in by_name[name].settings]
+        )
         raise ConfigError(f"{name}: no setting {setting!r}{there}")
     return [Section(name, by_name[name].about, tuple(wanted))]
 
 
 def _section(name: str, kind: Any) -> Section:
-    about, meanings = documented(kind)
+    about, meanings = docstring_parts(kind)
     settings = [
         Setting(f"{name}.{field.name}", _default(field), meanings.get(field.name, ""))
         for field in fields(kind)
@@ -99,7 +103,7 @@ def _default(field: "Field[Any]") -> Any:
     return "" if field.default is MISSING else field.default
 
 
-def documented(kind: type) -> tuple[str, Mapping[str, str]]:
+def docstring_parts(kind: type) -> tuple[str, Mapping[str, str]]:
     """What a dataclass's docstring says of it, and of each of its attributes."""
     about, _, listed = inspect.cleandoc(kind.__doc__ or "").partition("\nAttributes:\n")
     texts = {

@@ -13,7 +13,7 @@ MAPPING = yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG
 SEQUENCE = yaml.resolver.BaseResolver.DEFAULT_SEQUENCE_TAG
 
 
-class Lined(dict[str, Any]):
+class LinedMapping(dict[str, Any]):
     """A mapping as YAML gave it.
 
     Attributes:
@@ -31,7 +31,7 @@ class Lined(dict[str, Any]):
         return f"{self.file}:{self.lines[key]}"
 
 
-def load(path: Path) -> Lined:
+def load(path: Path) -> LinedMapping:
     """Read a YAML file whose outermost value is a mapping.
 
     Raises:
@@ -51,13 +51,13 @@ def load(path: Path) -> Lined:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: {' '.join(str(error).split())}") from error
-    loaded = _plain(node, path.name) if node is not None else Lined(path.name)
-    if not isinstance(loaded, Lined):
+    loaded = _plain(node, path.name) if node is not None else LinedMapping(path.name)
+    if not isinstance(loaded, LinedMapping):
         raise ConfigError(f"{path}: expected a mapping, got {type(loaded).__name__}")
     return loaded
 
 
-def inner(mapping: Lined, key: str) -> Lined:
+def inner(mapping: LinedMapping, key: str) -> LinedMapping:
     """Return the mapping under a key; an empty one if nothing stands there.
 
     Raises:
@@ -65,13 +65,13 @@ def inner(mapping: Lined, key: str) -> Lined:
     """
     found = mapping.get(key)
     if found is None:
-        return Lined(mapping.file)
-    if not isinstance(found, Lined):
+        return LinedMapping(mapping.file)
+    if not isinstance(found, LinedMapping):
         raise ConfigError(f"{mapping.where(key)}: {key} is {found!r}; expected a mapping")
     return found
 
 
-def words(mapping: Lined, key: str) -> tuple[str, ...]:
+def words(mapping: LinedMapping, key: str) -> tuple[str, ...]:
     """Return the list of words under a key; none if nothing stands there.
 
     Raises:
@@ -83,7 +83,7 @@ def words(mapping: Lined, key: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def known(mapping: Lined, names: Sequence[str], what: str) -> None:
+def known(mapping: LinedMapping, names: Sequence[str], what: str) -> None:
     """Refuse keys that are not among some names.
 
     Raises:
@@ -92,11 +92,11 @@ def known(mapping: Lined, names: Sequence[str], what: str) -> None:
     for key in mapping:
         if key not in names:
             raise ConfigError(
-                f"{mapping.where(key)}: {what}: no entry {key!r}{hint(key, names)}"
+                f"{mapping.where(key)}: {what}: no entry {key!r}{did_you_mean(key, names)}"
             )
 
 
-def hint(name: str, names: Sequence[str]) -> str:
+def did_you_mean(name: str, names: Sequence[str]) -> str:
     """Say which of some names may have been meant, to be put behind a message."""
     near = get_close_matches(name, names, n=1)
     if near:
@@ -116,8 +116,8 @@ def _plain(node: yaml.Node, file: str) -> Any:
         raise ConfigError(f"{file}:{_line(node)}: {said}") from error
 
 
-def _mapping(node: yaml.MappingNode, file: str) -> Lined:
-    found = Lined(file)
+def _mapping(node: yaml.MappingNode, file: str) -> LinedMapping:
+    found = LinedMapping(file)
     for key_node, value_node in node.value:
         key = str(key_node.value)
         if key in found:

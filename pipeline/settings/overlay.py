@@ -11,12 +11,12 @@ from typing import Any
 from infgen.config import ConfigError, settle
 from pipeline.engine.layout import Root
 from pipeline.engine.stage import Source
-from pipeline.settings.lined_yaml import Lined, hint, inner, known
+from pipeline.settings.lined_yaml import LinedMapping, did_you_mean, inner, known
 from pipeline.storage.source_files import find_sources
 
 
 @dataclass(frozen=True, slots=True)
-class Value:
+class SettingValue:
     """One value, and the place that gave it."""
 
     value: Any
@@ -28,7 +28,7 @@ class Overlay:
     """Settings by section, and source files; empty where nothing is said."""
 
     sources: tuple[str, ...]
-    values: Mapping[str, Mapping[str, Value]]
+    values: Mapping[str, Mapping[str, SettingValue]]
 
     def with_sources(self, sources: tuple[str, ...]) -> "Overlay":
         """Replace the source files."""
@@ -66,10 +66,10 @@ class Overlay:
         )
 
 
-def lay(layers: Iterable[Overlay]) -> Overlay:
+def merge_overlays(layers: Iterable[Overlay]) -> Overlay:
     """Lay overlays over each other, the last on top."""
     sources: tuple[str, ...] = ()
-    values: dict[str, dict[str, Value]] = {}
+    values: dict[str, dict[str, SettingValue]] = {}
     for layer in layers:
         sources = layer.sources or sources
         for section, given in layer.values.items():
@@ -77,7 +77,7 @@ def lay(layers: Iterable[Overlay]) -> Overlay:
     return Overlay(sources, values)
 
 
-def read_values(params: Lined, sections: Sequence[str]) -> Overlay:
+def read_sections(params: LinedMapping, sections: Sequence[str]) -> Overlay:
     """Read settings by section from YAML; only their sections are checked.
 
     Raises:
@@ -86,7 +86,7 @@ def read_values(params: Lined, sections: Sequence[str]) -> Overlay:
     known(params, sections, "params")
     values = {
         section: {
-            key: Value(value, f"{inner(params, section).where(key)}: {section}")
+            key: SettingValue(value, f"{inner(params, section).where(key)}: {section}")
             for key, value in inner(params, section).items()
         }
         for section in params
@@ -94,21 +94,23 @@ def read_values(params: Lined, sections: Sequence[str]) -> Overlay:
     return Overlay((), values)
 
 
-def read_words(words: Sequence[str], sections: Sequence[str]) -> Overlay:
+def read_overrides(words: Sequence[str], sections: Sequence[str]) -> Overlay:
     """Read settings from ``section.key=value`` words of the command line.
 
     Raises:
         ConfigError: naming the word.
     """
-    values: dict[str, dict[str, Value]] = {}
+    values: dict[str, dict[str, SettingValue]] = {}
     for word in words:
         match = re.fullmatch(r"([\w-]+)\.(\w+)=(.*)", word, re.DOTALL)
         if match is None:
             raise ConfigError(f"-s {word}: expected section.key=value, as train.steps=100")
         section, key, value = match.groups()
         if section not in sections:
-            raise ConfigError(f"-s {word}: no section {section!r}{hint(section, sections)}")
-        values.setdefault(section, {})[key] = Value(value, f"-s {section}")
+            raise ConfigError(
+                f"-s {word}: no section {section!r}{did_you_mean(section, sections)}"
+            )
+        values.setdefault(section, {})[key] = SettingValue(value, f"-s {section}")
     return Overlay((), values)
 
 

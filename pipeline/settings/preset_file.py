@@ -7,19 +7,19 @@ from dataclasses import dataclass
 from infgen.coerce import build
 from infgen.config import ConfigError
 from infgen.views.published import ABLATIONS, PAPER
-from pipeline.settings.lined_yaml import Lined, hint, inner, known, words
-from pipeline.settings.overlay import Overlay, lay, read_values
+from pipeline.settings.lined_yaml import LinedMapping, did_you_mean, inner, known, words
+from pipeline.settings.overlay import Overlay, merge_overlays, read_sections
 from pipeline.settings.presets import Arm, Preset, TownSet
 
 COUNT_ERRORS = ("own", "split", "truth")
 """See ``infgen.metrics.long_term.table``: own log, mean of the split, same step."""
-_PRESET = ("profile", "seeds", "count_error", "towns", "plays", "arms")
-_ARM = ("profile", "published", "label", "start", "ablates", "plays")
+_PRESET = ("profile", "seeds", "count_error", "towns", "rollout_sets", "arms")
+_ARM = ("profile", "published", "label", "start", "ablates", "rollout_sets")
 _METHODS = tuple(each.method for each in PAPER)
 
 
 def read_preset(
-    presets: Lined, name: str, sections: Sequence[str], profiles: Sequence[str]
+    presets: LinedMapping, name: str, sections: Sequence[str], profiles: Sequence[str]
 ) -> Preset:
     """Read one preset.
 
@@ -35,15 +35,17 @@ def read_preset(
     entry = inner(presets, name)
     _check_name(presets, name, "preset")
     known(entry, (*_PRESET, *sections), name)
-    below = _settings(entry, sections)
-    plays = {
-        play: _only_settings(inner(entry, "plays"), play, sections)
-        for play in inner(entry, "plays")
+    context = _settings(entry, sections)
+    rollout_sets = {
+        play: _only_settings(inner(entry, "rollout_sets"), play, sections)
+        for play in inner(entry, "rollout_sets")
     }
-    for play in plays:
-        _check_name(inner(entry, "plays"), play, "play")
+    for play in rollout_sets:
+        _check_name(inner(entry, "rollout_sets"), play, "play")
     arms = {
-        arm: _arm(inner(entry, "arms"), arm, _Below(below, plays, sections, profiles))
+        arm: _arm(
+            inner(entry, "arms"), arm, _Context(context, rollout_sets, sections, profiles)
+        )
         for arm in inner(entry, "arms")
     }
     if not arms:
@@ -63,29 +65,30 @@ def read_preset(
 
 
 @dataclass(frozen=True, slots=True)
-class _Below:
-    """What arms may name: plays, sections and profiles; and what they are laid over."""
+class _Context:
+    """What arms may name, and the settings that they are laid over."""
 
     settings: Overlay
-    plays: Mapping[str, Overlay]
+    rollout_sets: Mapping[str, Overlay]
     sections: Sequence[str]
     profiles: Sequence[str]
 
 
-def _arm(arms: Lined, name: str, below: _Below) -> Arm:
+def _arm(arms: LinedMapping, name: str, context: _Context) -> Arm:
     entry = inner(arms, name)
     _check_name(arms, name, "arm")
-    known(entry, (*_ARM, *below.sections), name)
+    known(entry, (*_ARM, *context.sections), name)
     published = _word(entry, "published", (*_METHODS, *ABLATIONS))
-    settings = lay([below.settings, _settings(entry, below.sections)])
-    own = _own_plays(entry, tuple(below.plays), below.sections)
+    settings = merge_overlays([context.settings, _settings(entry, context.sections)])
+    own = _own_rollout_sets(entry, tuple(context.rollout_sets), context.sections)
     return Arm(
         name=name,
         label=_word(entry, "label", ()) or published or name,
-        profile=_profile(entry, below.profiles),
+        profile=_profile(entry, context.profiles),
         settings=settings,
-        plays={
-            play: lay([settings, below.plays[play], over]) for play, over in own.items()
+        rollout_sets={
+            play: merge_overlays([settings, context.rollout_sets[play], over])
+            for play, over in own.items()
         },
         start=_word(entry, "start", tuple(arms)),
         ablates=_word(entry, "ablates", tuple(arms)),
@@ -94,34 +97,36 @@ def _arm(arms: Lined, name: str, below: _Below) -> Arm:
     )
 
 
-def _own_plays(
-    entry: Lined, plays: Sequence[str], sections: Sequence[str]
+def _own_rollout_sets(
+    entry: LinedMapping, rollout_sets: Sequence[str], sections: Sequence[str]
 ) -> dict[str, Overlay]:
-    """Read which plays an arm has: a list of names, or settings by name."""
-    given = entry.get("plays")
-    if isinstance(given, Lined):
-        known(given, plays, "plays")
+    """Read which rollout_sets an arm has: a list of names, or settings by name."""
+    given = entry.get("rollout_sets")
+    if isinstance(given, LinedMapping):
+        known(given, rollout_sets, "rollout_sets")
         return {play: _only_settings(given, play, sections) for play in given}
-    for play in words(entry, "plays"):
-        if play not in plays:
-            where = entry.where("plays")
-            raise ConfigError(f"{where}: no play {play!r}{hint(play, plays)}")
-    return {play: Overlay((), {}) for play in words(entry, "plays")}
+    for play in words(entry, "rollout_sets"):
+        if play not in rollout_sets:
+            where = entry.where("rollout_sets")
+            raise ConfigError(
+                f"{where}: no play {play!r}{did_you_mean(play, rollout_sets)}"
+            )
+    return {play: Overlay((), {}) for play in words(entry, "rollout_sets")}
 
 
-def _only_settings(mapping: Lined, key: str, sections: Sequence[str]) -> Overlay:
+def _only_settings(mapping: LinedMapping, key: str, sections: Sequence[str]) -> Overlay:
     entry = inner(mapping, key)
     known(entry, sections, key)
     return _settings(entry, sections)
 
 
-def _settings(entry: Lined, sections: Sequence[str]) -> Overlay:
+def _settings(entry: LinedMapping, sections: Sequence[str]) -> Overlay:
     """Read the settings in an entry that holds other things too."""
-    own = Lined(entry.file)
+    own = LinedMapping(entry.file)
     for key in entry:
         if key in sections:
             own[key], own.lines[key] = entry[key], entry.lines[key]
-    overlay = read_values(own, sections)
+    overlay = read_sections(own, sections)
     for section in overlay.values.values():
         for key, given in section.items():
             if not isinstance(given.value, str | int | float):
@@ -132,24 +137,24 @@ def _settings(entry: Lined, sections: Sequence[str]) -> Overlay:
     return overlay
 
 
-def _profile(entry: Lined, profiles: Sequence[str]) -> tuple[str, ...]:
+def _profile(entry: LinedMapping, profiles: Sequence[str]) -> tuple[str, ...]:
     given = entry.get("profile", "")
     names = [part.strip() for part in str(given).split(",")] if given else []
     for name in names:
         if name not in profiles:
             where = entry.where("profile")
-            raise ConfigError(f"{where}: no profile {name!r}{hint(name, profiles)}")
+            raise ConfigError(f"{where}: no profile {name!r}{did_you_mean(name, profiles)}")
     return tuple(names)
 
 
-def _seeds(entry: Lined) -> int:
+def _seeds(entry: LinedMapping) -> int:
     seeds = entry.get("seeds", 1)
     if not isinstance(seeds, int) or isinstance(seeds, bool) or seeds < 1:
         raise ConfigError(f"{entry.where('seeds')}: seeds is {seeds!r}; expected 1 or more")
     return seeds
 
 
-def _word(entry: Lined, key: str, there: Sequence[str]) -> str | None:
+def _word(entry: LinedMapping, key: str, there: Sequence[str]) -> str | None:
     """Read a word; one of some, if there are any."""
     given = entry.get(key)
     if given is None:
@@ -157,11 +162,13 @@ def _word(entry: Lined, key: str, there: Sequence[str]) -> str | None:
     if not isinstance(given, str):
         raise ConfigError(f"{entry.where(key)}: {key} is {given!r}; expected a word")
     if there and given not in there:
-        raise ConfigError(f"{entry.where(key)}: no {key} {given!r}{hint(given, there)}")
+        raise ConfigError(
+            f"{entry.where(key)}: no {key} {given!r}{did_you_mean(given, there)}"
+        )
     return given
 
 
-def _check_name(mapping: Lined, name: str, what: str) -> None:
+def _check_name(mapping: LinedMapping, name: str, what: str) -> None:
     """Names become parts of file names."""
     if not re.fullmatch(r"[\w-]+", name):
         raise ConfigError(
@@ -169,7 +176,7 @@ def _check_name(mapping: Lined, name: str, what: str) -> None:
         )
 
 
-def _places(towns: Lined) -> list[tuple[str, str]]:
+def _places(towns: LinedMapping) -> list[tuple[str, str]]:
     for split in towns:
         for key in ("scenes", "seconds"):
             if key not in inner(towns, split):

@@ -9,16 +9,16 @@
         count_error: truth              # what the agent count error is measured against
         towns:                          # what is read where no records are named
           training: {scenes: 2000, seconds: 9.1}
-        plays:                          # what is done with every arm's weights
+        rollout_sets:                          # what is done with every arm's weights
           long: {rollout: {mode: long}}
           wosac: {rollout: {mode: wosac, count: 32}}
         arms:
-          infgen: {published: InfGen, plays: [long, wosac]}
+          infgen: {published: InfGen, rollout_sets: [long, wosac]}
           smart:
             profile: smart              # over the preset's profile
-            plays: {long: {score: {presence_radius_m: 75}}, wosac: {}}
-          catk: {profile: "smart,closed-loop", start: smart, plays: [long]}
-          no-cell: {profile: no-position-token, ablates: infgen, plays: [long]}
+            rollout_sets: {long: {score: {presence_radius_m: 75}}, wosac: {}}
+          catk: {profile: "smart,closed-loop", start: smart, rollout_sets: [long]}
+          no-cell: {profile: no-position-token, ablates: infgen, rollout_sets: [long]}
 
 Sections of settings may stand in the preset itself, in an arm, in a play, and in a play of
 an arm; each is laid over those before it, and all of them over the profiles.
@@ -28,7 +28,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from infgen.config import ConfigError
-from pipeline.settings.lined_yaml import hint
+from pipeline.settings.lined_yaml import did_you_mean
 from pipeline.settings.overlay import Overlay
 
 
@@ -58,7 +58,8 @@ class Arm:
         label: In tables.
         profile: Profiles that are laid over those of the preset.
         settings: Laid over all profiles, those of the preset among them.
-        plays: The same of each of its plays, with what the play sets, by the play's name.
+        rollout_sets: The same of each of its rollout_sets, with what the play sets, by the
+            play's name.
         start: Arm whose weights it goes on from.
         ablates: Arm of which it leaves something out; it then stands in the table of
             ablations.
@@ -70,7 +71,7 @@ class Arm:
     label: str
     profile: tuple[str, ...]
     settings: Overlay
-    plays: Mapping[str, Overlay]
+    rollout_sets: Mapping[str, Overlay]
     start: str | None
     ablates: str | None
     published: str | None
@@ -105,11 +106,11 @@ class Preset:
         """
         for name in names:
             if name not in self.arms:
-                there = hint(name, list(self.arms))
+                there = did_you_mean(name, list(self.arms))
                 raise ConfigError(f"--arms {name}: no arm {name!r} in {self.name}{there}")
         return [arm for name, arm in self.arms.items() if not names or name in names]
 
-    def starts_of(self, arms: Sequence[Arm]) -> list[Arm]:
+    def initial_arms(self, arms: Sequence[Arm]) -> list[Arm]:
         """Arms that others go on from but that are not among them, each after its own."""
         have = {arm.name for arm in arms}
         needed: set[str] = set()

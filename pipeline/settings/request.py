@@ -15,9 +15,9 @@ from infgen.config import ConfigError
 from pipeline.engine.atomic import StoreError, write_file, write_json
 from pipeline.engine.layout import Root, link, read_json
 from pipeline.engine.plan import Plan, PlanError, make_plan
-from pipeline.settings.lined_yaml import Lined, inner, load
+from pipeline.settings.lined_yaml import LinedMapping, inner, load
 from pipeline.settings.stages_file import DEFAULT_FILE, StagesFile, load_stages
-from pipeline.storage.initial_weights import START
+from pipeline.storage.initial_weights import INITIAL_WEIGHTS
 from pipeline.storage.source_files import absolute
 
 NO_PROFILE = "default"
@@ -64,7 +64,7 @@ class Request:
 
     def made(self) -> Mapping[str, str]:
         """Keys of the stages that the last run under this profile was to make."""
-        return recall(self.root, self._name).get("keys", {})
+        return read_request(self.root, self._name).get("keys", {})
 
     def remember(self, plan: Plan, name: str | None = None) -> None:
         """Make this the root's last request.
@@ -74,7 +74,7 @@ class Request:
             name: To remember it by; the profile if None.
         """
         name = name or self._name
-        before = recall(self.root, name).get("keys", {})
+        before = read_request(self.root, name).get("keys", {})
         about = {
             "profile": self.profile,
             "records": self.records,
@@ -82,7 +82,7 @@ class Request:
             "file": None if self.file == DEFAULT_FILE else str(self.file),
             "keys": {**before, **{stage: plan[stage].key for stage in plan.stages}},
         }
-        path = ref(self.root, name)
+        path = request_file(self.root, name)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, about)
         link(self.root.refs / LAST, path)
@@ -94,8 +94,8 @@ class Request:
         Others may look on while it is made, and a run that is killed goes on with it. Words
         that are refused only then, by a stage, must not come back with the next command.
         """
-        last, path = self.root.refs / LAST, ref(self.root, name or self._name)
-        pointed = last.resolve() if last.exists() else None
+        last, path = self.root.refs / LAST, request_file(self.root, name or self._name)
+        latest_folder = last.resolve() if last.exists() else None
         before = path.read_bytes() if path.is_file() else None
         self.remember(plan, name)
         ours = path.read_bytes()
@@ -103,7 +103,7 @@ class Request:
             yield
         except (ConfigError, PlanError):
             if path.is_file() and path.read_bytes() == ours:  # Nobody asked since.
-                _put_back(last, pointed, path, before)
+                _restore(last, latest_folder, path, before)
             raise
 
     @property
@@ -111,7 +111,7 @@ class Request:
         return self.profile or NO_PROFILE
 
 
-def complete(
+def complete_request(
     root: Root,
     *,
     file: Path | None,
@@ -121,9 +121,9 @@ def complete(
     environ: Mapping[str, str],
 ) -> Request:
     """Fill in from the root's memory what a command does not name."""
-    last = recall(root, LAST)
+    last = read_request(root, LAST)
     fresh = profile is not None or bool(records)
-    before = last if profile is None else recall(root, profile)
+    before = last if profile is None else read_request(root, profile)
     profile = profile or last.get("profile")
     request = Request(
         root=root,
@@ -163,26 +163,28 @@ def find_file(named: Path | None, before: Mapping[str, Any]) -> Path:
     return Path(remembered) if remembered else DEFAULT_FILE
 
 
-def _put_back(last: Path, pointed: Path | None, path: Path, before: bytes | None) -> None:
+def _restore(
+    last: Path, latest_folder: Path | None, path: Path, before: bytes | None
+) -> None:
     """Remember by a name, and as the last request, what was remembered before."""
     if last.resolve() == path.resolve():
         last.unlink()
-        if pointed is not None:
-            link(last, pointed)
+        if latest_folder is not None:
+            link(last, latest_folder)
     if before is None:
         path.unlink()
     else:
         write_file(path, before)
 
 
-def ref(root: Root, name: str) -> Path:
+def request_file(root: Root, name: str) -> Path:
     """File in which a root remembers a request by a name."""
     return root.refs / f"{name}.json"
 
 
-def recall(root: Root, name: str) -> dict[str, Any]:
+def read_request(root: Root, name: str) -> dict[str, Any]:
     """Return what a root remembers by a name; nothing if that is damaged."""
-    path = root.refs / LAST if name == LAST else ref(root, name)
+    path = root.refs / LAST if name == LAST else request_file(root, name)
     try:
         about = read_json(path)
     except StoreError:
@@ -196,10 +198,10 @@ def named_weights(root: Root) -> set[str]:
     found = set()
     for word in (word for request in requests for word in request.get("overrides", ())):
         setting, _, value = word.partition("=")
-        if setting.endswith(f".{START}"):
+        if setting.endswith(f".{INITIAL_WEIGHTS}"):
             found.add(value)
     for path in {Path(request.get("file") or DEFAULT_FILE) for request in requests}:
-        file = load(path) if path.is_file() else Lined(path.name)
+        file = load(path) if path.is_file() else LinedMapping(path.name)
         for part in ("params", "profiles"):
             found |= set(_named_in(inner(file, part)))
     return found - {""}
@@ -209,5 +211,5 @@ def _named_in(settings: Mapping[str, Any]) -> Iterator[str]:
     for name, value in settings.items():
         if isinstance(value, Mapping):
             yield from _named_in(value)
-        elif name == START:
+        elif name == INITIAL_WEIGHTS:
             yield str(value)

@@ -24,8 +24,15 @@ from pathlib import Path
 from infgen.config import ConfigError
 from pipeline.engine.plan import SOURCES, StageEntry
 from pipeline.engine.registry import MODULES
-from pipeline.settings.lined_yaml import Lined, hint, inner, known, load, words
-from pipeline.settings.overlay import Overlay, lay, read_values, read_words
+from pipeline.settings.lined_yaml import (
+    LinedMapping,
+    did_you_mean,
+    inner,
+    known,
+    load,
+    words,
+)
+from pipeline.settings.overlay import Overlay, merge_overlays, read_overrides, read_sections
 from pipeline.settings.preset_file import read_preset
 from pipeline.settings.presets import Preset
 
@@ -59,8 +66,8 @@ class StagesFile:
         Raises:
             ConfigError: for a profile or section that does not exist.
         """
-        over = read_words(overrides, self.sections)
-        return lay([self.base, *self.laid(profile), *between, over])
+        over = read_overrides(overrides, self.sections)
+        return merge_overlays([self.base, *self.profile_overlays(profile), *between, over])
 
     def preset(self, name: str) -> Preset:
         """Find a preset.
@@ -69,15 +76,15 @@ class StagesFile:
             ConfigError: if there is none of that name.
         """
         if name not in self.presets:
-            there = hint(name, list(self.presets))
+            there = did_you_mean(name, list(self.presets))
             raise ConfigError(f"--preset {name}: no preset {name!r}{there}")
         return self.presets[name]
 
     def names_sources(self, profile: str | None) -> bool:
         """Whether one of the profiles says itself which source files it reads."""
-        return any(overlay.sources for overlay in self.laid(profile))
+        return any(overlay.sources for overlay in self.profile_overlays(profile))
 
-    def laid(self, profile: str | None) -> list[Overlay]:
+    def profile_overlays(self, profile: str | None) -> list[Overlay]:
         """Find profiles by their names with commas between."""
         names = [] if profile is None else profile.split(",")
         return [
@@ -110,7 +117,7 @@ def load_stages(path: Path, environ: Mapping[str, str]) -> StagesFile:
     sections = [section for entry in stages.values() for section in entry.params]
     return StagesFile(
         stages=stages,
-        base=read_values(inner(file, "params"), sections).with_sources(
+        base=read_sections(inner(file, "params"), sections).with_sources(
             _sources(file, environ)
         ),
         profiles={
@@ -126,13 +133,13 @@ def load_stages(path: Path, environ: Mapping[str, str]) -> StagesFile:
     )
 
 
-def _stage(file: Lined, name: str) -> StageEntry:
+def _stage(file: LinedMapping, name: str) -> StageEntry:
     entry = inner(inner(file, "stages"), name)
     where = inner(file, "stages").where(name)
     known(entry, ("deps", "params", "module"), name)
     module = entry.get("module", MODULES.get(name))
     if not isinstance(module, str):
-        near = hint(name, list(MODULES))
+        near = did_you_mean(name, list(MODULES))
         raise ConfigError(f"{where}: stage {name!r} needs a `module`{near}")
     return StageEntry(
         name=name,
@@ -143,15 +150,17 @@ def _stage(file: Lined, name: str) -> StageEntry:
     )
 
 
-def _profile(entry: Lined, sections: Sequence[str], environ: Mapping[str, str]) -> Overlay:
-    settings = Lined(entry.file)
+def _profile(
+    entry: LinedMapping, sections: Sequence[str], environ: Mapping[str, str]
+) -> Overlay:
+    settings = LinedMapping(entry.file)
     for key, value in entry.items():
         if key != SOURCES:
             settings[key], settings.lines[key] = value, entry.lines[key]
-    return read_values(settings, sections).with_sources(_sources(entry, environ))
+    return read_sections(settings, sections).with_sources(_sources(entry, environ))
 
 
-def _sources(entry: Lined, environ: Mapping[str, str]) -> tuple[str, ...]:
+def _sources(entry: LinedMapping, environ: Mapping[str, str]) -> tuple[str, ...]:
     given = entry.get(SOURCES)
     if given is None:
         return ()
@@ -176,5 +185,7 @@ def _expand(path: str, environ: Mapping[str, str], where: str) -> str:
 
 def _pick(found: Mapping[str, Overlay], name: str, what: str, where: str) -> Overlay:
     if name not in found:
-        raise ConfigError(f"{where} {name}: no {what} {name!r}{hint(name, list(found))}")
+        raise ConfigError(
+            f"{where} {name}: no {what} {name!r}{did_you_mean(name, list(found))}"
+        )
     return found[name]

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 from infgen.clock import CLOCK
 from infgen.config import CalibrateSettings, RolloutSettings, TokenSettings
-from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
+from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
 from pipeline.stages.calibration import Biases, read_biases, write_found
 from pipeline.stages.simulation import begin, load_player, play_all, read_some
-from pipeline.storage.splits import files_of, spread
+from pipeline.storage.splits import files_of_split, spread_evenly
 
 if TYPE_CHECKING:
     from infgen.metrics.flow import Turnover
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Settings = Mapping[str, Any]
 
 
-def narrow(settings: Settings) -> Settings:
+def normalize(settings: Settings) -> Settings:
     """Leave only what decides: rollouts that differ in the rest share a calibration."""
     how: CalibrateSettings = settings["calibrate"]
     played: RolloutSettings = settings["rollout"]
@@ -92,17 +92,19 @@ def _reach(weights: Path, how: CalibrateSettings) -> Any:
     return Reach(read_biases(weights), how.add_bias_range, how.remove_bias_range)
 
 
-def _parts(inputs: Inputs, how: CalibrateSettings) -> list[list[tuple[Done, list[int]]]]:
+def _parts(
+    inputs: Inputs, how: CalibrateSettings
+) -> list[list[tuple[FinishedUnit, list[int]]]]:
     """Cut the scenes into parts for one unit each: file, rows of its scenes.
 
     Raises:
         PlanError: if there is no scene of the split.
     """
-    files = files_of(
+    files = files_of_split(
         inputs.units("ingest"), how.split,
         to="play and calibrate by", setting="calibrate.split or calibrate.by",
     )  # fmt: skip
-    chosen = zip(files, spread(files, how.scenes), strict=True)
+    chosen = zip(files, spread_evenly(files, how.scenes), strict=True)
     scenes = [(done, row) for done, rows in chosen for row in rows]
     most = how.scenes_per_unit
     parts = [scenes[at : at + most] for at in range(0, len(scenes), most)]
@@ -161,7 +163,7 @@ def _scenes(unit: Unit) -> Iterator[Any]:
 
 def finish(
     inputs: Inputs,
-    units: Sequence[Done],
+    units: Sequence[FinishedUnit],
     target: Path,
     settings: Settings,
     progress: Progress,
@@ -178,7 +180,7 @@ def finish(
 
 
 def _find(
-    inputs: Inputs, units: Sequence[Done], target: Path, how: CalibrateSettings
+    inputs: Inputs, units: Sequence[FinishedUnit], target: Path, how: CalibrateSettings
 ) -> tuple[Biases, Report]:
     """Find the biases in what was played, and say how sure that is."""
     from pipeline.engine.atomic import write_json  # noqa: PLC0415
@@ -209,7 +211,7 @@ def _find(
     }
 
 
-def _sum(units: Sequence[Done], what: str, point: int) -> "Turnover":
+def _sum(units: Sequence[FinishedUnit], what: str, point: int) -> "Turnover":
     from infgen.metrics.flow import Turnover, add_up  # noqa: PLC0415
 
     return add_up(
@@ -241,7 +243,7 @@ STAGE = Stage(
     plan=plan,
     work=work,
     finish=finish,
-    narrow=narrow,
+    normalize=normalize,
     modules=(
         "pipeline.stages.calibrate",
         "pipeline.stages.calibration",

@@ -16,9 +16,9 @@ from infgen.config import IngestSettings
 from infgen.scene import Scene
 from infgen.sources.tfrecord import BadRecord, Record, iter_records
 from infgen.sources.womd import scene_or_fault
-from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
-from pipeline.storage.duplicates import mark_duplicates, tell_left_out
-from pipeline.storage.parquet import joined, table
+from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
+from pipeline.storage.duplicates import mark_duplicates, report_duplicates
+from pipeline.storage.parquet import make_table, read_tables
 from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.splits import split_of
 
@@ -70,7 +70,7 @@ def work(unit: Unit, target: Path, settings: IngestSettings, progress: Progress)
 
 def finish(
     inputs: Inputs,
-    units: Sequence[Done],
+    units: Sequence[FinishedUnit],
     target: Path,
     settings: IngestSettings,
     progress: Progress,
@@ -81,18 +81,18 @@ def finish(
     """
     target.mkdir(parents=True, exist_ok=True)
     paths = [unit.path for unit in units]
-    index = mark_duplicates(joined(paths, "index.parquet", _INDEX))
-    quarantine = joined(paths, "quarantine.parquet", _QUARANTINE)
+    index = mark_duplicates(read_tables(paths, "index.parquet", _INDEX))
+    quarantine = read_tables(paths, "quarantine.parquet", _QUARANTINE)
     duplicates = _duplicates(index)
     index.write_parquet(target / "index.parquet")
     quarantine.write_parquet(target / "quarantine.parquet")
     duplicates.write_parquet(target / "duplicates.parquet")
-    left_out = tell_left_out(index)
+    duplicate_rows = report_duplicates(index)
     return {
         "scenes": len(index),
         "quarantined": len(quarantine),
         "duplicates": int(index["duplicate"].sum()),
-        **({"units": left_out} if left_out else {}),
+        **({"units": duplicate_rows} if duplicate_rows else {}),
     }
 
 
@@ -125,8 +125,10 @@ class _Shard:
     def close(self) -> None:
         """Write what is left, and the tables."""
         self._flush()
-        table(self.index, _INDEX).write_parquet(self._target / "index.parquet")
-        table(self._bad, _QUARANTINE).write_parquet(self._target / "quarantine.parquet")
+        make_table(self.index, _INDEX).write_parquet(self._target / "index.parquet")
+        make_table(self._bad, _QUARANTINE).write_parquet(
+            self._target / "quarantine.parquet"
+        )
 
     def report(self) -> Report:
         """Sum up the unit."""
@@ -196,11 +198,11 @@ def _duplicates(index: "pl.DataFrame") -> "pl.DataFrame":
     several = index.filter(pl.col("scenario_id").is_duplicated()).select(_MARKED)
     first: dict[tuple[str, ...], tuple[str, int]] = {}
     rows = []
-    for name, split, left_out, source, record, offset in several.iter_rows():
+    for name, split, duplicate_rows, source, record, offset in several.iter_rows():
         place = (source, record)
         in_split = first.setdefault((name, split), place)
         earlier = first.setdefault((name,), place)
-        if left_out:
+        if duplicate_rows:
             earlier, fate = in_split, "left out"
         elif earlier != place:
             fate = "both count"
@@ -208,7 +210,9 @@ def _duplicates(index: "pl.DataFrame") -> "pl.DataFrame":
             continue
         reason = f"scenario {name} is in {earlier[0]} too: {fate}"
         rows.append((*place, offset, reason, name, *earlier))
-    return table([dict(zip(_DUPLICATES, row, strict=True)) for row in rows], _DUPLICATES)
+    return make_table(
+        [dict(zip(_DUPLICATES, row, strict=True)) for row in rows], _DUPLICATES
+    )
 
 
 STAGE = Stage(

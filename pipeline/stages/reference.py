@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infgen.config import ReferenceSettings, TokenSettings
-from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
-from pipeline.storage.duplicates import read_scenes_of, scenes_of
-from pipeline.storage.splits import files_of
+from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
+from pipeline.storage.duplicates import read_task_scenes, scenes_task
+from pipeline.storage.splits import files_of_split
 
 if TYPE_CHECKING:
     from infgen.metrics.long_term.binned import Binned
@@ -28,8 +28,8 @@ def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
         PlanError: if there is no scene of the split.
     """
     every, split = inputs.units("ingest"), settings["reference"].split
-    files = files_of(every, split, to="measure", setting="reference.split")
-    return [Unit(done.name, {"scenes": done.key}, scenes_of(done)) for done in files]
+    files = files_of_split(every, split, to="measure", setting="reference.split")
+    return [Unit(done.name, {"scenes": done.key}, scenes_task(done)) for done in files]
 
 
 def work(
@@ -44,7 +44,7 @@ def work(
     counts, logged = no_counts(), []
     group: list[Binned] = []
     skipped: dict[str, str] = {}
-    for scene in read_scenes_of(unit.task):
+    for scene in read_task_scenes(unit.task):
         measured = _measure(scene, settings["tokenize"], settings["reference"])
         if isinstance(measured, str):
             skipped[scene.scenario_id] = measured
@@ -90,7 +90,7 @@ def _measure(
 
 def finish(
     inputs: Inputs,
-    units: Sequence[Done],
+    units: Sequence[FinishedUnit],
     target: Path,
     settings: Mapping[str, Any],
     progress: Progress,

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infgen.config import RolloutSettings
-from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
+from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
 from pipeline.stages.calibration import Biases, read_found
 from pipeline.stages.simulation import begin, load_player, play_all, read_some
-from pipeline.storage.parquet import Fields, joined, table
+from pipeline.storage.parquet import Fields, make_table, read_tables
 from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
-from pipeline.storage.splits import files_of, spread
+from pipeline.storage.splits import files_of_split, spread_evenly
 
 if TYPE_CHECKING:
     from infgen.rollout.recording import Start
@@ -53,7 +53,7 @@ OF_ENTRIES = (
 OF_EXITS = ("remove_bias", "removal_radius_m")
 
 
-def narrow(sections: Mapping[str, Any]) -> Mapping[str, Any]:
+def normalize(sections: Mapping[str, Any]) -> Mapping[str, Any]:
     """Set what is about who enters, or leaves, to its default where nobody does."""
     settings: RolloutSettings = sections["rollout"]
     idle = (() if settings.inserts else OF_ENTRIES) + (() if settings.removes else OF_EXITS)
@@ -75,9 +75,9 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
         leave=found.leave if settings.removes else 0.0,
     )
     every = inputs.units("ingest")
-    shards = files_of(every, settings.split, to="play", setting="rollout.split")
+    shards = files_of_split(every, settings.split, to="play", setting="rollout.split")
     units = []
-    for done, rows in zip(shards, spread(shards, settings.scenes), strict=True):
+    for done, rows in zip(shards, spread_evenly(shards, settings.scenes), strict=True):
         for first, after in pairwise(_edges(len(rows), settings.scenes_per_unit)):
             units.append(
                 Unit(
@@ -120,7 +120,7 @@ def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
         path = target / f"rollouts-{group:03d}.zarr"
         write_records(path, rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True)
         rows += [_row(unit.name, group, at, done) for at, done in enumerate(rollouts)]
-    table(rows, INDEX).write_parquet(target / "index.parquet")
+    make_table(rows, INDEX).write_parquet(target / "index.parquet")
     pace = {"rollouts_per_s": round(_rate(len(rows), begun), 4)}
     told = {"add_bias": settings.add_bias, "remove_bias": settings.remove_bias}
     return {**_report(rows, refused), **told, "plays": player.plays, "run": pace}
@@ -132,13 +132,13 @@ def _rate(played: float | int, begun: float) -> float:
 
 def finish(
     inputs: Inputs,
-    units: Sequence[Done],
+    units: Sequence[FinishedUnit],
     target: Path,
     settings: RolloutSettings,
     progress: Progress,
 ) -> Report:
     """Write one index of all rollouts, and what they add up to."""
-    index = joined([done.path for done in units], "index.parquet", INDEX)
+    index = read_tables([done.path for done in units], "index.parquet", INDEX)
     index.write_parquet(target / "index.parquet")
     count = sum(done.report["rollouts"] for done in units)
     totals = {
@@ -201,7 +201,7 @@ STAGE = Stage(
     plan=plan,
     work=play,
     finish=finish,
-    narrow=narrow,
+    normalize=normalize,
     modules=(
         "pipeline.stages.calibration",
         "pipeline.stages.simulation",

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infgen.config import ConfigError, ReferenceSettings, ScoreSettings
-from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
+from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
 from pipeline.storage.splits import in_split, split_of
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
     return units
 
 
-def _check_split(rollouts: Sequence[Done], split: str) -> None:
+def _check_split(rollouts: Sequence[FinishedUnit], split: str) -> None:
     for done in rollouts:
         if not in_split(done.name, split):
             found = split_of(done.name)
@@ -191,7 +191,7 @@ def _scenes(folder: str, wanted: Sequence[str]) -> "Iterator[tuple[str, Scene]]"
 
 def finish(
     inputs: Inputs,
-    units: Sequence[Done],
+    units: Sequence[FinishedUnit],
     target: Path,
     settings: Mapping[str, Any],
     progress: Progress,

@@ -7,7 +7,7 @@ from typing import Any
 from infgen.metrics.long_term.reference import add_up, divergence
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import read_json
-from pipeline.engine.stage import Done, Inputs, Progress
+from pipeline.engine.stage import FinishedUnit, Inputs, Progress
 from pipeline.stages.reference_files import read_counts
 from pipeline.stages.score_summary import Gathered, Summary, Tally
 from pipeline.stages.score_write import ROWS, join_parts, read_tally, write_curves
@@ -17,7 +17,7 @@ WOSAC = "wosac.json"
 
 def gather(
     inputs: Inputs,
-    units: Sequence[Done],
+    units: Sequence[FinishedUnit],
     target: Path,
     settings: Mapping[str, Any],
     progress: Progress,
@@ -49,7 +49,7 @@ def gather(
     return summary.report(missing)
 
 
-def _skipped(logs: Sequence[Done]) -> list[str]:
+def _skipped(logs: Sequence[FinishedUnit]) -> list[str]:
     """Logs that could not be measured, each with the reason."""
     return [
         f"{scenario_id}: {reason}"

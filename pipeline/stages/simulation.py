@@ -34,7 +34,7 @@ def load_player(
 
     from infgen.model.stepping import Stepper  # noqa: PLC0415
     from infgen.rollout.simulator import Player  # noqa: PLC0415
-    from pipeline.storage.weights import load_network, read_about  # noqa: PLC0415
+    from pipeline.storage.weights import load_network, read_description  # noqa: PLC0415
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = load_network(weights).to(device).eval()
@@ -46,7 +46,7 @@ def load_player(
         settings=settings,
         device=device,
     )
-    return player, str(read_about(weights)["weights"])
+    return player, str(read_description(weights)["weights"])
 
 
 def read_some(folder: Path, rows: Sequence[int]) -> "Iterator[Scene]":

@@ -19,13 +19,13 @@ from infgen.tokens.statistics import Figures, count, describe, no_figures
 from infgen.tokens.tokenizer import tokenize_scene
 from infgen.tokens.tracks import TokensError
 from pipeline.engine.atomic import write_json
-from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
-from pipeline.storage.duplicates import read_scenes_of, scenes_of
-from pipeline.storage.parquet import joined, table
+from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
+from pipeline.storage.duplicates import read_task_scenes, scenes_task
+from pipeline.storage.parquet import make_table, read_tables
 from pipeline.storage.splits import split_of
 
 if TYPE_CHECKING:
-    from pipeline.storage.columns import Unpacked
+    from pipeline.storage.columns import PackedRecords
 
 SCHEMA = "infgen.tokens/2"
 SCENES_PER_GROUP = 500
@@ -46,7 +46,7 @@ _INDEX = {
 _REFUSED = {"scenario_id": str, "split": str, "unit": str, "reason": str}
 
 
-def open_tokens(unit_folder: Path) -> "list[Unpacked[SceneTokens]]":
+def open_tokens(unit_folder: Path) -> "list[PackedRecords[SceneTokens]]":
     """Open the tokens of one unit, group by group; nothing of them is read yet.
 
     Raises:
@@ -68,7 +68,7 @@ def plan(inputs: Inputs, settings: TokenSettings) -> list[Unit]:
         Unit(
             name=done.name,
             inputs={"scenes": done.key, "codebooks": identity},
-            task={**scenes_of(done), "codebooks": str(codebooks)},
+            task={**scenes_task(done), "codebooks": str(codebooks)},
         )
         for done in inputs.units("ingest")
     ]
@@ -76,12 +76,12 @@ def plan(inputs: Inputs, settings: TokenSettings) -> list[Unit]:
 
 def work(unit: Unit, target: Path, settings: TokenSettings, progress: Progress) -> Report:
     """Tokenize the scenes of one ingested file."""
-    from pipeline.stages.vocabulary import load_codebooks  # noqa: PLC0415
+    from pipeline.stages.vocabulary import load_vocabularies  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
-    motion, roads = load_codebooks(Path(unit.task["codebooks"]))
+    motion, roads = load_vocabularies(Path(unit.task["codebooks"]))
     shard = _Shard(target, unit.name)
-    for scene in read_scenes_of(unit.task):
+    for scene in read_task_scenes(unit.task):
         try:
             shard.keep(scene, tokenize_scene(scene, motion, roads, settings))
         except TokensError as error:
@@ -92,7 +92,7 @@ def work(unit: Unit, target: Path, settings: TokenSettings, progress: Progress) 
 
 def finish(
     inputs: Inputs,
-    units: Sequence[Done],
+    units: Sequence[FinishedUnit],
     target: Path,
     settings: TokenSettings,
     progress: Progress,
@@ -101,7 +101,9 @@ def finish(
     target.mkdir(parents=True, exist_ok=True)
     paths = [done.path for done in units]
     for name, columns in (("index", _INDEX), ("refused", _REFUSED)):
-        joined(paths, f"{name}.parquet", columns).write_parquet(target / f"{name}.parquet")
+        read_tables(paths, f"{name}.parquet", columns).write_parquet(
+            target / f"{name}.parquet"
+        )
     splits = {split_of(done.name): no_figures() for done in units}
     for done in units:
         splits[split_of(done.name)] += _read_figures(done.path)
@@ -156,8 +158,8 @@ class _Shard:
     def close(self) -> None:
         """Write what is left, the tables and the figures."""
         self._flush()
-        table(self._index, _INDEX).write_parquet(self._target / "index.parquet")
-        table(self._refused, _REFUSED).write_parquet(self._target / "refused.parquet")
+        make_table(self._index, _INDEX).write_parquet(self._target / "index.parquet")
+        make_table(self._refused, _REFUSED).write_parquet(self._target / "refused.parquet")
         figures = {
             name: value.tolist() if isinstance(value, np.ndarray) else value
             for name, value in asdict(self._figures).items()

@@ -33,13 +33,21 @@ from infgen.tokens.tracks import Paths, TokensError, read_paths
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from infgen.views.charts.vocabularies import codebook_page
 from pipeline.engine.plan import PlanError
-from pipeline.engine.stage import Done, Inputs, Progress, Report, Source, Stage, Unit
-from pipeline.storage.duplicates import read_scenes_of, scenes_of
-from pipeline.storage.initial_weights import find_start
+from pipeline.engine.stage import (
+    FinishedUnit,
+    Inputs,
+    Progress,
+    Report,
+    Source,
+    Stage,
+    Unit,
+)
+from pipeline.storage.duplicates import read_task_scenes, scenes_task
+from pipeline.storage.initial_weights import find_initial_weights
 from pipeline.storage.splits import in_split, split_of
 
 if TYPE_CHECKING:
-    from pipeline.storage.columns import Unpacked
+    from pipeline.storage.columns import PackedRecords
 
 T = TypeVar("T")
 
@@ -92,7 +100,7 @@ class _Books(NamedTuple):
     road_tolerance_m: float
 
 
-def load_codebooks(folder: Path) -> tuple[MotionVocabulary, MapVocabulary]:
+def load_vocabularies(folder: Path) -> tuple[MotionVocabulary, MapVocabulary]:
     """Read both codebooks from the folder of this stage.
 
     Raises:
@@ -109,7 +117,7 @@ def reads(root: Path, settings: VocabSettings) -> list[Source]:
     Raises:
         ConfigError: if there are none, or a key is of several.
     """
-    return find_start(root, "build-vocab.start", settings.start)
+    return find_initial_weights(root, "build-vocab.start", settings.start)
 
 
 def plan(inputs: Inputs, settings: VocabSettings) -> list[Unit]:
@@ -138,7 +146,7 @@ def plan(inputs: Inputs, settings: VocabSettings) -> list[Unit]:
         Unit(
             name=done.name,
             inputs={"scenes": done.key, "role": roles[done.name]},
-            task={**scenes_of(done), "role": roles[done.name]},
+            task={**scenes_task(done), "role": roles[done.name]},
         )
         for done in files
         if done.name in roles
@@ -149,7 +157,7 @@ def work(unit: Unit, target: Path, settings: VocabSettings, progress: Progress) 
     """Sample the moves, map pieces and tracks of one file."""
     role = unit.task["role"]
     samples = {side: _Sample(side, settings) for side in _SIDES}
-    for scene in read_scenes_of(unit.task):
+    for scene in read_task_scenes(unit.task):
         validation_split = (
             role == BOTH and name_key(scene.scenario_id) % HELD_OUT_EVERY == 0
         )
@@ -161,7 +169,7 @@ def work(unit: Unit, target: Path, settings: VocabSettings, progress: Progress) 
 
 def finish(
     inputs: Inputs,
-    units: Sequence[Done],
+    units: Sequence[FinishedUnit],
     target: Path,
     settings: VocabSettings,
     progress: Progress,
@@ -207,7 +215,7 @@ def _clustered(learn: _Gathered, settings: VocabSettings, progress: Progress) ->
 
 def _taken(folder: Path) -> _Books:
     """Take codebooks from weights; what is not logged in them counts as made."""
-    from pipeline.storage.weights import load_codebooks as load  # noqa: PLC0415
+    from pipeline.storage.weights import load_vocabularies as load  # noqa: PLC0415
 
     motion, roads = load(folder)
     move_origin, road_origin = (
@@ -270,7 +278,7 @@ class _Sample:
         self._curves = [sample_curves(self._curves, most)]
 
 
-def _gather(units: Sequence[Done], side: str, settings: VocabSettings) -> _Gathered:
+def _gather(units: Sequence[FinishedUnit], side: str, settings: VocabSettings) -> _Gathered:
     """Merge one side's samples of all files, one file in memory at a time."""
     segments, curves, paths = NO_SEGMENTS, NO_CURVES, dict[int, Paths]()
     most = settings.segments_per_kind
@@ -288,7 +296,7 @@ def _gather(units: Sequence[Done], side: str, settings: VocabSettings) -> _Gathe
     return _Gathered(segments, curves, list(paths.values()))
 
 
-def _held_out_words(units: Sequence[Done], settings: VocabSettings) -> str:
+def _held_out_words(units: Sequence[FinishedUnit], settings: VocabSettings) -> str:
     """Say in words what the coverage is measured on."""
     scenes = sum(done.report[HELD_OUT] for done in units)
     if any(done.report["role"] == HELD_OUT for done in units):
@@ -319,7 +327,7 @@ def _write(path: Path, records: Sequence[Any], kind: type, schema: str) -> None:
     write_records(path, records, kind, schema, compress=False)
 
 
-def _read(path: Path, kind: type[T], schema: str) -> "Unpacked[T]":
+def _read(path: Path, kind: type[T], schema: str) -> "PackedRecords[T]":
     from pipeline.storage.zarr_store import read_records  # noqa: PLC0415
 
     return read_records(path, kind, schema, whole=True)

@@ -16,14 +16,14 @@ from torch import Tensor
 
 from infgen.model.network import Network
 from pipeline.engine.atomic import write_json
-from pipeline.storage.weights import read_tensors, state_of, write_tensors
+from pipeline.storage.weights import read_tensors, state_dict_of, write_tensors
 
 POINTER = "checkpoint.json"
 PREFIX = "checkpoint-"
 
 
 @dataclass(frozen=True, slots=True)
-class Training:
+class TrainingState:
     """A network as it is being trained.
 
     Attributes:
@@ -37,19 +37,19 @@ class Training:
     optimiser: torch.optim.AdamW
 
 
-def save_checkpoint(folder: Path, training: Training, step: int) -> None:
+def save_checkpoint(folder: Path, training: TrainingState, step: int) -> None:
     """Write everything after ``step`` optimiser steps, then forget the one before."""
     target = folder / f"{PREFIX}{step:09d}"
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir()
-    write_tensors(target / "network.safetensors", state_of(training.network))
+    write_tensors(target / "network.safetensors", state_dict_of(training.network))
     write_tensors(target / "average.safetensors", training.average)
     write_tensors(target / "optimiser.safetensors", _optimiser_state(training))
     write_json(folder / POINTER, {"folder": target.name, "step": step})
     _drop(folder, keep=target.name)
 
 
-def load_checkpoint(folder: Path, training: Training) -> int:
+def load_checkpoint(folder: Path, training: TrainingState) -> int:
     """Go on from the last checkpoint: return the optimiser steps done, 0 if none."""
     pointer = folder / POINTER
     if not pointer.is_file():
@@ -63,7 +63,7 @@ def load_checkpoint(folder: Path, training: Training) -> int:
     return int(about["step"])
 
 
-def drop_checkpoints(folder: Path) -> None:
+def remove_checkpoints(folder: Path) -> None:
     """Remove all checkpoints, the pointer first."""
     (folder / POINTER).unlink(missing_ok=True)
     _drop(folder, keep="")
@@ -75,7 +75,7 @@ def _drop(folder: Path, keep: str) -> None:
             shutil.rmtree(path)
 
 
-def _optimiser_state(training: Training) -> dict[str, Tensor]:
+def _optimiser_state(training: TrainingState) -> dict[str, Tensor]:
     """State of every parameter as ``<parameter>/<what>``."""
     return {
         f"{name}/{what}": value
@@ -84,7 +84,7 @@ def _optimiser_state(training: Training) -> dict[str, Tensor]:
     }
 
 
-def _restore_optimiser(training: Training, tensors: dict[str, Tensor]) -> None:
+def _restore_optimiser(training: TrainingState, tensors: dict[str, Tensor]) -> None:
     parameters = dict(training.network.named_parameters())
     for key, value in tensors.items():
         name, what = key.rsplit("/", 1)

@@ -90,7 +90,7 @@ def leaves(kind: Any) -> tuple[Column, ...]:
 
 
 def pack(records: Sequence[Any], kind: type) -> dict[str, np.ndarray]:
-    """Lay records end to end. Inverse of ``Unpacked``.
+    """Lay records end to end. Inverse of ``PackedRecords``.
 
     Raises:
         ValueError: if a dimension has two sizes within one record.
@@ -105,7 +105,7 @@ def pack(records: Sequence[Any], kind: type) -> dict[str, np.ndarray]:
     return {**{f"dim.{dim}": size for dim, size in sizes.items()}, **columns}
 
 
-class _Extent(NamedTuple):
+class _Offsets(NamedTuple):
     """Where each record's part of some columns starts, for all columns of like shape.
 
     Attributes:
@@ -117,32 +117,32 @@ class _Extent(NamedTuple):
     sizes: tuple[np.ndarray, ...]
 
 
-class _Cut(NamedTuple):
-    """How one leaf is cut out: its column, its extent, and its fixed dimensions.
+class _Slice(NamedTuple):
+    """How one leaf is cut out: its column, its offsets, and its fixed dimensions.
 
     Attributes:
         values: The column.
-        extent: Which of the extents it follows.
+        offsets: Which of the all_offsets it follows.
         factor: Product of its fixed dimensions.
-        shape: Its dimensions: a fixed size, or ``-1 - i`` for the extent's i-th size.
+        shape: Its dimensions: a fixed size, or ``-1 - i`` for the offsets's i-th size.
         kind: Python type of a scalar; None for an array.
     """
 
     values: Values
-    extent: int
+    offsets: int
     factor: int
     shape: tuple[int, ...]
     kind: type | None
 
 
-class _Maker(NamedTuple):
+class _Layout(NamedTuple):
     """A record type with its fields in order: a leaf's number, or a nested maker."""
 
     kind: Any
-    parts: "tuple[int | _Maker, ...]"
+    parts: "tuple[int | _Layout, ...]"
 
 
-class Unpacked(Generic[T], Sequence[T]):
+class PackedRecords(Generic[T], Sequence[T]):
     """Records cut out of columns on demand: ``records[3]`` touches only that record.
 
     Arrays are parts of the columns: views, or read there and then from columns on disk. All
@@ -154,11 +154,11 @@ class Unpacked(Generic[T], Sequence[T]):
             kind  # a type is hashable, whatever the type checker thinks of type[T]
         )
         self._columns = columns
-        self._extents: list[_Extent] = []
+        self._offsets: list[_Offsets] = []
         found: dict[tuple[str, ...], int] = {}
-        self._cuts = [self._cut(leaf, found) for leaf in leaves(record)]
-        self._length = len(self._extents[0].starts) - 1 if self._extents else 0
-        self._maker = _maker(record, iter(range(len(self._cuts))))
+        self._slices = [self._slice(leaf, found) for leaf in leaves(record)]
+        self._length = len(self._offsets[0].starts) - 1 if self._offsets else 0
+        self._layout = _layout(record, iter(range(len(self._slices))))
 
     def __len__(self) -> int:
         return self._length
@@ -169,11 +169,11 @@ class Unpacked(Generic[T], Sequence[T]):
         if not -self._length <= row < self._length:
             raise IndexError(f"record {row} of {self._length}")
         row = row % self._length
-        extents = [
+        all_offsets = [
             (int(starts[row]), int(starts[row + 1]), [int(size[row]) for size in sizes])
-            for starts, sizes in self._extents
+            for starts, sizes in self._offsets
         ]
-        return _make(self._maker, [_value_at(cut, extents) for cut in self._cuts])
+        return _make(self._layout, [_value_at(cut, all_offsets) for cut in self._slices])
 
     def __iter__(self) -> Iterator[T]:
         return (self[row] for row in range(len(self)))
@@ -186,25 +186,25 @@ class Unpacked(Generic[T], Sequence[T]):
         """Return the size of one named dimension in every record."""
         return self._columns[f"dim.{dim}"][:]
 
-    def _cut(self, leaf: Column, found: dict[tuple[str, ...], int]) -> _Cut:
+    def _slice(self, leaf: Column, found: dict[tuple[str, ...], int]) -> _Slice:
         values = self._columns[leaf.name]
         dims = _dims(leaf)
         named = tuple(dim for dim in dims if not dim.isdigit())
         factor = math.prod(int(dim) for dim in dims if dim.isdigit())
         if named not in found:
-            found[named] = len(self._extents)
-            self._extents.append(self._extent(named, len(values) // factor))
+            found[named] = len(self._offsets)
+            self._offsets.append(self._offsets_of(named, len(values) // factor))
         order = iter(range(len(named)))
         shape = tuple(int(dim) if dim.isdigit() else -1 - next(order) for dim in dims)
         scalar = leaf.kind if leaf.dims is None else None
-        return _Cut(values, found[named], factor, shape, scalar)
+        return _Slice(values, found[named], factor, shape, scalar)
 
-    def _extent(self, named: tuple[str, ...], length: int) -> _Extent:
+    def _offsets_of(self, named: tuple[str, ...], length: int) -> _Offsets:
         if not named:
-            return _Extent(np.arange(length + 1), ())
+            return _Offsets(np.arange(length + 1), ())
         sizes = tuple(self._size(dim) for dim in named)
         per_record = np.prod(sizes, axis=0, dtype=np.int64)
-        return _Extent(np.concatenate([[0], np.cumsum(per_record)]), sizes)
+        return _Offsets(np.concatenate([[0], np.cumsum(per_record)]), sizes)
 
     def _size(self, dim: str) -> np.ndarray:
         name, more = _split(dim)
@@ -222,18 +222,18 @@ def names(kind: Any) -> frozenset[str]:
     return frozenset(named | {leaf.name for leaf in leaves(kind)})
 
 
-def _maker(kind: Any, numbers: Iterator[int]) -> _Maker:
+def _layout(kind: Any, numbers: Iterator[int]) -> _Layout:
     hints = get_type_hints(kind, include_extras=True)
-    return _Maker(
+    return _Layout(
         kind,
         tuple(
-            _maker(hint, numbers) if is_dataclass(hint) else next(numbers)
+            _layout(hint, numbers) if is_dataclass(hint) else next(numbers)
             for hint in hints.values()
         ),
     )
 
 
-def _make(maker: _Maker, values: list[Any]) -> Any:
+def _make(maker: _Layout, values: list[Any]) -> Any:
     return maker.kind(
         *[
             values[part] if isinstance(part, int) else _make(part, values)
@@ -242,9 +242,9 @@ def _make(maker: _Maker, values: list[Any]) -> Any:
     )
 
 
-def _value_at(cut: _Cut, extents: list[tuple[int, int, list[int]]]) -> Any:
-    values, extent, factor, shape, kind = cut
-    start, stop, sizes = extents[extent]
+def _value_at(cut: _Slice, all_offsets: list[tuple[int, int, list[int]]]) -> Any:
+    values, offsets, factor, shape, kind = cut
+    start, stop, sizes = all_offsets[offsets]
     part = values[start * factor : stop * factor]
     if kind is str:
         return part.tobytes().decode()

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.engine.stage import Done, Report
+from pipeline.engine.stage import FinishedUnit, Report
 
 if TYPE_CHECKING:
     import polars as pl
 
     from infgen.scene import Scene
 
-LEFT_OUT = "left_out"
+DUPLICATE_ROWS = "duplicate_rows"
 """Ranges ``[first, after)`` of rows of a file's scenes that do not count: in what stage
 ``ingest`` reports of the file, and in the tasks of those who read it."""
 
@@ -30,28 +30,34 @@ def mark_duplicates(index: "pl.DataFrame") -> "pl.DataFrame":
     return index.with_columns(duplicate=~first)
 
 
-def tell_left_out(index: "pl.DataFrame") -> dict[str, Report]:
+def report_duplicates(index: "pl.DataFrame") -> dict[str, Report]:
     """Say of each file with marked scenes which of its rows they are."""
     import polars as pl  # noqa: PLC0415
 
     rows = index.select("source", "duplicate", at=pl.int_range(pl.len()).over("source"))
     parts = rows.filter("duplicate").partition_by("source", maintain_order=True)
-    return {part["source"][0]: {LEFT_OUT: _ranges(part["at"].to_numpy())} for part in parts}
+    return {
+        part["source"][0]: {DUPLICATE_ROWS: _ranges(part["at"].to_numpy())}
+        for part in parts
+    }
 
 
-def rows_that_count(file: Done) -> list[int]:
+def unique_rows(file: FinishedUnit) -> list[int]:
     """Rows of the scenes of an ingested file that count."""
-    left_out = _rows(file.report)
-    return [row for row in range(int(file.report["scenes"])) if row not in left_out]
+    duplicate_rows = _rows(file.report)
+    return [row for row in range(int(file.report["scenes"])) if row not in duplicate_rows]
 
 
-def scenes_of(file: Done) -> dict[str, Any]:
+def scenes_task(file: FinishedUnit) -> dict[str, Any]:
     """Name the scenes of an ingested file that count, in the task of a unit."""
-    left_out = file.report.get(LEFT_OUT)
-    return {"scenes": str(file.path), **({LEFT_OUT: left_out} if left_out else {})}
+    duplicate_rows = file.report.get(DUPLICATE_ROWS)
+    return {
+        "scenes": str(file.path),
+        **({DUPLICATE_ROWS: duplicate_rows} if duplicate_rows else {}),
+    }
 
 
-def read_scenes_of(task: Mapping[str, Any]) -> "Iterator[Scene]":
+def read_task_scenes(task: Mapping[str, Any]) -> "Iterator[Scene]":
     """Stream the scenes that a task names.
 
     Raises:
@@ -59,13 +65,15 @@ def read_scenes_of(task: Mapping[str, Any]) -> "Iterator[Scene]":
     """
     from pipeline.storage.scenes import read_scenes  # noqa: PLC0415
 
-    left_out = _rows(task)
+    duplicate_rows = _rows(task)
     scenes = enumerate(read_scenes(Path(task["scenes"])))
-    return (scene for row, scene in scenes if row not in left_out)
+    return (scene for row, scene in scenes if row not in duplicate_rows)
 
 
 def _rows(about: Mapping[str, Any]) -> set[int]:
-    return {row for first, after in about.get(LEFT_OUT, ()) for row in range(first, after)}
+    return {
+        row for first, after in about.get(DUPLICATE_ROWS, ()) for row in range(first, after)
+    }
 
 
 def _ranges(rows: np.ndarray) -> list[list[int]]:

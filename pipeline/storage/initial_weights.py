@@ -7,14 +7,14 @@ from infgen.pretrained import builtin_weights
 from pipeline.engine.layout import KEY_DIGITS, Root, read_json
 from pipeline.engine.stage import Source
 
-WEIGHTS, ABOUT = "model.safetensors", "model.json"
+WEIGHTS, DESCRIPTION = "model.safetensors", "model.json"
 BUILTIN = "builtin"
 """The word for the weights that come with the package."""
-START = "start"
+INITIAL_WEIGHTS = "start"
 """Name of the weights to begin with, among a stage's sources."""
 
 
-def find_start(root: Path, setting: str, named: str) -> list[Source]:
+def find_initial_weights(root: Path, setting: str, named: str) -> list[Source]:
     """Find the weights that a setting names.
 
     Args:
@@ -33,15 +33,17 @@ def find_start(root: Path, setting: str, named: str) -> list[Source]:
     stage = Root(root).stage("train")
     keyed = [path for path in stage.glob("*") if path.name.startswith(named[:KEY_DIGITS])]
     own = [builtin_weights()] if named == BUILTIN else [Path(named).absolute()]
-    found = [place for place in (*own, *sorted(keyed)) if (place / ABOUT).is_file()]
+    found = [place for place in (*own, *sorted(keyed)) if (place / DESCRIPTION).is_file()]
     if len(found) != 1:
         told = "several have it" if found else "there is no such folder or key"
         raise ConfigError(
             f"{setting} is {named!r}, but {told}; expected {BUILTIN!r}, a folder with "
-            f"{WEIGHTS} and {ABOUT}, or the start of a key below {stage}"
+            f"{WEIGHTS} and {DESCRIPTION}, or the start of a key below {stage}"
         )
     folder = found[0].resolve()
-    return [Source(str(folder), START, _fingerprint(folder / ABOUT, setting))]
+    return [
+        Source(str(folder), INITIAL_WEIGHTS, _fingerprint(folder / DESCRIPTION, setting))
+    ]
 
 
 def _fingerprint(path: Path, setting: str) -> str:
@@ -49,6 +51,6 @@ def _fingerprint(path: Path, setting: str) -> str:
     if not isinstance(about, dict) or "weights" not in about:
         raise ConfigError(
             f"{setting}: {path} lacks the entry 'weights'; expected a folder that stage "
-            f"'train' made, with {WEIGHTS} and the {ABOUT} that tells of them"
+            f"'train' made, with {WEIGHTS} and the {DESCRIPTION} that tells of them"
         )
     return str(about["weights"])

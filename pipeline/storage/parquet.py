@@ -11,17 +11,17 @@ Fields = Mapping[str, type]
 """Names of columns and what they hold: ``str`` or ``int``."""
 
 
-def table(rows: Sequence[Mapping[str, Any]], columns: Fields) -> "pl.DataFrame":
-    """Make a table of rows; an empty one has its columns too."""
+def make_table(rows: Sequence[Mapping[str, Any]], columns: Fields) -> "pl.DataFrame":
+    """Make a make_table of rows; an empty one has its columns too."""
     import polars as pl  # noqa: PLC0415
 
     types = {name: pl.String if kind is str else pl.Int64 for name, kind in columns.items()}
     return pl.DataFrame(list(rows), schema=types)
 
 
-def joined(folders: Sequence[Path], name: str, columns: Fields) -> "pl.DataFrame":
-    """Read the table of one name from every folder, and lay them end to end."""
+def read_tables(folders: Sequence[Path], name: str, columns: Fields) -> "pl.DataFrame":
+    """Read the make_table of one name from every folder, and lay them end to end."""
     import polars as pl  # noqa: PLC0415
 
     tables = [pl.read_parquet(folder / name) for folder in folders]
-    return pl.concat([table([], columns), *tables])
+    return pl.concat([make_table([], columns), *tables])

@@ -1,4 +1,4 @@
-"""Logs found by scenario id, in raw records or in an ingested store, in any order.
+"""SceneLookup found by scenario id, in raw records or in an ingested store, in any order.
 
 Neither holds more than a bounded part of the logs: what rollouts ask for comes in their
 order, not in that of the records.
@@ -18,27 +18,27 @@ from pipeline.engine.manifest import read_manifest
 from pipeline.storage.source_files import find_urls
 
 if TYPE_CHECKING:
-    from pipeline.storage.columns import Unpacked
+    from pipeline.storage.columns import PackedRecords
 
-KEPT_BYTES = 256 << 20
+CACHE_BYTES = 256 << 20
 """Records that were passed on the way to another, kept in case they are next."""
-OPEN_GROUPS = 2
+MAX_OPEN_GROUPS = 2
 MAX_NAMED = 3
 
 
-class MissingLogError(ValueError):
+class MissingSceneError(ValueError):
     """No log of a scene."""
 
 
 @runtime_checkable
-class Logs(Protocol):
-    """Logs by scenario id."""
+class SceneLookup(Protocol):
+    """SceneLookup by scenario id."""
 
     def find(self, scenario_id: str) -> Scene:
         """Return one log.
 
         Raises:
-            MissingLogError: if there is none.
+            MissingSceneError: if there is none.
             RecordError: if there is, but it cannot be used.
         """
 
@@ -48,34 +48,34 @@ class _Place(NamedTuple):
     offset: int
 
 
-class RecordLogs:
-    """Logs in raw records: read once, as far as is needed, and again where asked back.
+class RecordLookup:
+    """Scenes in raw records, read as far as needed, and read again where asked back.
 
-    Where rollouts come in the order of the records, each record is read and held alone.
+    Where rollouts come in the order of the records, each record is read once, alone.
     """
 
-    def __init__(self, urls: Sequence[str], kept_bytes: int = KEPT_BYTES) -> None:
-        self._coming = self._read(urls)
+    def __init__(self, urls: Sequence[str], cache_bytes: int = CACHE_BYTES) -> None:
+        self._unread = self._read(urls)
         self._places: dict[str, _Place] = {}
-        self._kept: dict[str, bytes] = {}
-        self._room = kept_bytes
+        self._cached: dict[str, bytes] = {}
+        self._free_bytes = cache_bytes
         self._bad: list[str] = []
 
     def find(self, scenario_id: str) -> Scene:
         """Return one log.
 
         Raises:
-            MissingLogError: if there is none.
+            MissingSceneError: if there is none.
             RecordError: if there is, but it cannot be used.
             ConfigError: if no file holds any usable record.
         """
         while scenario_id not in self._places:
-            if next(self._coming, None) is None:
+            if next(self._unread, None) is None:
                 raise self._missing(scenario_id)
-        data = self._kept.pop(scenario_id, None)
+        data = self._cached.pop(scenario_id, None)
         if data is None:
             return decode_scene(self._reread(self._places[scenario_id]))
-        self._room += len(data)
+        self._free_bytes += len(data)
         return decode_scene(data)
 
     def _read(self, urls: Sequence[str]) -> Iterator[str]:
@@ -96,11 +96,11 @@ class RecordLogs:
 
     def _keep(self, scenario_id: str, data: bytes) -> None:
         """Keep a record, and let go of the oldest ones while there is no room."""
-        self._kept[scenario_id] = data
-        self._room -= len(data)
-        while self._room < 0 and len(self._kept) > 1:
-            oldest = next(iter(self._kept))
-            self._room += len(self._kept.pop(oldest))
+        self._cached[scenario_id] = data
+        self._free_bytes -= len(data)
+        while self._free_bytes < 0 and len(self._cached) > 1:
+            oldest = next(iter(self._cached))
+            self._free_bytes += len(self._cached.pop(oldest))
 
     def _reread(self, place: _Place) -> bytes:
         record = read_record(place.url, place.offset)
@@ -114,17 +114,17 @@ class RecordLogs:
             return ConfigError(f"no usable record: {bad}")
         unusable = f" ({len(self._bad)} unusable records: {bad})" if self._bad else ""
         none = f"scene {scenario_id}: none of {len(self._places)} records holds it"
-        return MissingLogError(f"{none}{unusable}")
+        return MissingSceneError(f"{none}{unusable}")
 
 
-class StoreLogs:
-    """Logs in an ingested store, a few groups of scenes in memory at a time."""
+class StoreLookup:
+    """SceneLookup in an ingested store, a few groups of scenes in memory at a time."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         import polars as pl  # noqa: PLC0415
 
         self._places: dict[str, tuple[Path, int]] = {}
-        self._open: dict[Path, Unpacked[Scene]] = {}
+        self._open: dict[Path, PackedRecords[Scene]] = {}
         for folder in folders:
             index = pl.read_parquet(folder / "index.parquet")
             for scenario_id, group, row in index.select(_PLACE).iter_rows():
@@ -134,21 +134,21 @@ class StoreLogs:
         """Return one log.
 
         Raises:
-            MissingLogError: if there is none.
+            MissingSceneError: if there is none.
             StoreError: if its group is damaged.
         """
         if scenario_id not in self._places:
             none = f"none of {len(self._places)} ingested scenes has its id"
-            raise MissingLogError(f"scene {scenario_id}: {none}")
+            raise MissingSceneError(f"scene {scenario_id}: {none}")
         path, row = self._places[scenario_id]
         return self._group(path)[row]
 
-    def _group(self, path: Path) -> "Unpacked[Scene]":
+    def _group(self, path: Path) -> "PackedRecords[Scene]":
         from pipeline.storage.scenes import SCENES_SCHEMA  # noqa: PLC0415
         from pipeline.storage.zarr_store import read_records  # noqa: PLC0415
 
         if path not in self._open:
-            while len(self._open) >= OPEN_GROUPS:
+            while len(self._open) >= MAX_OPEN_GROUPS:
                 self._open.pop(next(iter(self._open)))
             self._open[path] = read_records(path, Scene, SCENES_SCHEMA, whole=True)
         return self._open[path]
@@ -157,7 +157,7 @@ class StoreLogs:
 _PLACE = ("scenario_id", "group", "row")
 
 
-def open_logs(names: Sequence[str]) -> Logs:
+def open_scene_lookup(names: Sequence[str]) -> SceneLookup:
     """Open raw records (paths, patterns, folders, URLs), or one folder of a store.
 
     Raises:
@@ -166,8 +166,8 @@ def open_logs(names: Sequence[str]) -> Logs:
     if len(names) == 1 and (folders := unit_folders(Path(names[0]))) is not None:
         if not any(any(folder.glob("scenes-*.zarr")) for folder in folders):
             raise ConfigError(f"{names[0]} holds no ingested scenes")
-        return StoreLogs(folders)
-    return RecordLogs(find_urls(names))
+        return StoreLookup(folders)
+    return RecordLookup(find_urls(names))
 
 
 def unit_folders(folder: Path) -> list[Path] | None:

@@ -58,8 +58,8 @@ def find_sources(patterns: Sequence[str], root: Root) -> tuple[Source, ...]:
     if not patterns:
         raise ConfigError("no records are named; --records 'DIR/*.tfrecord*' names them")
     urls = find_urls(patterns)
-    _refuse_twins(urls)
-    memory = _Memory(root)
+    _refuse_equal_names(urls)
+    memory = _FingerprintCache(root)
     found = [Source(url, _name(url), memory.fingerprint(url)) for url in urls]
     memory.save()
     return tuple(sorted(found, key=lambda source: source.name))
@@ -117,7 +117,7 @@ def _name(url: str) -> str:
     return url.rsplit("/", 1)[-1]
 
 
-def _refuse_twins(urls: Sequence[str]) -> None:
+def _refuse_equal_names(urls: Sequence[str]) -> None:
     by_name = defaultdict(list)
     for url in urls:
         by_name[_name(url)].append(url)
@@ -128,12 +128,12 @@ def _refuse_twins(urls: Sequence[str]) -> None:
             )
 
 
-class _Memory:
+class _FingerprintCache:
     """Identities of local files that have not changed since they were last read."""
 
     def __init__(self, root: Root) -> None:
         self._root, self._path = root, root.fingerprints
-        self._known: dict[str, list[Any]] = _remembered(self._path)
+        self._known: dict[str, list[Any]] = _read_cache(self._path)
         self._changed = False
 
     def fingerprint(self, url: str) -> str:
@@ -156,11 +156,11 @@ class _Memory:
         if found.startswith(WHOLE):
             return found
         damaged = self._damaged.get(found, ())
-        mended = any(isinstance(read_record(path, offset), Record) for offset in damaged)
-        if not mended and not before.startswith(WHOLE):
+        repaired = any(isinstance(read_record(path, offset), Record) for offset in damaged)
+        if not repaired and not before.startswith(WHOLE):
             return found
         whole = _hash_whole(path)
-        return whole if mended or whole == before else found
+        return whole if repaired or whole == before else found
 
     @cached_property
     def _damaged(self) -> dict[str, set[int]]:
@@ -187,7 +187,7 @@ def _damaged_offsets(unit: Path) -> set[int]:
     return set(rows.filter(pl.col("reason") == DAMAGED)["offset"])
 
 
-def _remembered(path: Path) -> dict[str, list[Any]]:
+def _read_cache(path: Path) -> dict[str, list[Any]]:
     try:
         known = read_json(path)
     except StoreError:
@@ -235,7 +235,7 @@ def _masked(crc: int) -> int:
 def _fingerprint_remote(url: str) -> str:
     """Identity of a remote file: what its store says of it, or else all its bytes."""
     system, path = file_system(url)
-    said = sorted(_said(system.info(path)))
+    said = sorted(_content_marks(system.info(path)))
     digest = hashlib.sha256(repr(said).encode())
     if not any(name != "size" for name, _ in said):
         with system.open(path, "rb") as file:
@@ -248,7 +248,7 @@ CONTENT_MARKS = ("etag", "md5hash", "content_md5", "contentmd5", "crc32c", "chec
 TIME_MARKS = ("mtime", "lastmodified", "last_modified", "last_commit")
 
 
-def _said(info: dict[str, Any]) -> Iterator[tuple[str, str]]:
+def _content_marks(info: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """Pick what tells contents apart: checksums if there are any, else times."""
     found = {name.lower(): str(value) for name, value in info.items() if value}
     marks = [name for name in CONTENT_MARKS if name in found]

@@ -6,8 +6,8 @@ from itertools import accumulate, pairwise
 import numpy as np
 
 from pipeline.engine.plan import PlanError
-from pipeline.engine.stage import Done
-from pipeline.storage.duplicates import rows_that_count
+from pipeline.engine.stage import FinishedUnit
+from pipeline.storage.duplicates import unique_rows
 
 
 def split_of(name: str) -> str:
@@ -31,7 +31,9 @@ def in_split(name: str, split: str) -> bool:
     return split_of(name) == split
 
 
-def files_of(files: Sequence[Done], split: str, *, to: str, setting: str) -> list[Done]:
+def files_of_split(
+    files: Sequence[FinishedUnit], split: str, *, to: str, setting: str
+) -> list[FinishedUnit]:
     """Find the ingested files of a split that hold a scene.
 
     Args:
@@ -58,8 +60,8 @@ def files_of(files: Sequence[Done], split: str, *, to: str, setting: str) -> lis
     return found
 
 
-def spread(files: Sequence[Done], most: int) -> list[list[int]]:
-    """Choose scenes of ingested files, evenly spread over all of them.
+def spread_evenly(files: Sequence[FinishedUnit], most: int) -> list[list[int]]:
+    """Choose scenes of ingested files, evenly spread_evenly over all of them.
 
     Neighbours in a file may be alike: views of one town, cuts of one drive.
 
@@ -70,7 +72,7 @@ def spread(files: Sequence[Done], most: int) -> list[list[int]]:
     Returns:
         For each file the rows of its scenes, ascending.
     """
-    rows = [np.array(rows_that_count(done), int) for done in files]
+    rows = [np.array(unique_rows(done), int) for done in files]
     counts = [len(each) for each in rows]
     total = sum(counts)
     chosen = np.arange(total)

@@ -19,12 +19,12 @@ from infgen.pretrained import builtin_weights
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from pipeline.engine.atomic import StoreError, write_file, write_json
 from pipeline.engine.layout import read_json
-from pipeline.storage.initial_weights import ABOUT, WEIGHTS
+from pipeline.storage.initial_weights import DESCRIPTION, WEIGHTS
 
 SCHEMA = "infgen.model/1"
 MAX_NAMED = 3
 MAX_SAID = 300
-_NEEDED = ("model", "tokenize", "vocabulary", "weights")
+_REQUIRED = ("model", "tokenize", "vocabulary", "weights")
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> str:
@@ -74,7 +74,7 @@ def save_network(
         "step": step,
         "weights": fingerprint,
     }
-    write_json(folder / ABOUT, about)
+    write_json(folder / DESCRIPTION, about)
     return fingerprint
 
 
@@ -84,10 +84,10 @@ def load_network(folder: Path) -> Network:
     Raises:
         StoreError: if a file is missing, damaged, or of another schema.
     """
-    about = read_about(folder)
+    about = read_description(folder)
     tensors = read_tensors(folder / WEIGHTS)
-    motion, roads = _codebooks(tensors)
-    where = str(folder / ABOUT)
+    motion, roads = _vocabularies(tensors)
+    where = str(folder / DESCRIPTION)
     network = Network(
         build(ModelSettings, about["model"], where),
         motion,
@@ -99,22 +99,22 @@ def load_network(folder: Path) -> Network:
     except RuntimeError as error:  # It names every tensor.
         said = textwrap.shorten(str(error), MAX_SAID, placeholder=" ...")
         raise StoreError(
-            f"{folder / WEIGHTS} does not fit its settings in {ABOUT}: {said}"
+            f"{folder / WEIGHTS} does not fit its settings in {DESCRIPTION}: {said}"
         ) from error
     return network.eval()
 
 
-def load_codebooks(folder: Path) -> tuple[MotionVocabulary, MapVocabulary]:
+def load_vocabularies(folder: Path) -> tuple[MotionVocabulary, MapVocabulary]:
     """Read the codebooks that the weights in a folder were trained with.
 
     Raises:
         StoreError: if a file is missing, damaged, or of another schema.
     """
-    read_about(folder)
-    return _codebooks(read_tensors(folder / WEIGHTS))
+    read_description(folder)
+    return _vocabularies(read_tensors(folder / WEIGHTS))
 
 
-def take_weights(network: Network, folder: Path) -> None:
+def copy_weights(network: Network, folder: Path) -> None:
     """Give a network the weights in a folder, made with the same vocabularies.
 
     What the folder holds beyond the network's own parameters is left aside.
@@ -123,17 +123,17 @@ def take_weights(network: Network, folder: Path) -> None:
         StoreError: naming the parameters that are missing there or of another shape; or if
             the weights were made with other vocabularies, or are not what they were.
     """
-    about = read_about(folder)
+    about = read_description(folder)
     own_books = vocabulary_fingerprint(network.motion_codebook(), network.road_codebook())
     if about["vocabulary"] != own_books:
         raise StoreError(
             f"{folder} was trained with vocabulary {about['vocabulary'][:12]}, expected "
             f"{own_books[:12]}; build-vocab must have the same settings and records"
-            f"{_way_out(folder)}"
+            f"{_remedy(folder)}"
         )
     found = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
     if found != about["weights"]:
-        raise StoreError(f"{folder / WEIGHTS} is not the one that {ABOUT} tells of")
+        raise StoreError(f"{folder / WEIGHTS} is not the one that {DESCRIPTION} tells of")
     tensors = read_tensors(folder / WEIGHTS)
     parameters = dict(network.named_parameters())
     unfit = [
@@ -143,20 +143,20 @@ def take_weights(network: Network, folder: Path) -> None:
     ]
     if unfit:
         raise StoreError(
-            f"{folder} has no weights of the right shape for {_some(unfit)}"
-            f"{_other_settings(about, network)}{_way_out(folder)}"
+            f"{folder} has no weights of the right shape for {_first_names(unfit)}"
+            f"{_differing_settings(about, network)}{_remedy(folder)}"
         )
     with torch.no_grad():
         for name, parameter in parameters.items():
             parameter.copy_(tensors[name])
 
 
-def _some(names: Sequence[str]) -> str:
+def _first_names(names: Sequence[str]) -> str:
     more = len(names) - MAX_NAMED
     return ", ".join(names[:MAX_NAMED]) + (f" and {more} more tensors" if more > 0 else "")
 
 
-def _other_settings(about: Mapping[str, Any], network: Network) -> str:
+def _differing_settings(about: Mapping[str, Any], network: Network) -> str:
     """Say which settings of a network are not those that its weights were trained with."""
     model, grid = asdict(network.settings), asdict(network.grid_settings)
     for section, asked in (("model", model), ("tokenize", grid)):
@@ -171,26 +171,26 @@ def _other_settings(about: Mapping[str, Any], network: Network) -> str:
     return ""
 
 
-def _way_out(folder: Path) -> str:
+def _remedy(folder: Path) -> str:
     """Say where the settings are that go with the weights of the package."""
     own = folder.resolve() == builtin_weights().resolve()
     return "; --profile pretrained has all that goes with them" if own else ""
 
 
-def read_about(folder: Path) -> dict[str, Any]:
+def read_description(folder: Path) -> dict[str, Any]:
     """Read what is said about the weights in a folder.
 
     Raises:
         StoreError: if there are none, or they are of another schema.
     """
-    path = folder / ABOUT
+    path = folder / DESCRIPTION
     if not path.is_file():
         raise StoreError(f"{path} is missing; run stage 'train' first")
     read = read_json(path)
     about: dict[str, Any] = read if isinstance(read, dict) else {}
     if about.get("schema") != SCHEMA:
         raise StoreError(f"{path} holds {about.get('schema')!r}, expected {SCHEMA!r}")
-    lacks = [name for name in _NEEDED if name not in about]
+    lacks = [name for name in _REQUIRED if name not in about]
     if lacks:
         raise StoreError(f"{path} lacks {', '.join(lacks)}; run stage 'train' again")
     return about
@@ -205,12 +205,12 @@ def vocabulary_fingerprint(motion: MotionVocabulary, roads: MapVocabulary) -> st
     return digest.hexdigest()
 
 
-def state_of(network: torch.nn.Module) -> dict[str, Tensor]:
+def state_dict_of(network: torch.nn.Module) -> dict[str, Tensor]:
     """Weights and codebooks of a network by name (not copied)."""
     return {name: tensor.detach() for name, tensor in network.state_dict().items()}
 
 
-def _codebooks(tensors: Mapping[str, Tensor]) -> tuple[MotionVocabulary, MapVocabulary]:
+def _vocabularies(tensors: Mapping[str, Tensor]) -> tuple[MotionVocabulary, MapVocabulary]:
     return (
         MotionVocabulary(*_arrays(tensors, "motion_size_lw_m motion_path motion_real")),
         MapVocabulary(*_arrays(tensors, "road_curve_m road_real")),

@@ -15,11 +15,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pipeline.engine.atomic import StoreError, publish, write_file, write_json
-from pipeline.storage.columns import Columns, Unpacked, names, pack
+from pipeline.storage.columns import Columns, PackedRecords, names, pack
 
 __all__ = [
+    "DiskColumn",
     "StoreError",
-    "Stored",
     "open_group",
     "publish",
     "read_group",
@@ -35,7 +35,7 @@ T = TypeVar("T")
 CHECKSUM_BYTES = 4
 
 
-class Stored:
+class DiskColumn:
     """A column that stays on disk: any part of it can be read, and nothing is kept open.
 
     A memory map would hold on to a descriptor and a mapping. Training draws its scenes from
@@ -144,7 +144,7 @@ def read_group(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     return columns, dict(group.attrs)
 
 
-def open_group(path: Path) -> tuple[dict[str, Stored], dict[str, Any]]:
+def open_group(path: Path) -> tuple[dict[str, DiskColumn], dict[str, Any]]:
     """Find where the columns of an uncompressed group lie, without reading them.
 
     Raises:
@@ -159,7 +159,7 @@ def open_group(path: Path) -> tuple[dict[str, Stored], dict[str, Any]]:
             raise StoreError(
                 f"{meta_file.parent} is compressed and cannot be read in parts"
             )
-        columns[name] = _stored(_chunk(path, name), dtype, int(meta["shape"][0]))
+        columns[name] = _disk_column(_chunk(path, name), dtype, int(meta["shape"][0]))
     return columns, about.get("attributes", {})
 
 
@@ -171,7 +171,9 @@ def write_records(
     write_group(path, pack(records, kind), attributes, compress=compress)
 
 
-def read_records(path: Path, kind: type[T], schema: str, *, whole: bool) -> Unpacked[T]:
+def read_records(
+    path: Path, kind: type[T], schema: str, *, whole: bool
+) -> PackedRecords[T]:
     """Open a group of records: all read at once and verified, or each on demand.
 
     Raises:
@@ -187,15 +189,15 @@ def read_records(path: Path, kind: type[T], schema: str, *, whole: bool) -> Unpa
     lost = sorted(names(kind) - columns.keys())
     if lost:
         raise StoreError(f"{path} lacks {', '.join(lost)}; `infgen verify` lists damage")
-    return Unpacked(columns, kind)
+    return PackedRecords(columns, kind)
 
 
-def _stored(chunk: Path, dtype: np.dtype, length: int) -> Stored:
+def _disk_column(chunk: Path, dtype: np.dtype, length: int) -> DiskColumn:
     expected = length * dtype.itemsize + CHECKSUM_BYTES
     found = chunk.stat().st_size if chunk.is_file() else None
     if length and found != expected:
         raise StoreError(f"{chunk} holds {found} bytes, expected {expected}")
-    return Stored(chunk, dtype, length)
+    return DiskColumn(chunk, dtype, length)
 
 
 def _chunk(path: Path, name: str) -> Path:

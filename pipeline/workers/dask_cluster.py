@@ -31,23 +31,23 @@ from pipeline.engine.units import (
 )
 from pipeline.workers.scheduling import (
     RETRIES,
-    Broken,
-    ByCrew,
-    Ended,
-    Full,
-    Lost,
-    News,
-    Share,
+    PoolExecutor,
+    TaskEnded,
+    TaskFailure,
+    TaskProgress,
+    WorkerEvent,
+    WorkerLost,
+    WorkerMemoryFull,
 )
 
 HELP = "none | local[:N] | gpu[:0,1] | tcp://HOST:PORT | file:scheduler.json"
 LOOPBACK = "127.0.0.1"  # Dask runs what anyone who connects sends it.
 WEB: dict[str, Any] = {"dashboard": False, "dashboard_address": f"{LOOPBACK}:0"}
 """Any free port for a scheduler's web server: another cluster may have the usual one."""
-SILENT_S = 60.0
+SCHEDULER_TIMEOUT_S = 60.0
 """Longest that a scheduler may leave a question unanswered."""
 CLOSE_S, POLL_S = 10.0, 0.1
-TELL_EVERY_S = 2.0
+PROGRESS_EVERY_S = 2.0
 CONFIG = {
     # A worker that is just being restarted when this time is up is given up for good; with
     # the usual 15 seconds a few crashes leave a cluster without workers.
@@ -57,9 +57,9 @@ CONFIG = {
 }
 WORKER_ENVIRONMENT = {"ZARR_ASYNC__CONCURRENCY": "4", "ZARR_THREADING__MAX_WORKERS": "2"}
 VISIBLE_DEVICES = "CUDA_VISIBLE_DEVICES"
-COMING_TOPIC, MEMORY_TOPIC = "all", "worker-restart-memory"
+WORKERS_TOPIC, MEMORY_TOPIC = "all", "worker-restart-memory"
 """What Dask tells there: workers that come and go, and those it restarts."""
-SHARE_TOPIC = "infgen-share"
+PROGRESS_TOPIC = "infgen-progress"
 
 
 def choose_workers(words: str, visible_devices: str | None = None) -> Workers:
@@ -121,9 +121,9 @@ class OpenDaskWorkers:
         if self._executor is None:
             words, visible = self._workers.words, self._workers.visible_devices
             client = self._stack.enter_context(_client(words, visible))
-            crew = DaskCrew(client)
-            self._stack.callback(crew.close)
-            self._executor = ByCrew(crew)
+            pool = DaskPool(client)
+            self._stack.callback(pool.close)
+            self._executor = PoolExecutor(pool)
         return self._executor
 
 
@@ -150,7 +150,7 @@ def _client(words: str, visible: str | None) -> Iterator[Any]:
             cluster = _local(int(rest or os.cpu_count() or 1))
             place = {"address": stack.enter_context(cluster)}
         elif kind == "gpu":
-            cluster = _gpus(pick_gpus(rest, visible))
+            cluster = _gpus(select_gpus(rest, visible))
             place = {"address": stack.enter_context(cluster)}
         elif kind == "file":
             place = {"scheduler_file": _await_file(rest)}
@@ -169,7 +169,7 @@ def _await_file(path: str) -> str:
     """Wait for the file that a scheduler writes: Dask would do so for ever."""
     begun = time.monotonic()
     while not os.path.exists(path):
-        if time.monotonic() - begun > SILENT_S:
+        if time.monotonic() - begun > SCHEDULER_TIMEOUT_S:
             raise WorkersLostError(f"no Dask scheduler has written {path}: start one")
         time.sleep(POLL_S)
     return path
@@ -231,7 +231,7 @@ def gpu_workers(devices: Sequence[str]) -> dict[str, dict[str, Any]]:
     }
 
 
-def pick_gpus(wanted: str, visible: str | None) -> list[str]:
+def select_gpus(wanted: str, visible: str | None) -> list[str]:
     """Name the devices that workers are started for.
 
     Args:
@@ -259,19 +259,19 @@ def pick_gpus(wanted: str, visible: str | None) -> list[str]:
     return [names[number].strip() for number in numbers]
 
 
-class DaskCrew:
-    """The workers of a Dask client, as a ``Crew``."""
+class DaskPool:
+    """The workers of a Dask client, as a ``WorkerPool``."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
         self._futures: dict[str, Any] = {}
-        self._inbox: SimpleQueue[News] = SimpleQueue()
+        self._inbox: SimpleQueue[WorkerEvent] = SimpleQueue()
         # Two runs on one cluster may do units of one name, for two roots.
         self._mark = uuid.uuid4().hex[:8]
         self._topics = {
-            COMING_TOPIC: self._hear,
-            MEMORY_TOPIC: self._hear_full,
-            f"{SHARE_TOPIC}-{self._mark}": self._hear_share,
+            WORKERS_TOPIC: self._on_worker_event,
+            MEMORY_TOPIC: self._on_memory_full,
+            f"{PROGRESS_TOPIC}-{self._mark}": self._on_progress,
         }
         for topic, hear in self._topics.items():
             client.subscribe_topic(topic, hear)
@@ -283,7 +283,7 @@ class DaskCrew:
                 self._client.unsubscribe_topic(topic)
 
     @property
-    def inbox(self) -> "SimpleQueue[News]":
+    def inbox(self) -> "SimpleQueue[WorkerEvent]":
         """What they report, as it comes in."""
         return self._inbox
 
@@ -291,12 +291,12 @@ class DaskCrew:
         """Hand out a task as a try of that name."""
         key = f"{name}-{self._mark}"
         future = self._client.submit(
-            _do_telling, task, key, self._mark, key=key, retries=RETRIES, pure=False
+            _run_with_progress, task, key, self._mark, key=key, retries=RETRIES, pure=False
         )
         self._futures[key] = future
-        future.add_done_callback(lambda _: self._inbox.put(Ended(name)))
+        future.add_done_callback(lambda _: self._inbox.put(TaskEnded(name)))
 
-    def take(self, name: str) -> Outcome | Broken:
+    def take(self, name: str) -> Outcome | TaskFailure:
         """Return what became of a try that has ended.
 
         Raises:
@@ -313,7 +313,7 @@ class DaskCrew:
         if error is None:
             raise self._lost()
         trace = "".join(traceback.format_tb(future.traceback()))
-        return Broken(error, trace, isinstance(error, _dask().KilledWorker))
+        return TaskFailure(error, trace, isinstance(error, _dask().KilledWorker))
 
     def threads(self) -> int:
         """Count how many tasks they can do at once.
@@ -325,7 +325,9 @@ class DaskCrew:
         if client.status != "running":
             raise self._lost()
         try:
-            found = client.sync(client.scheduler.ncores, callback_timeout=SILENT_S)
+            found = client.sync(
+                client.scheduler.ncores, callback_timeout=SCHEDULER_TIMEOUT_S
+            )
         except OSError as error:
             raise self._lost() from error
         return sum(found.values())
@@ -337,38 +339,38 @@ class DaskCrew:
             "there is one"
         )
 
-    def _hear(self, event: tuple[float, Mapping[str, Any]]) -> None:
+    def _on_worker_event(self, event: tuple[float, Mapping[str, Any]]) -> None:
         """Take note of workers that come and go."""
         about = event[1]
         if about.get("action") == "remove-worker" and not about.get("expected"):
             keys = map(str, about.get("processing-tasks", ()))
             ours = [key for key in keys if key.endswith(self._mark)]
             names = tuple(key.removesuffix(f"-{self._mark}") for key in ours)
-            self._inbox.put(Lost(str(about["worker"]), names))
+            self._inbox.put(WorkerLost(str(about["worker"]), names))
 
-    def _hear_full(self, event: tuple[float, Mapping[str, Any]]) -> None:
+    def _on_memory_full(self, event: tuple[float, Mapping[str, Any]]) -> None:
         about = event[1]
-        self._inbox.put(Full(str(about["worker"]), int(about["rss"])))
+        self._inbox.put(WorkerMemoryFull(str(about["worker"]), int(about["rss"])))
 
-    def _hear_share(self, event: tuple[float, Mapping[str, Any]]) -> None:
+    def _on_progress(self, event: tuple[float, Mapping[str, Any]]) -> None:
         about = event[1]
         name = str(about["key"]).removesuffix(f"-{self._mark}")
-        self._inbox.put(Share(name, about["done"], about["total"], about["note"]))
+        self._inbox.put(TaskProgress(name, about["done"], about["total"], about["note"]))
 
 
-def _do_telling(task: Task, key: str, mark: str) -> Outcome:
+def _run_with_progress(task: Task, key: str, mark: str) -> Outcome:
     """Do a task on a worker; now and then tell the driver how far it is."""
-    return do(task, _teller(key, mark))
+    return do(task, _progress_sender(key, mark))
 
 
-def _teller(key: str, mark: str) -> Progress:
+def _progress_sender(key: str, mark: str) -> Progress:
     worker, told = _dask().get_worker(), time.monotonic()
 
     def tell(done: float | int, total: float | int, note: str = "") -> None:
         nonlocal told
-        if time.monotonic() - told >= TELL_EVERY_S:
+        if time.monotonic() - told >= PROGRESS_EVERY_S:
             told = time.monotonic()
             about = {"key": key, "done": float(done), "total": float(total), "note": note}
-            worker.log_event(f"{SHARE_TOPIC}-{mark}", about)
+            worker.log_event(f"{PROGRESS_TOPIC}-{mark}", about)
 
     return tell

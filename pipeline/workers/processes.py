@@ -6,7 +6,7 @@ from pathlib import Path
 
 PROC = Path("/proc")
 BYTES_PER_KIB = 1024
-_FACTS = re.compile(r"^(PPid|VmRSS):\s+(\d+)", re.MULTILINE)
+_STATUS_LINES = re.compile(r"^(PPid|VmRSS):\s+(\d+)", re.MULTILINE)
 
 
 def memory_bytes(pid: int) -> int | None:
@@ -32,7 +32,7 @@ def _processes() -> Iterator[tuple[int, dict[str, int]]]:
             text = path.read_text()
         except OSError:  # It has ended meanwhile.
             continue
-        facts = {name: int(value) for name, value in _FACTS.findall(text)}
+        facts = {name: int(value) for name, value in _STATUS_LINES.findall(text)}
         yield int(path.parent.name), facts
 
 

@@ -18,21 +18,21 @@ from pipeline.engine.units import Outcome, Task, Tell, WorkersLostError, failure
 RETRIES = 2
 """A unit that fails is tried so often again before it counts as failed."""
 TASKS_PER_THREAD = 2
-LOOK_S = 5.0
-"""Without news for so long, the crew is asked how many it still is."""
-NOBODY_S = 600.0
+COUNT_WORKERS_EVERY_S = 5.0
+"""Without news for so long, the pool is asked how many it still is."""
+NO_WORKER_TIMEOUT_S = 600.0
 """Without any worker for so long, a run gives up."""
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class TaskEnded:
     """A try of a unit has come to its end: take what became of it."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
-class Share:
+class TaskProgress:
     """How far a unit is, in its own steps."""
 
     name: str
@@ -42,7 +42,7 @@ class Share:
 
 
 @dataclass(frozen=True, slots=True)
-class Full:
+class WorkerMemoryFull:
     """A worker used more memory than it may, and is restarted."""
 
     worker: str
@@ -50,18 +50,18 @@ class Full:
 
 
 @dataclass(frozen=True, slots=True)
-class Lost:
+class WorkerLost:
     """A worker ended; the tries it had begin again on others."""
 
     worker: str
     names: tuple[str, ...]
 
 
-News = Ended | Share | Full | Lost
+WorkerEvent = TaskEnded | TaskProgress | WorkerMemoryFull | WorkerLost
 
 
 @dataclass(frozen=True, slots=True)
-class Broken:
+class TaskFailure:
     """Why a try came to nothing.
 
     Attributes:
@@ -76,17 +76,17 @@ class Broken:
 
 
 @runtime_checkable
-class Crew(Protocol):
+class WorkerPool(Protocol):
     """Workers, wherever they are."""
 
     @property
-    def inbox(self) -> SimpleQueue[News]:
+    def inbox(self) -> SimpleQueue[WorkerEvent]:
         """What they report, as it comes in."""
 
     def begin(self, name: str, task: Task) -> None:
         """Hand out a task as a try of that name."""
 
-    def take(self, name: str) -> Outcome | Broken:
+    def take(self, name: str) -> Outcome | TaskFailure:
         """Return what became of a try that has ended.
 
         Raises:
@@ -101,144 +101,144 @@ class Crew(Protocol):
         """
 
 
-class ByCrew:
-    """Does tasks by a crew of workers."""
+class PoolExecutor:
+    """Does tasks by a pool of workers."""
 
-    def __init__(self, crew: Crew) -> None:
-        self._crew = crew
+    def __init__(self, pool: WorkerPool) -> None:
+        self._crew = pool
 
     def run(
         self,
         tasks: Sequence[Task],
-        go_on: Callable[[], bool],
+        may_start: Callable[[], bool],
         progress: Progress,
         tell: Tell,
     ) -> Iterator[Outcome]:
-        """Do all tasks; begin no more once ``go_on()`` is False.
+        """Do all tasks; begin no more once ``may_start()`` is False.
 
         Raises:
-            WorkersLostError: if the crew is lost.
+            WorkersLostError: if the pool is lost.
         """
-        flow = _Flow(self._crew, list(reversed(tasks)), progress, tell)
-        while flow.begin(go_on):
+        flow = _Schedule(self._crew, list(reversed(tasks)), progress, tell)
+        while flow.begin(may_start):
             outcome = flow.listen()
             if outcome is not None:
                 yield outcome
-                flow.tell_progress()
+                flow.emit_progress()
 
 
 @dataclass(slots=True)
-class _Flow:
+class _Schedule:
     """Tasks on their way.
 
     Attributes:
-        crew: Who does them.
+        pool: Who does them.
         waiting: Those not begun, the next one last.
         progress: Is told how far the units under way are.
         tell: Is told of lost workers.
         suspects: Those that workers died of, or beside.
         under_way: By the names of their tries.
-        shares: How far they are.
+        progress_of: How far they are.
         window: How many may be under way.
     """
 
-    crew: Crew
+    pool: WorkerPool
     waiting: list[Task]
     progress: Progress
     tell: Tell
     suspects: list[Task] = field(default_factory=list)
     under_way: dict[str, Task] = field(default_factory=dict)
-    shares: dict[str, Share] = field(default_factory=dict)
+    progress_of: dict[str, TaskProgress] = field(default_factory=dict)
     window: int = 1
-    _tried: set[str] = field(default_factory=set)
-    _full: set[str] = field(default_factory=set)
-    _filling: set[str] = field(default_factory=set)
-    _looked: float = -math.inf
-    _manned: float = field(default_factory=time.monotonic)
-    _missed: bool = False
+    _tried_again: set[str] = field(default_factory=set)
+    _memory_full: set[str] = field(default_factory=set)
+    _filled_memory: set[str] = field(default_factory=set)
+    _counted_at: float = -math.inf
+    _workers_seen_at: float = field(default_factory=time.monotonic)
+    _workers_missing: bool = False
 
-    def begin(self, go_on: Callable[[], bool]) -> bool:
+    def begin(self, may_start: Callable[[], bool]) -> bool:
         """Hand out as many tasks as fit; tell whether any is under way."""
-        if time.monotonic() - self._looked > LOOK_S:
-            self._look()
-        while go_on():
+        if time.monotonic() - self._counted_at > COUNT_WORKERS_EVERY_S:
+            self._count_workers()
+        while may_start():
             if self.waiting and len(self.under_way) < self.window:
-                self._hand_out(self.waiting.pop(), "")
+                self._submit(self.waiting.pop(), "")
             elif self.suspects and not self.waiting and not self.under_way:
-                self._hand_out(self.suspects.pop(0), "-alone")
+                self._submit(self.suspects.pop(0), "-alone")
             else:
                 break
         return bool(self.under_way)
 
-    def _hand_out(self, task: Task, mark: str) -> None:
+    def _submit(self, task: Task, mark: str) -> None:
         name = f"{task.about['stage']}-{task.target.name}{mark}"
         self.under_way[name] = task
-        self.crew.begin(name, task)
+        self.pool.begin(name, task)
 
     def listen(self) -> Outcome | None:
         """Wait for one piece of news; return a unit's outcome if it was that."""
         try:
-            news = self.crew.inbox.get(timeout=LOOK_S)
+            news = self.pool.inbox.get(timeout=COUNT_WORKERS_EVERY_S)
         except Empty:
             return None
-        if isinstance(news, Ended):
+        if isinstance(news, TaskEnded):
             return self._end(news.name)
-        if isinstance(news, Full):
-            self._full.add(news.worker)
+        if isinstance(news, WorkerMemoryFull):
+            self._memory_full.add(news.worker)
             memory_gib = round(news.memory_bytes / (1 << 30), 2)
             self.tell("worker-full", worker=news.worker, memory_gib=memory_gib)
-        elif isinstance(news, Lost):
-            self._tell_lost(news)
+        elif isinstance(news, WorkerLost):
+            self._emit_worker_lost(news)
         elif news.name in self.under_way:
-            self.shares[news.name] = news
-            self.tell_progress()
+            self.progress_of[news.name] = news
+            self.emit_progress()
         return None
 
     def _end(self, name: str) -> Outcome | None:
-        found, task = self.crew.take(name), self.under_way.pop(name)
-        self.shares.pop(name, None)
+        found, task = self.pool.take(name), self.under_way.pop(name)
+        self.progress_of.pop(name, None)
         if isinstance(found, Outcome):
             return found
-        if found.killed and task.unit.name not in self._tried:
-            self._tried.add(task.unit.name)
+        if found.killed and task.unit.name not in self._tried_again:
+            self._tried_again.add(task.unit.name)
             self.suspects.append(task)
             return None
         outcome = failure(task.unit.name, found.error, found.trace, 0.0)
-        if task.unit.name in self._filling:
+        if task.unit.name in self._filled_memory:
             more = f"{outcome.error} (a worker that did it filled its memory)"
             return replace(outcome, error=more)
         return outcome
 
-    def _tell_lost(self, news: Lost) -> None:
+    def _emit_worker_lost(self, news: WorkerLost) -> None:
         names = [name for name in news.names if name in self.under_way]
         for name in names:
-            self.shares.pop(name, None)
+            self.progress_of.pop(name, None)
         units = sorted(self.under_way[name].unit.name for name in names)
-        if news.worker in self._full:
-            self._filling.update(units)
+        if news.worker in self._memory_full:
+            self._filled_memory.update(units)
         self.tell("worker-lost", worker=news.worker, units=units)
 
-    def _look(self) -> None:
+    def _count_workers(self) -> None:
         """See how many there are: a cluster may grow and shrink meanwhile."""
-        threads, now = self.crew.threads(), time.monotonic()
-        self._looked = now
-        self._manned = now if threads else self._manned
-        if now - self._manned > NOBODY_S:
+        threads, now = self.pool.threads(), time.monotonic()
+        self._counted_at = now
+        self._workers_seen_at = now if threads else self._workers_seen_at
+        if now - self._workers_seen_at > NO_WORKER_TIMEOUT_S:
             raise WorkersLostError(
-                f"no worker for {NOBODY_S / 60:g} minutes; what is done is kept: start "
-                "workers and run again"
+                f"no worker for {NO_WORKER_TIMEOUT_S / 60:g} minutes; what is done is "
+                "kept: start workers and run again"
             )
-        if not threads and not self._missed:
-            self.tell("workers-missing", patience_min=NOBODY_S / 60)
-        self._missed = not threads
+        if not threads and not self._workers_missing:
+            self.tell("workers-missing", timeout_min=NO_WORKER_TIMEOUT_S / 60)
+        self._workers_missing = not threads
         self.window = max(1, threads * TASKS_PER_THREAD)
 
-    def tell_progress(self) -> None:
+    def emit_progress(self) -> None:
         """Tell how far the units under way are, as one sum."""
-        shares = [share for share in self.shares.values() if share.total]
-        if len(shares) == 1:
-            self.progress(shares[0].done, shares[0].total, shares[0].note)
-        elif shares:
-            done = sum(min(1.0, share.done / share.total) for share in shares)
-            note = f"{len(shares)} at a time, one of them: {shares[-1].note}"
-            self.progress(done, 1.0, note if shares[-1].note else "")
+        progress_of = [share for share in self.progress_of.values() if share.total]
+        if len(progress_of) == 1:
+            self.progress(progress_of[0].done, progress_of[0].total, progress_of[0].note)
+        elif progress_of:
+            done = sum(min(1.0, share.done / share.total) for share in progress_of)
+            note = f"{len(progress_of)} at a time, one of them: {progress_of[-1].note}"
+            self.progress(done, 1.0, note if progress_of[-1].note else "")

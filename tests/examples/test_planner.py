@@ -9,7 +9,7 @@ import pytest
 from infgen.config import RolloutSettings
 from infgen.scene import Scene
 from pipeline.storage.scenes import SCENES_SCHEMA
-from pipeline.storage.weights import save_network, state_of
+from pipeline.storage.weights import save_network, state_dict_of
 from pipeline.storage.zarr_store import write_records
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -70,7 +70,7 @@ def test_the_planner_plays_a_logged_scene_with_given_weights(
     planner, street, tmp_path, capsys, crossing
 ):
     network = street.fresh_network(seed=3)
-    save_network(tmp_path, network, state_of(network), step=1)
+    save_network(tmp_path, network, state_dict_of(network), step=1)
     write_records(
         tmp_path / "scenes-000.zarr", [crossing()], Scene, SCENES_SCHEMA, compress=True
     )

@@ -21,7 +21,7 @@ def arm(name, **changes) -> Arm:
         "label": name,
         "profile": (),
         "settings": NOTHING,
-        "plays": {"long": NOTHING, "motion-only": NOTHING, "wosac": NOTHING},
+        "rollout_sets": {"long": NOTHING, "motion-only": NOTHING, "wosac": NOTHING},
         "start": None,
         "ablates": None,
         "published": None,

@@ -18,13 +18,13 @@ from infgen.tokens.tokenizer import tokenize_scene
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from pipeline.engine.events import Events
 from pipeline.engine.layout import Root
-from pipeline.engine.runner import Orders, Result, run
+from pipeline.engine.runner import RunOptions, StageResult, run
 from pipeline.engine.stage import Unit
 from pipeline.settings.request import Request
 from pipeline.stages.tokenize import SCHEMA
 from pipeline.stages.train.loader import TokenScenes
 from pipeline.stages.train.setup import Course
-from pipeline.storage.weights import save_network, state_of
+from pipeline.storage.weights import save_network, state_dict_of
 from pipeline.storage.zarr_store import write_records
 from tests.pipeline.finished import TINY
 
@@ -88,13 +88,13 @@ class Workshop:
         self,
         *overrides: str,
         targets: tuple[str, ...] = (),
-        orders: Orders | None = None,
+        run_options: RunOptions | None = None,
         events: list | None = None,
-    ) -> dict[str, Result]:
+    ) -> dict[str, StageResult]:
         listeners = () if events is None else (events.append,)
         plan = self.plan(*overrides, targets=targets)
         self.request(*overrides).remember(plan)
-        results = run(plan, orders or Orders(), Events(self.root, listeners))
+        results = run(plan, run_options or RunOptions(), Events(self.root, listeners))
         return {result.stage: result for result in results}
 
     def files(self) -> dict[str, bytes]:
@@ -218,5 +218,5 @@ def weights(tmp_path, metre_moves, bent_roads):
     network = Network(TINY, metre_moves, bent_roads, TokenSettings())
     folder = tmp_path / "train"
     folder.mkdir()
-    save_network(folder, network, state_of(network), step=7)
+    save_network(folder, network, state_dict_of(network), step=7)
     return folder

@@ -16,8 +16,8 @@ from pipeline.engine.stage import Unit
 from pipeline.stages import ingest
 from pipeline.stages.rollout import STAGE
 from pipeline.storage.rollouts import read_rollouts
-from pipeline.storage.scene_lookup import open_logs
-from pipeline.storage.weights import save_network, state_of
+from pipeline.storage.scene_lookup import open_scene_lookup
+from pipeline.storage.weights import save_network, state_dict_of
 from tests.exports.test_wosac import ABOUT
 from tests.metrics.golden import GOLDEN, needs_goldens
 
@@ -44,7 +44,7 @@ def played(record, metre_moves, bent_roads, tmp_path_factory, quiet):
     network = Network(TINY, metre_moves, bent_roads, TokenSettings())
     for folder in (weights, target):
         folder.mkdir()
-    save_network(weights, network, state_of(network), step=0)
+    save_network(weights, network, state_dict_of(network), step=0)
     paths = {"scenes": str(scenes), "weights": str(weights)}
     unit = Unit("v-00000", {"weights": "random"}, {**paths, "biases": {}, "rows": [0]})
     report = STAGE.work(unit, target, RolloutSettings(mode="wosac", batch=16), quiet)
@@ -55,7 +55,7 @@ def played(record, metre_moves, bent_roads, tmp_path_factory, quiet):
 @pytest.fixture(scope="module")
 def exported(record, played, tmp_path_factory):
     out = tmp_path_factory.mktemp("exported") / "submission.tar.gz"
-    export(Order("wosac", played, open_logs([str(record)]), out, ABOUT))
+    export(Order("wosac", played, open_scene_lookup([str(record)]), out, ABOUT))
     return out
 
 

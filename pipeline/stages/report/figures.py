@@ -8,7 +8,7 @@ import numpy as np
 
 from infgen.clock import CLOCK
 from infgen.views.charts.figures import Interval, Series, interval_chart, line_chart
-from pipeline.engine.stage import Done, Inputs
+from pipeline.engine.stage import FinishedUnit, Inputs
 from pipeline.stages.report.tables import BUCKETS, FEATURES
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def first_played(inputs: Inputs) -> Played | None:
     logs = {done.name: done for done in inputs.units("ingest")}
     for done in inputs.units("rollout"):
         rollout = next(iter(read_rollouts(done.path)), None)
-        log: Done | None = logs.get(done.name.rsplit("-", 1)[0])
+        log: FinishedUnit | None = logs.get(done.name.rsplit("-", 1)[0])
         if rollout is None or log is None:
             continue
         for scene in read_scenes(log.path):

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.engine.atomic import write_file
-from pipeline.engine.stage import Done, Inputs
+from pipeline.engine.stage import FinishedUnit, Inputs
 
 if TYPE_CHECKING:
     from infgen.rollout.rollout import Rollout
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 class Place(NamedTuple):
     """Units that hold a rollout, and the log it goes on from."""
 
-    played: Done
-    logged: Done
+    played: FinishedUnit
+    logged: FinishedUnit
 
 
 def write_players(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from infgen.config import ReportSettings, RolloutSettings
 from pipeline.engine.layout import RUN_FOLDER
 from pipeline.engine.manifest import read_manifest
-from pipeline.engine.stage import Done, Inputs, Progress, Report, Stage, Unit
+from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
 
 if TYPE_CHECKING:
     from infgen.metrics.long_term.reference import Counts
@@ -50,7 +50,7 @@ def work(unit: Unit, target: Path, settings: ReportSettings, progress: Progress)
 
 def finish(
     inputs: Inputs,
-    units: Sequence[Done],
+    units: Sequence[FinishedUnit],
     target: Path,
     settings: ReportSettings,
     progress: Progress,

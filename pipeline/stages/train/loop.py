@@ -18,7 +18,7 @@ from pipeline.stages.train.process_group import PeerError, Team, own_device
 from pipeline.stages.train.recorder import Journal, is_validated
 from pipeline.stages.train.setup import Course, TrainingError, repeatable
 from pipeline.stages.train.validation import validate
-from pipeline.storage.checkpoint import Training, load_checkpoint
+from pipeline.storage.checkpoint import TrainingState, load_checkpoint
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Trained:
 
 
 def train(
-    course: Course, training: Training, progress: Progress, team: Team | None = None
+    course: Course, training: TrainingState, progress: Progress, team: Team | None = None
 ) -> Trained:
     """Train from the last checkpoint on, to the last step.
 
@@ -69,7 +69,7 @@ def train(
         return Trained(found, run.figures())
 
 
-def _noise(course: Course, training: Training) -> Noise | None:
+def _noise(course: Course, training: TrainingState) -> Noise | None:
     """How scenes are disturbed to learn from; held-out ones never are."""
     network = training.network
     return make_noise(course.train, network.motion_codebook(), network.road_codebook())
@@ -80,7 +80,7 @@ class _Run:
     """What the first process does besides the steps."""
 
     course: Course
-    training: Training
+    training: TrainingState
     forward: Pass
     journal: Journal
 
@@ -153,6 +153,6 @@ def _step(descent: Descent, recipe: Recipe, parts: list[Any], step: int) -> Step
         ) from error
 
 
-def final_state(training: Training) -> dict[str, Tensor]:
+def final_state(training: TrainingState) -> dict[str, Tensor]:
     """Weights to keep: the averaged ones if there are any."""
     return {**training.network.state_dict(), **training.average}

@@ -22,7 +22,7 @@ from infgen.model.training.losses import Term, Terms, losses
 from pipeline.stages.train.precision import Pass
 from pipeline.stages.train.process_group import Team
 from pipeline.stages.train.setup import TrainingError
-from pipeline.storage.checkpoint import Training
+from pipeline.storage.checkpoint import TrainingState
 
 LEAST_WEIGHT = 1e-6
 SEED_BITS = 16
@@ -73,7 +73,7 @@ class Descent:
     """
 
     def __init__(
-        self, training: Training, settings: TrainSettings, team: Team, parts: int
+        self, training: TrainingState, settings: TrainSettings, team: Team, parts: int
     ) -> None:
         self._training, self._settings, self._team = training, settings, team
         self.forward = Pass(training.network, settings)
@@ -186,7 +186,7 @@ def learning_rate(settings: TrainSettings, step: int) -> float:
     return settings.learning_rate * 0.5 * (1 + math.cos(math.pi * share))
 
 
-def _move_average(training: Training, settings: TrainSettings, step: int) -> None:
+def _move_average(training: TrainingState, settings: TrainSettings, step: int) -> None:
     """Move the average towards the weights, faster at first: they are still far off."""
     decay = min(settings.ema_decay, (1 + step) / (10 + step))
     with torch.no_grad():

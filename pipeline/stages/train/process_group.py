@@ -145,9 +145,9 @@ def follow(take_part: Callable[[Mapping[str, Any], Team], None]) -> None:
         PeerError: if the first process is gone.
         Stopped: if the run is stopped.
     """
-    with signals.listening():
+    with signals.handling_signals():
         while (call := _next_call()) is not None:
-            with signals.patient(), _team(call["timeout_s"]) as team:
+            with signals.deferred(), _team(call["timeout_s"]) as team:
                 take_part(call["work"], team)
 
 

@@ -14,7 +14,7 @@ from pipeline.stages.train.setup import Course
 from pipeline.stages.train.tensorboard import EventFiles
 from pipeline.stages.train.throughput import Pace
 from pipeline.stages.train.train_log import TrainLog
-from pipeline.storage.checkpoint import Training, save_checkpoint
+from pipeline.storage.checkpoint import TrainingState, save_checkpoint
 
 LOG, PACE, EVENTS = "train.jsonl", "pace.jsonl", "tensorboard"
 LOG_LINES = 1000
@@ -26,7 +26,7 @@ class Journal:
     """Writes down what each step gave, and saves what is needed to go on from it."""
 
     def __init__(
-        self, course: Course, training: Training, first: int, progress: Progress
+        self, course: Course, training: TrainingState, first: int, progress: Progress
     ) -> None:
         how, folder = course.train, course.folder
         self._course, self._training, self._progress = course, training, progress

@@ -15,12 +15,12 @@ from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from pipeline.stages.train.loader import Recipe, TokenScenes
 from pipeline.stages.train.process_group import Team, own_device
 from pipeline.stages.train.sampler import Order
-from pipeline.storage.checkpoint import Training
-from pipeline.storage.weights import take_weights
+from pipeline.storage.checkpoint import TrainingState
+from pipeline.storage.weights import copy_weights
 
 
 class TrainingError(ValueError):
-    """Training that cannot go on."""
+    """TrainingState that cannot go on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Course:
         return Recipe(self.scenes, self.limits, order, parts, own)
 
 
-def begin(course: Course, motion: MotionVocabulary, roads: MapVocabulary) -> Training:
+def begin(course: Course, motion: MotionVocabulary, roads: MapVocabulary) -> TrainingState:
     """Make a network with its first weights, and its optimiser.
 
     Raises:
@@ -81,7 +81,7 @@ def begin(course: Course, motion: MotionVocabulary, roads: MapVocabulary) -> Tra
     torch.manual_seed(course.train.seed)
     network = Network(course.model, motion, roads, course.grid)
     if course.start is not None:
-        take_weights(network, course.start)
+        copy_weights(network, course.start)
     network = network.to(own_device())
     parameters = list(network.parameters())
     decay = course.train.weight_decay
@@ -94,7 +94,7 @@ def begin(course: Course, motion: MotionVocabulary, roads: MapVocabulary) -> Tra
         fused=True,
     )
     average = {name: p.detach().clone() for name, p in network.named_parameters()}
-    return Training(network, average if course.train.ema_decay else {}, optimiser)
+    return TrainingState(network, average if course.train.ema_decay else {}, optimiser)
 
 
 @contextmanager

@@ -14,18 +14,31 @@ from typing import TYPE_CHECKING, Any
 from infgen.config import ModelSettings, TokenSettings, TrainSettings, build
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import RUN_FOLDER, read_json
-from pipeline.engine.stage import Done, Inputs, Progress, Report, Source, Stage, Unit
-from pipeline.storage.initial_weights import ABOUT, START, WEIGHTS, find_start
+from pipeline.engine.stage import (
+    FinishedUnit,
+    Inputs,
+    Progress,
+    Report,
+    Source,
+    Stage,
+    Unit,
+)
+from pipeline.storage.initial_weights import (
+    DESCRIPTION,
+    INITIAL_WEIGHTS,
+    WEIGHTS,
+    find_initial_weights,
+)
 from pipeline.storage.splits import in_split
 
 if TYPE_CHECKING:
     from infgen.model.network import Network
     from pipeline.stages.train.process_group import Team
     from pipeline.stages.train.setup import Course
-    from pipeline.storage.checkpoint import Training
+    from pipeline.storage.checkpoint import TrainingState
 
 CODEBOOKS = ("motion.zarr", "roads.zarr")
-OUTPUTS = (WEIGHTS, ABOUT, "train.jsonl")
+OUTPUTS = (WEIGHTS, DESCRIPTION, "train.jsonl")
 DONE = "trained.json"
 """Below ``run``: all else is written, and no checkpoint is needed any more."""
 
@@ -47,7 +60,7 @@ def reads(root: Path, settings: Mapping[str, Any]) -> list[Source]:
     Raises:
         ConfigError: if there are none, or the key is of several.
     """
-    return find_start(root, "train.start", settings["train"].start)
+    return find_initial_weights(root, "train.start", settings["train"].start)
 
 
 def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
@@ -70,7 +83,7 @@ def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
     ]
 
 
-def _shards(inputs: Inputs, split: str) -> list[Done]:
+def _shards(inputs: Inputs, split: str) -> list[FinishedUnit]:
     return [done for done in inputs.units("tokenize") if in_split(done.name, split)]
 
 
@@ -78,12 +91,12 @@ def work(
     unit: Unit, target: Path, settings: Mapping[str, Any], progress: Progress
 ) -> Report:
     """Train, or go on training, and write the averaged weights."""
-    from pipeline.storage.checkpoint import drop_checkpoints  # noqa: PLC0415
+    from pipeline.storage.checkpoint import remove_checkpoints  # noqa: PLC0415
 
     done = target / RUN_FOLDER / DONE
     if not done.is_file():
         write_json(done, _train(unit, target, settings, progress))
-    drop_checkpoints(target)
+    remove_checkpoints(target)
     report: Report = read_json(done)
     return report
 
@@ -139,10 +152,10 @@ def take_part(call: Mapping[str, Any], team: "Team") -> None:
 
 def _prepare(
     task: Mapping[str, Any], target: Path, settings: Mapping[str, Any]
-) -> "tuple[Course, Training]":
+) -> "tuple[Course, TrainingState]":
     from pipeline.stages.train.loader import TokenScenes  # noqa: PLC0415
     from pipeline.stages.train.setup import Course, begin  # noqa: PLC0415
-    from pipeline.stages.vocabulary import load_codebooks  # noqa: PLC0415
+    from pipeline.stages.vocabulary import load_vocabularies  # noqa: PLC0415
 
     course = Course(
         model=settings["model"],
@@ -151,9 +164,9 @@ def _prepare(
         scenes=TokenScenes([Path(path) for path in task["scenes"]]),
         validation_split=TokenScenes([Path(path) for path in task["validation_split"]]),
         folder=target,
-        start=Path(task[START]) if START in task else None,
+        start=Path(task[INITIAL_WEIGHTS]) if INITIAL_WEIGHTS in task else None,
     )
-    return course, begin(course, *load_codebooks(Path(task["codebooks"])))
+    return course, begin(course, *load_vocabularies(Path(task["codebooks"])))
 
 
 def _say_nothing(done: float, total: float, note: str = "") -> None:
@@ -162,7 +175,7 @@ def _say_nothing(done: float, total: float, note: str = "") -> None:
 
 def finish(
     inputs: Inputs,
-    units: Sequence[Done],
+    units: Sequence[FinishedUnit],
     target: Path,
     settings: Mapping[str, Any],
     progress: Progress,

@@ -17,14 +17,14 @@ from infgen.model.training.losses import Terms, figures, losses, total
 from pipeline.stages.train.loader import held_out_batches
 from pipeline.stages.train.precision import Pass
 from pipeline.stages.train.setup import Course
-from pipeline.storage.checkpoint import Training
+from pipeline.storage.checkpoint import TrainingState
 
 Found = dict[str, Any]
 """Figures by name; ``<term>_bins`` are dictionaries of lists, one number a bin."""
 
 
 @torch.no_grad()
-def validate(course: Course, training: Training, forward: Pass) -> Found:
+def validate(course: Course, training: TrainingState, forward: Pass) -> Found:
     """Figures of the averaged weights over the held-out scenes; empty without any."""
     settings = course.train
     training.network.eval()

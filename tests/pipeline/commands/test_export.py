@@ -25,15 +25,15 @@ from infgen.sources.womd import decode_scene
 from infgen.sources.womd_write import encode_scenario, write_tfrecord
 from pipeline.commands.export import FORMATS, export
 from pipeline.commands.export_job import ExportError, Order
-from pipeline.commands.export_wosac import read_about
+from pipeline.commands.export_wosac import read_description
 from pipeline.commands.wosac import score_files
 from pipeline.engine.atomic import StoreError, write_json
 from pipeline.engine.layout import Root
-from pipeline.engine.locks import PATIENCE_S, LockedError, locked
+from pipeline.engine.locks import LOCK_TIMEOUT_S, LockedError, locked
 from pipeline.engine.stage import Unit
 from pipeline.stages import ingest
 from pipeline.storage.rollouts import ROLLOUTS_SCHEMA, read_rollouts
-from pipeline.storage.scene_lookup import open_logs
+from pipeline.storage.scene_lookup import open_scene_lookup
 from pipeline.storage.zarr_store import write_records
 from tests.exports.replays import replay, with_newcomer, without
 from tests.exports.submission_proto import Submission
@@ -115,7 +115,9 @@ def few(scenes, tmp_path_factory):
 @pytest.fixture
 def order(played, logs, tmp_path):
     out = tmp_path / "submission.tar.gz"
-    return Order("wosac", played, open_logs([str(logs)]), out, ABOUT, scenes_per_shard=2)
+    return Order(
+        "wosac", played, open_scene_lookup([str(logs)]), out, ABOUT, scenes_per_shard=2
+    )
 
 
 @pytest.fixture
@@ -250,7 +252,7 @@ def test_agents_that_no_model_plays_are_there_and_told_of(scenes, tmp_path):
     order = Order(
         to="wosac",
         rollouts=keep(tmp_path / "unit", rollouts),
-        logs=open_logs([str(tmp_path / "logs.tfrecord")]),
+        logs=open_scene_lookup([str(tmp_path / "logs.tfrecord")]),
         out=tmp_path / "s.tar.gz",
         about=ABOUT,
     )
@@ -306,7 +308,7 @@ def test_an_id_that_cannot_name_a_file_is_refused(order, scenes, tmp_path):
 
 
 def test_parquet_has_a_partition_per_scene_and_all_rows(few, logs, scenes, tmp_path):
-    order = Order("parquet", few, open_logs([str(logs)]), tmp_path / "table")
+    order = Order("parquet", few, open_scene_lookup([str(logs)]), tmp_path / "table")
 
     found = export(order)
 
@@ -327,7 +329,7 @@ def test_parquet_has_a_partition_per_scene_and_all_rows(few, logs, scenes, tmp_p
 
 @pytest.mark.parametrize("to", ["gpudrive", "scenarionet"])
 def test_there_is_a_file_per_scene_and_rollout(few, logs, scenes, tmp_path, to):
-    order = Order(to, few, open_logs([str(logs)]), tmp_path / "out")
+    order = Order(to, few, open_scene_lookup([str(logs)]), tmp_path / "out")
 
     found = export(order)
 
@@ -350,7 +352,7 @@ def test_a_killed_folder_goes_on_scene_by_scene_to_the_same_bytes(few, logs, tmp
     def files(folder):
         return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*.*")}
 
-    order = Order(to, few, open_logs([str(logs)]), tmp_path / "a")
+    order = Order(to, few, open_scene_lookup([str(logs)]), tmp_path / "a")
     with pytest.raises(_Stop):
         export(order, killed_after(2))
     assert not order.out.exists()
@@ -381,7 +383,7 @@ def test_lights_are_those_that_were_played(scenes, tmp_path, played, later):
     rollouts = keep(tmp_path / "unit", [replay(scene)])
     settings = {"rollout": {"lights": played} if played else {}}
     write_json(rollouts / "manifest.json", {"files": {}, "settings": settings})
-    logs = open_logs([str(tmp_path / "logs.tfrecord")])
+    logs = open_scene_lookup([str(tmp_path / "logs.tfrecord")])
 
     for to in ("gpudrive", "scenarionet"):
         export(Order(to, rollouts, logs, tmp_path / to))
@@ -432,7 +434,7 @@ def test_who_waited_for_another_process_finds_what_it_wrote(order):
         order.out.write_bytes(b"whole")
         holding.__exit__(None, None, None)
 
-    Timer(PATIENCE_S / 3, finish).start()
+    Timer(LOCK_TIMEOUT_S / 3, finish).start()
 
     with pytest.raises(ConfigError, match="exists; remove it"):
         export(order)
@@ -518,14 +520,14 @@ def test_a_wrong_file_of_who_submits_what_is_explained(tmp_path, text, reason):
     path.write_text(text)
 
     with pytest.raises(ConfigError) as refused:
-        read_about(path, Root(tmp_path))
+        read_description(path, Root(tmp_path))
 
     assert reason in str(refused.value)
 
 
 def test_a_missing_file_of_who_submits_what_says_what_is_expected(tmp_path):
     with pytest.raises(ConfigError, match="no such file; expected YAML with account_name"):
-        read_about(tmp_path / "about.yaml", Root(tmp_path))
+        read_description(tmp_path / "about.yaml", Root(tmp_path))
 
 
 def test_the_number_of_parameters_is_that_of_the_roots_network(tmp_path):
@@ -537,9 +539,9 @@ def test_the_number_of_parameters_is_that_of_the_roots_network(tmp_path):
     path = tmp_path / "about.yaml"
     path.write_text(YAML.replace("num_model_parameters: 11M\n", ""))
 
-    assert read_about(path, Root(tmp_path)).num_model_parameters == "999K"
+    assert read_description(path, Root(tmp_path)).num_model_parameters == "999K"
     path.write_text(YAML)
-    assert read_about(path, Root(tmp_path)).num_model_parameters == "11M"
+    assert read_description(path, Root(tmp_path)).num_model_parameters == "11M"
 
 
 @needs_goldens
@@ -547,7 +549,7 @@ def test_a_real_scene_scores_the_same_through_a_submission(tmp_path):
     record = next(GOLDEN.glob("*/scenario.tfrecord"))
     scene = decode_scene(next(iter_records(str(record))).data)
     rollouts = keep(tmp_path / "unit", many(scene))
-    logs = open_logs([str(record)])
+    logs = open_scene_lookup([str(record)])
     order = Order("wosac", rollouts, logs, tmp_path / "s.tar.gz", ABOUT)
 
     export(order)

@@ -13,8 +13,8 @@ from pipeline.engine.events import Events
 from pipeline.engine.layout import Root
 from pipeline.engine.locks import locked
 from pipeline.engine.registry import load_stage
-from pipeline.engine.runner import Orders
-from pipeline.settings.request import complete
+from pipeline.engine.runner import RunOptions
+from pipeline.settings.request import complete_request
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def rows(look):
 def test_a_root_without_any_run_is_waited_for(tmp_path):
     def ask():
         known = {"file": None, "profile": None, "records": (), "overrides": ()}
-        return complete(Root(tmp_path / "none"), **known, environ={})
+        return complete_request(Root(tmp_path / "none"), **known, environ={})
 
     look = Watcher(ask, {}).look()
 
@@ -53,7 +53,7 @@ def test_failures_of_the_last_run_are_counted_and_one_is_told(workshop, watcher)
     for name in ("a.txt", "b.txt"):
         workshop.text(name, "fail")
     workshop.text("c.txt", "well")
-    workshop.run(orders=Orders(keep_going=True))
+    workshop.run(run_options=RunOptions(keep_going=True))
 
     row = rows(watcher.look())["count"]
 
@@ -93,7 +93,7 @@ def test_a_running_stage_tells_all_there_is_to_know(making, watcher):
     assert look.running
     assert (row.state, row.done, row.units, row.what) == ("running", 30, 50, "steps")
     assert row.per_s > 0
-    assert row.left_s == pytest.approx(20 / row.per_s)
+    assert row.remaining_s == pytest.approx(20 / row.per_s)
     assert (row.at_work, row.failed, row.note) == (1, 1, "height 29")
     assert row.memory_bytes > 1 << 20
     assert row.run.startswith(f"process {os.getpid()} on {gethostname()} since ")
@@ -125,7 +125,7 @@ def test_what_units_set_aside_is_added_up_as_they_are_made(workshop, watcher, mo
     stage = replace(toy, work=work)
     monkeypatch.setattr("toy_count.STAGE", stage)
     workshop.text("c.txt", "more")
-    workshop.run(orders=Orders(keep_going=True))
+    workshop.run(run_options=RunOptions(keep_going=True))
 
     found = rows(watcher.look())
 

@@ -14,8 +14,8 @@ from pipeline.comparison.write import write_comparison
 from pipeline.engine.atomic import MANIFEST
 from pipeline.engine.events import Events
 from pipeline.engine.layout import Root, read_json
-from pipeline.engine.runner import Orders
-from pipeline.settings.request import LAST, recall
+from pipeline.engine.runner import RunOptions
+from pipeline.settings.request import LAST, read_request
 from pipeline.settings.stages_file import load_stages
 from tests.pipeline.conftest import TOYS
 
@@ -35,11 +35,11 @@ presets:
   mini:
     profile: steps
     seeds: 2
-    plays: {long: {}, brief: {rollout: {mode: brief}}}
+    rollout_sets: {long: {}, brief: {rollout: {mode: brief}}}
     arms:
-      tuned: {start: plain, train: {steps: 1}, plays: [brief]}
-      plain: {plays: {long: {score: {presence_radius_m: 75}}, brief: {}}}
-      other: {train: {steps: 7}, plays: [long]}
+      tuned: {start: plain, train: {steps: 1}, rollout_sets: [brief]}
+      plain: {rollout_sets: {long: {score: {presence_radius_m: 75}}, brief: {}}}
+      other: {train: {steps: 7}, rollout_sets: [long]}
 """
 
 
@@ -74,11 +74,11 @@ class _Shop:
         comparison = self.comparison(*words, **more)
         return legs_of(comparison, comparison.preset.chosen(arms), seeds)
 
-    def run(self, *words, arms=(), seeds=1, orders=None, **more):
+    def run(self, *words, arms=(), seeds=1, run_options=None, **more):
         comparison = self.comparison(*words, **more)
         legs = legs_of(comparison, comparison.preset.chosen(arms), seeds)
         events = Events(self.root, (self.told.append,))
-        return run_legs(comparison, legs, lambda plan: orders or Orders(), events)
+        return run_legs(comparison, legs, lambda plan: run_options or RunOptions(), events)
 
     def made(self, stage):
         return len(list(self.root.stage(stage).glob("*/manifest.json")))
@@ -177,7 +177,7 @@ def test_a_failing_arm_stops_neither_others_nor_their_seeds(shop):
 
 def test_who_goes_on_from_failed_weights_is_left_out_and_says_so(shop):
     text = (shop.folder / "stages.yaml").read_text()
-    text = text.replace("plain: {plays", "plain: {train: {fail: true}, plays")
+    text = text.replace("plain: {rollout_sets", "plain: {train: {fail: true}, rollout_sets")
     (shop.folder / "stages.yaml").write_text(text)
 
     ran = {(one.leg.arm.name, one.leg.play): one for one in shop.run()}
@@ -218,7 +218,7 @@ def test_seeds_are_not_set_by_hand(shop):
 def test_what_is_made_again_is_made_once(shop):
     shop.run()
 
-    ran = shop.run(orders=Orders(force=frozenset({"train"})), arms=["plain"])
+    ran = shop.run(run_options=RunOptions(force=frozenset({"train"})), arms=["plain"])
 
     states = [[result.state for result in one.results] for one in ran]
     assert states == [
@@ -230,7 +230,7 @@ def test_what_is_made_again_is_made_once(shop):
 def test_a_run_is_remembered_as_if_it_had_been_asked_for_alone(shop):
     ran = shop.run(arms=["plain"])
 
-    kept = recall(shop.root, "preset.mini.plain.0.long")
+    kept = read_request(shop.root, "preset.mini.plain.0.long")
     assert kept["keys"] == ran[0].keys
     last = read_json(shop.root.refs / LAST)
     assert last["profile"] == "steps"

@@ -1,7 +1,7 @@
 import pytest
 
 from pipeline.engine.atomic import StoreError
-from pipeline.engine.code_hash import code_hash, modules_of
+from pipeline.engine.code_hash import code_hash, imported_modules
 from pipeline.engine.registry import MODULES, load_stage
 
 
@@ -23,7 +23,7 @@ def test_code_without_a_source_is_refused():
 
 
 def test_what_decides_rollouts_is_found_through_imports():
-    found = modules_of(("pipeline.stages.rollout", "pipeline.stages.simulation"))
+    found = imported_modules(("pipeline.stages.rollout", "pipeline.stages.simulation"))
 
     assert found.keys() >= {"infgen.geometry", "infgen.rollout.session", "infgen.model"}
     assert "infgen.config" not in found, "settings are in keys by their values"
@@ -41,7 +41,7 @@ def test_imports_are_followed_into_functions_and_from_module_to_module(
     (library / "far.py").write_text("TWO = 2\n")
     (library / "near.py").write_text("from made_library.far import TWO\n")
     (tmp_path / "made_stage.py").write_text("def work():\n    import made_library.near\n")
-    one = modules_of(("made_stage",))
+    one = imported_modules(("made_stage",))
 
     assert set(one) == {"made_stage", "made_library", "made_library.near",
                         "made_library.far"}  # fmt: skip
@@ -53,4 +53,4 @@ def test_stages_name_modules_of_the_pipeline_alone(stage):
 
     assert named
     assert all(name.startswith("pipeline.") for name in named)
-    assert any(name.startswith("infgen.") for name in modules_of(named))
+    assert any(name.startswith("infgen.") for name in imported_modules(named))

@@ -5,9 +5,9 @@ import sys
 import pytest
 
 from pipeline.engine.atomic import remove_folder
-from pipeline.engine.garbage import PARTIAL_AGE_S, find_garbage, sweep
+from pipeline.engine.garbage import PARTIAL_AGE_S, find_garbage, remove_garbage
 from pipeline.engine.locks import LockedError, locked
-from pipeline.engine.runner import Orders
+from pipeline.engine.runner import RunOptions
 from pipeline.settings.request import named_weights
 
 
@@ -43,7 +43,7 @@ def test_finding_removes_nothing_and_sweeping_removes_just_that(workshop):
     garbage = find_garbage(workshop.root)
     assert all(each.path.is_dir() for each in garbage)
 
-    assert sweep(workshop.root) == garbage
+    assert remove_garbage(workshop.root) == garbage
 
     assert not any(each.path.exists() for each in garbage)
     assert {r.state for r in workshop.run("total.times=3").values()} == {"cached"}
@@ -63,7 +63,7 @@ def test_each_profile_keeps_its_latest(workshop):
 
 def test_units_of_an_unfinished_stage_are_kept(workshop):
     workshop.text("a.txt", "fail")
-    workshop.run(orders=Orders(keep_going=True))
+    workshop.run(run_options=RunOptions(keep_going=True))
 
     assert find_garbage(workshop.root) == []
 
@@ -84,7 +84,7 @@ def test_nothing_is_swept_while_a_run_goes_on(workshop):
     workshop.run("total.times=3")
 
     with locked(workshop.root.lock("climb")), pytest.raises(LockedError):
-        sweep(workshop.root)
+        remove_garbage(workshop.root)
 
     assert len(find_garbage(workshop.root)) == 5
 
@@ -100,7 +100,7 @@ def test_trash_is_garbage_at_once(workshop, monkeypatch):
         patch.setattr(shutil, "rmtree", lambda path, **how: None)
         remove_folder(unit)
 
-    assert kinds(sweep(workshop.root)) == ["left by a killed run"]
+    assert kinds(remove_garbage(workshop.root)) == ["left by a killed run"]
 
     assert list(workshop.root.units("count").glob("trash.*")) == []
 
@@ -126,7 +126,7 @@ def test_weights_that_a_request_starts_from_are_kept(trainer):
     start = f"train.start={first[:16]}"
     trainer.run(start)
 
-    assert sweep(trainer.root, named_weights(trainer.root)) == []
+    assert remove_garbage(trainer.root, named_weights(trainer.root)) == []
 
     assert trainer.run(start)["train"].state == "cached"
 
@@ -140,7 +140,7 @@ def test_weights_that_only_a_profile_starts_from_are_kept(trainer):
     request.remember(request.plan((), {}))
     trainer.run("train.seed=3")
 
-    assert sweep(trainer.root, named_weights(trainer.root)) == []
+    assert remove_garbage(trainer.root, named_weights(trainer.root)) == []
 
     assert request.plan((), {})["train"].sources
 
@@ -152,7 +152,7 @@ def test_weights_are_kept_by_their_folder_and_for_a_stage_not_made_yet(trainer):
     plan = trainer.plan("train.seed=3")
     trainer.request(f"build-vocab.start={folder}").remember(plan)
 
-    assert sweep(trainer.root, named_weights(trainer.root)) == []
+    assert remove_garbage(trainer.root, named_weights(trainer.root)) == []
 
 
 def test_weights_that_nothing_starts_from_any_more_are_garbage(trainer):
@@ -160,6 +160,8 @@ def test_weights_that_nothing_starts_from_any_more_are_garbage(trainer):
     trainer.run(f"train.start={first}")
     trainer.run("train.seed=3")
 
-    found = {each.path.name for each in sweep(trainer.root, named_weights(trainer.root))}
+    found = {
+        each.path.name for each in remove_garbage(trainer.root, named_weights(trainer.root))
+    }
 
     assert first in found

@@ -10,7 +10,7 @@ from pipeline.engine.manifest import crc32c, list_files, read_manifest, verify
 def made(workshop):
     """A made root, the folder of a stage and that of one of its units."""
     workshop.run()
-    stage = workshop.root.pointed("count")
+    stage = workshop.root.latest_folder("count")
     unit = read_manifest(stage)["units"][0]["key"]
     return workshop.root, stage, workshop.root.unit("count", unit)
 

@@ -3,7 +3,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from infgen.config import ConfigError
-from pipeline.engine.plan import PlanError, StageEntry, digest, needed, placeless
+from pipeline.engine.plan import (
+    PlanError,
+    StageEntry,
+    digest,
+    stages_in_order,
+    without_locations,
+)
 from pipeline.engine.stage import Unit
 
 
@@ -73,21 +79,21 @@ def test_unit_keys_leave_out_places_and_nothing_else(workshop):
 def test_only_what_a_target_needs_is_planned_each_after_what_it_reads():
     stages = graph(a=["sources"], b=["a"], c=["a"], d=["c", "b"])
 
-    assert needed(stages, ["d"]) == ["a", "c", "b", "d"]
-    assert needed(stages, ["b"]) == ["a", "b"]
-    assert needed(stages, ["c", "b"]) == ["a", "c", "b"]
+    assert stages_in_order(stages, ["d"]) == ["a", "c", "b", "d"]
+    assert stages_in_order(stages, ["b"]) == ["a", "b"]
+    assert stages_in_order(stages, ["c", "b"]) == ["a", "c", "b"]
 
 
 def test_stages_that_need_each_other_are_named():
     with pytest.raises(PlanError, match=r"stages.yaml:1: .*: a -> b -> c -> a"):
-        needed(graph(a=["b"], b=["c"], c=["a"]), ["a"])
+        stages_in_order(graph(a=["b"], b=["c"], c=["a"]), ["a"])
 
 
 def test_a_stage_that_does_not_exist_is_named_with_the_nearest():
     with pytest.raises(PlanError, match="'tokenise', which does not exist; did you mean"):
-        needed(graph(tokenize=[]), ["tokenise"])
+        stages_in_order(graph(tokenize=[]), ["tokenise"])
     with pytest.raises(PlanError, match=r"stages\.yaml:1 asks for stage 'x'"):
-        needed(graph(a=["x"]), ["a"])
+        stages_in_order(graph(a=["x"]), ["a"])
 
 
 def test_after_gives_all_that_reads_a_stage(workshop):
@@ -158,4 +164,4 @@ def test_a_digest_does_not_depend_on_the_order_of_keys(value):
 
 @given(json_values)
 def test_leaving_out_places_twice_is_leaving_them_out_once(value):
-    assert placeless(placeless(value)) == placeless(value)
+    assert without_locations(without_locations(value)) == without_locations(value)

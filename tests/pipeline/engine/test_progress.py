@@ -1,6 +1,6 @@
 import pytest
 
-from pipeline.engine.progress import Gauge, clock_time, figures
+from pipeline.engine.progress import ProgressMeter, clock_time, figures
 
 
 class Clock:
@@ -15,112 +15,112 @@ def clock():
     return Clock()
 
 
-def unit_done(gauge):
-    gauge.take({"event": "unit-done"})
+def unit_done(meter):
+    meter.take({"event": "unit-done"})
 
 
-def progress(gauge, done, total, note=""):
-    gauge.take({"event": "progress", "done": done, "total": total, "note": note})
+def progress(meter, done, total, note=""):
+    meter.take({"event": "progress", "done": done, "total": total, "note": note})
 
 
 def test_units_are_counted_with_those_made_before(clock):
-    gauge = Gauge("s", units=10, before=4, clock=clock)
+    meter = ProgressMeter("s", units=10, before=4, clock=clock)
     clock.now += 6
-    unit_done(gauge), unit_done(gauge), unit_done(gauge)
+    unit_done(meter), unit_done(meter), unit_done(meter)
 
-    assert gauge.done == 7
-    assert gauge.per_s == pytest.approx(0.5)
-    assert gauge.left_s == pytest.approx(6)
-    assert gauge.words() == "7 of 10 units, 0.5/s, 0:06 left"
+    assert meter.done == 7
+    assert meter.per_s == pytest.approx(0.5)
+    assert meter.remaining_s == pytest.approx(6)
+    assert meter.words() == "7 of 10 units, 0.5/s, 0:06 left"
 
 
 def test_the_rate_is_that_of_the_last_two_minutes(clock):
-    gauge = Gauge("s", units=1000, before=0, clock=clock)
+    meter = ProgressMeter("s", units=1000, before=0, clock=clock)
     for _ in range(300):  # Five minutes, a unit a second ...
         clock.now += 1
-        unit_done(gauge)
+        unit_done(meter)
     for _ in range(30):  # ... and five more at a tenth of that.
         clock.now += 10
-        unit_done(gauge)
+        unit_done(meter)
 
-    assert gauge.per_s == pytest.approx(0.1)
-    assert gauge.left_s == pytest.approx(6700)
+    assert meter.per_s == pytest.approx(0.1)
+    assert meter.remaining_s == pytest.approx(6700)
 
 
 def test_units_of_several_minutes_that_end_together_have_a_rate_too(clock):
-    gauge = Gauge("s", units=100, before=0, clock=clock)
+    meter = ProgressMeter("s", units=100, before=0, clock=clock)
     for _ in range(3):
         clock.now += 300
         for _ in range(8):  # Eight workers.
-            unit_done(gauge)
+            unit_done(meter)
 
-    assert gauge.per_s == pytest.approx(8 / 300)
+    assert meter.per_s == pytest.approx(8 / 300)
 
 
 def test_many_steps_are_written_in_full(clock):
-    gauge = Gauge("s", units=1, before=0, clock=clock)
-    progress(gauge, 12_345, 2_000_000)
+    meter = ProgressMeter("s", units=1, before=0, clock=clock)
+    progress(meter, 12_345, 2_000_000)
 
-    assert gauge.words() == "12345 of 2000000 steps"
+    assert meter.words() == "12345 of 2000000 steps"
 
 
 def test_part_of_a_unit_counts_in_part(clock):
-    gauge = Gauge("s", units=4, before=0, clock=clock)
-    unit_done(gauge)
-    progress(gauge, 5, 10)
+    meter = ProgressMeter("s", units=4, before=0, clock=clock)
+    unit_done(meter)
+    progress(meter, 5, 10)
 
-    assert gauge.done == 1.5
+    assert meter.done == 1.5
 
 
 def test_a_stage_of_one_unit_is_told_in_its_steps(clock):
-    gauge = Gauge("s", units=1, before=0, clock=clock)
-    progress(gauge, 100, 300, "loss 2.1")
+    meter = ProgressMeter("s", units=1, before=0, clock=clock)
+    progress(meter, 100, 300, "loss 2.1")
     clock.now += 10
-    progress(gauge, 150, 300, "loss 2.0")
+    progress(meter, 150, 300, "loss 2.0")
 
-    assert gauge.per_s == pytest.approx(5)  # Steps that a killed run took do not count.
-    assert gauge.words() == "150 of 300 steps, 5/s, 0:30 left, loss 2.0"
+    assert meter.per_s == pytest.approx(5)  # Steps that a killed run took do not count.
+    assert meter.words() == "150 of 300 steps, 5/s, 0:30 left, loss 2.0"
 
 
 def test_gathering_is_told_apart_from_units(clock):
-    gauge = Gauge("s", units=2, before=0, clock=clock)
-    unit_done(gauge), unit_done(gauge)
-    gauge.take({"event": "finish-started"})
-    progress(gauge, 3, 4, "coverage")
+    meter = ProgressMeter("s", units=2, before=0, clock=clock)
+    unit_done(meter), unit_done(meter)
+    meter.take({"event": "finish-started"})
+    progress(meter, 3, 4, "coverage")
 
-    assert gauge.done == gauge.total == 2
-    assert gauge.words() == "gathering 75%, coverage"
+    assert meter.done == meter.total == 2
+    assert meter.words() == "gathering 75%, coverage"
 
 
 def test_slow_work_is_told_in_seconds_each(clock):
-    gauge = Gauge("s", units=10, before=0, clock=clock)
+    meter = ProgressMeter("s", units=10, before=0, clock=clock)
     clock.now += 40
-    unit_done(gauge)
+    unit_done(meter)
 
-    assert gauge.words() == "1 of 10 units, 40 s each, 6:00 left"
+    assert meter.words() == "1 of 10 units, 40 s each, 6:00 left"
 
 
 def test_before_anything_is_done_nothing_is_promised(clock):
-    gauge = Gauge("s", units=10, before=2, clock=clock)
+    meter = ProgressMeter("s", units=10, before=2, clock=clock)
 
-    assert gauge.per_s is None
-    assert gauge.left_s is None
-    assert gauge.words() == "2 of 10 units"
+    assert meter.per_s is None
+    assert meter.remaining_s is None
+    assert meter.words() == "2 of 10 units"
 
 
 def test_the_first_of_many_steps_of_a_unit_promises_nothing(clock):
-    gauge = Gauge("s", units=6, before=0, clock=clock)
+    meter = ProgressMeter("s", units=6, before=0, clock=clock)
     clock.now += 57
-    progress(gauge, 1, 600)
+    progress(meter, 1, 600)
 
-    assert gauge.words() == "0.001667 of 6 units"
+    assert meter.words() == "0.001667 of 6 units"
 
 
 def test_progress_without_a_total_is_let_pass(clock):
-    gauge = Gauge("s", units=1, before=0, clock=clock)
-    progress(gauge, 0, 0)
+    meter = ProgressMeter("s", units=1, before=0, clock=clock)
+    progress(meter, 0, 0)
 
-    assert gauge.words() == "0 of 1 units"
+    assert meter.words() == "0 of 1 units"
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_only_plain_figures_are_shown():
 
 
 def test_the_steps_of_an_only_unit_have_a_name_of_their_own():
-    gauge = Gauge("s", units=1, before=0, what="scenes", clock=lambda: 0.0)
-    gauge.take({"event": "progress", "done": 3, "total": 12, "note": ""})
+    meter = ProgressMeter("s", units=1, before=0, what="scenes", clock=lambda: 0.0)
+    meter.take({"event": "progress", "done": 3, "total": 12, "note": ""})
 
-    assert gauge.words() == "3 of 12 scenes"
+    assert meter.words() == "3 of 12 scenes"

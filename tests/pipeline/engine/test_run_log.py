@@ -56,8 +56,8 @@ def test_a_run_is_followed_by_the_times_of_its_events(log):
     run.follow(NEW_YEAR_S + 16)
 
     assert (run.stage, run.workers, run.failed) == ("count", "local:4", 1)
-    assert run.gauge.done == 6
-    assert run.gauge.per_s == pytest.approx(4 / 16)
+    assert run.meter.done == 6
+    assert run.meter.per_s == pytest.approx(4 / 16)
 
 
 def test_time_does_not_run_backwards_where_clocks_differ(log):
@@ -67,7 +67,7 @@ def test_time_does_not_run_backwards_where_clocks_differ(log):
 
     run.follow(NEW_YEAR_S - 3600)
 
-    assert run.gauge.per_s == pytest.approx(1 / 8)
+    assert run.meter.per_s == pytest.approx(1 / 8)
 
 
 def test_between_stages_and_after_a_run_there_is_no_gauge(log):
@@ -75,7 +75,7 @@ def test_between_stages_and_after_a_run_there_is_no_gauge(log):
     log(1, "stage-done", stage="count", report={})
     run = RunLog(log.path)
     run.follow(NEW_YEAR_S)
-    assert (run.stage, run.gauge) == ("", None)
+    assert (run.stage, run.meter) == ("", None)
 
     log(2, "stage-started", stage="total", units=1, made=0)
     run.follow(NEW_YEAR_S)
@@ -83,4 +83,4 @@ def test_between_stages_and_after_a_run_there_is_no_gauge(log):
     log(3, "run-stopped", why="stopped by SIGINT")
     log(4, "progress", stage="total", done=1, total=2, note="")
     run.follow(NEW_YEAR_S)
-    assert run.gauge is None
+    assert run.meter is None

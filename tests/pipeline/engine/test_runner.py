@@ -10,7 +10,7 @@ from pipeline.engine.locks import LockedError, locked
 from pipeline.engine.manifest import read_manifest, verify
 from pipeline.engine.plan import PlanError
 from pipeline.engine.registry import load_stage
-from pipeline.engine.runner import Orders
+from pipeline.engine.runner import RunOptions
 from pipeline.engine.stage import Unit
 
 
@@ -69,7 +69,7 @@ def test_going_back_to_old_settings_costs_nothing(workshop):
     results = workshop.run()
 
     assert set(states(results).values()) == {"cached"}
-    folder = workshop.root.pointed("total")
+    folder = workshop.root.latest_folder("total")
     assert json.loads((folder / "total.json").read_text()) == 50.0
 
 
@@ -111,7 +111,7 @@ def test_force_makes_the_named_stage_and_those_after_it_again(workshop):
     workshop.run()
     before = workshop.files()
 
-    results = workshop.run(orders=Orders(force=frozenset({"total"})))
+    results = workshop.run(run_options=RunOptions(force=frozenset({"total"})))
 
     assert states(results) == {"count": "cached", "total": "made", "climb": "made"}
     assert results["total"].made == 2
@@ -134,7 +134,7 @@ def test_a_failed_unit_stops_the_run_and_names_the_reason(workshop):
 def test_keep_going_makes_the_other_units(workshop):
     workshop.text("a.txt", "fail")
 
-    results = workshop.run(orders=Orders(keep_going=True))
+    results = workshop.run(run_options=RunOptions(keep_going=True))
 
     assert results["count"].made == 1
     assert list(results["count"].errors) == ["a.txt"]
@@ -143,7 +143,7 @@ def test_keep_going_makes_the_other_units(workshop):
 
 def test_the_next_run_tries_failed_units_again_and_only_those(workshop):
     workshop.text("a.txt", "fail")
-    workshop.run(orders=Orders(keep_going=True))
+    workshop.run(run_options=RunOptions(keep_going=True))
     workshop.text("a.txt", "well")
 
     results = workshop.run()
@@ -164,7 +164,7 @@ def test_a_finish_that_fails_leaves_its_units_and_is_tried_again(workshop):
 
 def test_a_failed_unit_leaves_nothing_behind(workshop):
     workshop.text("a.txt", "fail")
-    workshop.run(orders=Orders(keep_going=True))
+    workshop.run(run_options=RunOptions(keep_going=True))
 
     assert not list(workshop.root.store.rglob("*.partial"))
 
@@ -187,9 +187,9 @@ def half_removed(folder):
 
 def test_a_unit_that_was_half_removed_is_made_again(workshop):
     workshop.run()
-    unit = next(iter(read_manifest(workshop.root.pointed("count"))["units"]))
+    unit = next(iter(read_manifest(workshop.root.latest_folder("count"))["units"]))
     half_removed(workshop.root.unit("count", unit["key"]))
-    half_removed(workshop.root.pointed("count"))
+    half_removed(workshop.root.latest_folder("count"))
 
     results = workshop.run()
 
@@ -201,7 +201,7 @@ def test_a_unit_that_was_half_removed_is_made_again(workshop):
 
 def test_a_stage_that_was_half_removed_is_made_again(workshop):
     workshop.run()
-    half_removed(workshop.root.pointed("count"))
+    half_removed(workshop.root.latest_folder("count"))
 
     assert states(workshop.run())["count"] == "made"
     assert states(workshop.run())["count"] == "cached"
@@ -217,7 +217,7 @@ def test_a_kill_while_folders_are_removed_leaves_none_half_removed(workshop, mon
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "rmtree", die)
         with pytest.raises(SystemExit):
-            workshop.run(orders=Orders(force=frozenset({"count"})))
+            workshop.run(run_options=RunOptions(force=frozenset({"count"})))
 
     workshop.run()
 
@@ -256,7 +256,7 @@ def test_a_resuming_stage_goes_on_where_it_was(workshop):
 
 def test_force_begins_a_resuming_stage_anew(workshop):
     workshop.run("climb.killed_at=3")
-    workshop.run("climb.killed_at=-1", orders=Orders(force=frozenset({"climb"})))
+    workshop.run("climb.killed_at=-1", run_options=RunOptions(force=frozenset({"climb"})))
 
     begun = (workshop.root.stage("climb") / "begun-at").read_text().split()
     assert begun == ["0", "0"]
@@ -279,7 +279,7 @@ def test_a_whole_stage_needs_no_lock(workshop):
 
 def test_manifests_hold_what_made_them_and_verify_finds_all_well(workshop):
     workshop.run()
-    folder = workshop.root.pointed("count")
+    folder = workshop.root.latest_folder("count")
     manifest = read_manifest(folder)
 
     assert manifest["settings"] == {"count": {"longest": 100, "sleep_s": 0.0}}
@@ -294,7 +294,7 @@ def test_manifests_hold_what_made_them_and_verify_finds_all_well(workshop):
 
 def test_what_varies_between_runs_is_kept_apart(workshop):
     workshop.run()
-    manifest = read_manifest(workshop.root.pointed("count"))
+    manifest = read_manifest(workshop.root.latest_folder("count"))
     unit = workshop.root.unit("count", manifest["units"][0]["key"])
 
     about = json.loads((unit / "run.json").read_text())
@@ -320,7 +320,7 @@ def test_other_code_makes_again_only_if_told_to(workshop, monkeypatch):
     monkeypatch.setattr("pipeline.engine.status.code_hash", lambda modules: "other")
 
     assert workshop.run()["count"].state == "cached"
-    assert workshop.run(orders=Orders(strict_code=True))["count"].state == "made"
+    assert workshop.run(run_options=RunOptions(strict_code=True))["count"].state == "made"
 
 
 @pytest.mark.parametrize("names", [("a", "a"), ("a/b",), ("",)])

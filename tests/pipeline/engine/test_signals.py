@@ -12,10 +12,10 @@ def send(number=signal.SIGTERM):
 
 
 @pytest.fixture(autouse=True)
-def listening():
-    with signals.listening():
+def handling_signals():
+    with signals.handling_signals():
         yield
-    assert signals._STATE.whole == signals._STATE.patient == 0
+    assert signals._STATE.whole == signals._STATE.deferred == 0
 
 
 @pytest.mark.parametrize("number", signals.SIGNALS)
@@ -58,7 +58,7 @@ def test_patient_work_stops_where_it_checks():
     done = []
 
     def work():
-        with signals.patient():
+        with signals.deferred():
             send()
             done.append("went on")
             signals.check()
@@ -71,7 +71,7 @@ def test_patient_work_stops_where_it_checks():
 
 def test_patient_work_that_never_checks_stops_at_its_end():
     def work():
-        with signals.patient():
+        with signals.deferred():
             send()
 
     with pytest.raises(Stopped):
@@ -82,7 +82,7 @@ def test_a_second_signal_does_not_wait():
     done = []
 
     def work():
-        with signals.patient():
+        with signals.deferred():
             send()
             done.append("first")
             send()
@@ -97,7 +97,7 @@ def test_a_write_within_patient_work_leaves_the_stop_to_the_check():
     done = []
 
     def work():
-        with signals.patient():
+        with signals.deferred():
             with signals.whole():
                 send()
             done.append("went on")
@@ -110,14 +110,14 @@ def test_a_write_within_patient_work_leaves_the_stop_to_the_check():
 
 def test_handlers_are_put_back():
     inner = signal.getsignal(signal.SIGTERM)
-    with signals.listening():
+    with signals.handling_signals():
         pass
 
     assert signal.getsignal(signal.SIGTERM) is inner
 
 
 def test_a_stop_that_was_heard_is_over_with_the_block():
-    with pytest.raises(Stopped), signals.listening():
+    with pytest.raises(Stopped), signals.handling_signals():
         send()
 
     with signals.whole():
@@ -125,5 +125,5 @@ def test_a_stop_that_was_heard_is_over_with_the_block():
 
 
 def test_without_a_signal_nothing_stops():
-    with signals.patient(), signals.whole():
+    with signals.deferred(), signals.whole():
         signals.check()

@@ -5,15 +5,15 @@ import pytest
 from pipeline.engine.locks import locked
 from pipeline.engine.plan import PlanError
 from pipeline.engine.registry import load_stage
-from pipeline.engine.runner import Orders
-from pipeline.engine.status import OTHER_CODE, standings
+from pipeline.engine.runner import RunOptions
+from pipeline.engine.status import OTHER_CODE, stage_statuses
 
 
 @pytest.fixture
 def status(workshop):
     def look(*overrides, profile=None, **more):
         request = workshop.request(*overrides, profile=profile)
-        found = standings(request.plan((), {}), request.made(), **more)
+        found = stage_statuses(request.plan((), {}), request.made(), **more)
         return {standing.stage: standing for standing in found}
 
     return look
@@ -73,7 +73,7 @@ def test_many_files_are_counted_and_few_named(workshop, status):
 
 def test_units_already_made_are_counted(workshop, status):
     workshop.text("c.txt", "fail")
-    workshop.run(orders=Orders(keep_going=True))
+    workshop.run(run_options=RunOptions(keep_going=True))
     workshop.text("c.txt", "well")
 
     assert told(status())["count"] == ("missing", "not made yet; 2 of 3 units made")
@@ -82,7 +82,7 @@ def test_units_already_made_are_counted(workshop, status):
 def test_a_failed_unit_is_named_with_its_error(workshop, status):
     workshop.text("a.txt", "fail")
     workshop.text("b.txt", "fail")
-    workshop.run(orders=Orders(keep_going=True))
+    workshop.run(run_options=RunOptions(keep_going=True))
 
     state, why = told(status())["count"]
 

@@ -23,17 +23,17 @@ presets:
     train: {batch_scenes: 4}
     towns:
       training: {scenes: 40, seconds: 9.1}
-    plays:
+    rollout_sets:
       long: {rollout: {mode: long, count: 2}}
       brief: {rollout: {mode: wosac}}
     arms:
-      fine: {profile: motion, start: plain, train: {steps: 1}, plays: [long]}
+      fine: {profile: motion, start: plain, train: {steps: 1}, rollout_sets: [long]}
       plain:
         label: Plain
         profile: motion
-        plays: {long: {rollout: {count: 3}}, brief: {}}
-      whole: {published: InfGen, plays: [brief]}
-      part: {published: no cell token, ablates: whole, plays: [brief]}
+        rollout_sets: {long: {rollout: {count: 3}}, brief: {}}
+      whole: {published: InfGen, rollout_sets: [brief]}
+      part: {published: no cell token, ablates: whole, rollout_sets: [brief]}
 """
 
 
@@ -59,7 +59,7 @@ def test_a_preset_is_read_whole(load):
     assert mini.arms["plain"].label == "Plain"
     assert mini.arms["whole"].label == "InfGen"
     assert mini.arms["part"].ablates == "whole"
-    assert list(mini.arms["plain"].plays) == ["long", "brief"]
+    assert list(mini.arms["plain"].rollout_sets) == ["long", "brief"]
 
 
 def test_an_arm_comes_after_the_one_whose_weights_it_goes_on_from(load):
@@ -70,13 +70,13 @@ def test_preset_arm_play_and_the_arms_own_play_are_laid_over_each_other(load):
     arms = load().preset("mini").arms
 
     assert words(arms["fine"].settings) == {"train.batch_scenes=4", "train.steps=1"}
-    assert words(arms["fine"].plays["long"]) == {
+    assert words(arms["fine"].rollout_sets["long"]) == {
         "train.batch_scenes=4",
         "train.steps=1",
         "rollout.mode=long",
         "rollout.count=2",
     }
-    assert "rollout.count=3" in words(arms["plain"].plays["long"])
+    assert "rollout.count=3" in words(arms["plain"].rollout_sets["long"])
 
 
 def test_arms_are_picked_by_name_and_bring_those_that_they_start_from(load):
@@ -84,7 +84,7 @@ def test_arms_are_picked_by_name_and_bring_those_that_they_start_from(load):
     picked = mini.chosen(["fine", "whole"])
 
     assert [arm.name for arm in picked] == ["fine", "whole"]
-    assert [arm.name for arm in mini.starts_of(picked)] == ["plain"]
+    assert [arm.name for arm in mini.initial_arms(picked)] == ["plain"]
     assert len(mini.chosen([])) == 4
     with pytest.raises(ConfigError, match="no arm 'fin' in mini; did you mean 'fine'"):
         mini.chosen(["fin"])
@@ -109,11 +109,19 @@ def test_arms_are_picked_by_name_and_bring_those_that_they_start_from(load):
         ("start: plain", "start: plan", "stages.yaml:20: no start 'plan'; did you mean"),
         ("start: plain", "start: fine", "stages.yaml:20: arm 'fine' names itself"),
         ("train: {steps: 1}", "trian: {steps: 1}", "stages.yaml:20: fine: no entry"),
-        ("plays: [long]", "plays: [lang]", "stages.yaml:20: no play 'lang'; did you mean"),
-        ("plays: [long]", "plays: long", "stages.yaml:20: plays is 'long'"),
+        (
+            "rollout_sets: [long]",
+            "rollout_sets: [lang]",
+            "stages.yaml:20: no play 'lang'; did you mean",
+        ),
+        (
+            "rollout_sets: [long]",
+            "rollout_sets: long",
+            "stages.yaml:20: rollout_sets is 'long'",
+        ),
         ("label: Plain", "label: 3", "stages.yaml:22: label is 3; expected a word"),
         ("label: Plain", "start: fine", "arms start each other: fine -> plain -> fine"),
-        (", brief: {}", ", brif: {}", "stages.yaml:24: plays: no entry 'brif'"),
+        (", brief: {}", ", brif: {}", "stages.yaml:24: rollout_sets: no entry 'brif'"),
         ("      whole:", "      who le:", "stages.yaml:25: arm 'who le'; expected"),
         ("published: InfGen", "published: Infgen", "stages.yaml:25: no published 'Infg"),
         ("ablates: whole", "ablates: hole", "stages.yaml:26: no ablates 'hole'; did"),
@@ -142,8 +150,8 @@ def test_the_packaged_presets_compare_all_methods_of_the_paper_and_all_ablations
         assert preset.seeds == 3
         methods = [arm for arm in preset.arms.values() if arm.ablates is None]
         for arm in methods:
-            assert set(arm.plays) == {"long", "motion-only", "wosac"}
-            radius = "score.presence_radius_m=75" in arm.plays["long"].words
+            assert set(arm.rollout_sets) == {"long", "motion-only", "wosac"}
+            radius = "score.presence_radius_m=75" in arm.rollout_sets["long"].words
             assert radius == (arm.published != "InfGen")
         assert preset.arms["catk"].start == "smart"
     assert file.preset("womd-mini").towns == {}

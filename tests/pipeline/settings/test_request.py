@@ -5,7 +5,7 @@ import pytest
 
 from infgen.config import ConfigError
 from pipeline.engine.plan import PlanError
-from pipeline.settings.request import complete
+from pipeline.settings.request import complete_request
 from pipeline.settings.stages_file import DEFAULT_FILE
 
 
@@ -14,7 +14,7 @@ def ask(workshop, monkeypatch):
     monkeypatch.chdir(workshop.folder)
 
     def build(*overrides, records=(), profile=None, file=None):
-        return complete(
+        return complete_request(
             workshop.root,
             file=file,
             profile=profile,

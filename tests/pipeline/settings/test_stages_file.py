@@ -8,10 +8,10 @@ from infgen.config import (
     TokenSettings,
     TrainSettings,
     build,
-    decisive,
+    key_values,
 )
 from infgen.model.network import Network
-from pipeline.engine.plan import SOURCES, needed
+from pipeline.engine.plan import SOURCES, stages_in_order
 from pipeline.engine.registry import MODULES, load_stage
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
 
@@ -60,7 +60,7 @@ def test_the_packaged_file_loads_and_lists_every_stage_in_order():
     file = load_stages(DEFAULT_FILE, {})
 
     assert list(file.stages) == list(MODULES)
-    assert needed(file.stages, ["report"]) == list(MODULES)
+    assert stages_in_order(file.stages, ["report"]) == list(MODULES)
     assert {"demo", "smoke", "small", "tiny", "paper"} <= file.profiles.keys()
 
 
@@ -202,8 +202,8 @@ def test_settings_that_decide_nothing_are_left_out_of_keys():
     how = TrainSettings()
     other = TrainSettings(loader_workers=3, checkpoint_minutes=1.0, start="work/train")
 
-    assert decisive(other) == decisive(how)
-    assert decisive(TrainSettings(steps=1)) != decisive(how)
+    assert key_values(other) == key_values(how)
+    assert key_values(TrainSettings(steps=1)) != key_values(how)
 
 
 @pytest.mark.parametrize("value", [True, "true"])

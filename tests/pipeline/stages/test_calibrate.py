@@ -9,7 +9,7 @@ from infgen.config import CalibrateSettings, RolloutSettings, TokenSettings
 from infgen.metrics.flow import Turnover
 from infgen.scene import Scene
 from pipeline.engine.plan import PlanError
-from pipeline.engine.stage import Done
+from pipeline.engine.stage import FinishedUnit
 from pipeline.stages import calibrate as stage
 from pipeline.stages.calibration import Biases, read_found
 from pipeline.stages.flow_response import DESIGN
@@ -30,7 +30,7 @@ def with_settings(section, **values):
     return {**SETTINGS, section: dataclasses.replace(SETTINGS[section], **values)}
 
 
-NARROW = stage.narrow(SETTINGS)
+NARROW = stage.normalize(SETTINGS)
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def inputs(tmp_path, weights, drive, crossing, parked):
         folder.mkdir()
         path = folder / "scenes-000.zarr"
         write_records(path, scenes, Scene, SCENES_SCHEMA, compress=True)
-        done.append(Done(name, f"key of {name}", folder, {"scenes": len(scenes)}))
+        done.append(FinishedUnit(name, f"key of {name}", folder, {"scenes": len(scenes)}))
     return Finished(done, weights)
 
 
@@ -65,7 +65,7 @@ def told(point, played, logged=None):
         "logged": dataclasses.asdict(logged or Turnover(1000, 1000, 9000, 1000)),
         "refused": ["scene 1: too short"],
     }
-    return Done(f"play-{point}-000", "key", Path(), report)
+    return FinishedUnit(f"play-{point}-000", "key", Path(), report)
 
 
 def test_every_pair_of_biases_is_played_on_the_same_scenes(inputs):
@@ -91,7 +91,7 @@ def test_every_pair_of_biases_is_played_on_the_same_scenes(inputs):
 
 
 def test_a_split_of_which_there_is_no_file_is_named_with_those_that_there_are(inputs):
-    asked = stage.narrow(with_settings("calibrate", split="tuning"))
+    asked = stage.normalize(with_settings("calibrate", split="tuning"))
 
     with pytest.raises(PlanError, match=r"'tuning'.*there is: training, validation.*split"):
         stage.plan(inputs, asked)
@@ -110,23 +110,23 @@ def test_a_split_of_which_there_is_no_file_is_named_with_those_that_there_are(in
 def test_nothing_is_played_where_it_is_not_asked_for_or_nobody_comes(
     inputs, section, values
 ):
-    assert stage.plan(inputs, stage.narrow(with_settings(section, **values))) == []
+    assert stage.plan(inputs, stage.normalize(with_settings(section, **values))) == []
 
 
 def test_rollouts_that_differ_in_number_alone_share_a_calibration():
     for values in ({"count": 32}, {"seed": 9}, {"scenes": 5}, {"split": "testing"}):
-        assert stage.narrow(with_settings("rollout", **values)) == NARROW
+        assert stage.normalize(with_settings("rollout", **values)) == NARROW
     for values in ({"motion_top_p": 0.5}, {"seconds": 9.0}, {"lights": "log"}):
-        assert stage.narrow(with_settings("rollout", **values)) != NARROW
-    plain = stage.narrow(with_settings("calibrate", by="odds"))
+        assert stage.normalize(with_settings("rollout", **values)) != NARROW
+    plain = stage.normalize(with_settings("calibrate", by="odds"))
     other = {**with_settings("calibrate", by="odds"), "rollout": RolloutSettings()}
-    assert stage.narrow(other) == plain
+    assert stage.normalize(other) == plain
 
 
 def test_a_unit_counts_rollouts_and_logs_and_names_what_cannot_be_played(
     inputs, tmp_path, quiet
 ):
-    every = stage.narrow(with_settings("calibrate", scenes=0, scenes_per_unit=99))
+    every = stage.normalize(with_settings("calibrate", scenes=0, scenes_per_unit=99))
     unit = stage.plan(inputs, every)[0]
 
     report = stage.work(unit, tmp_path / "out", every, quiet)
@@ -147,8 +147,8 @@ def test_a_rollout_counts_until_its_ego_leaves_the_map(inputs, drive, tmp_path, 
     scene = drive(road_map=straight_road(10.0))
     path = folder / "scenes-000.zarr"
     write_records(path, [scene], Scene, SCENES_SCHEMA, compress=True)
-    short = Done("training.tfrecord-9", "key", folder, {"scenes": 1})
-    every = stage.narrow(with_settings("calibrate", scenes=0, scenes_per_unit=99))
+    short = FinishedUnit("training.tfrecord-9", "key", folder, {"scenes": 1})
+    every = stage.normalize(with_settings("calibrate", scenes=0, scenes_per_unit=99))
     unit = stage.plan(Finished([short], inputs.weights), every)[0]
 
     report = stage.work(unit, tmp_path / "out", every, quiet)
@@ -169,7 +169,7 @@ def test_a_higher_bias_lets_more_in(inputs, tmp_path, quiet):
 
 
 def with_reach(reach):
-    return stage.narrow(
+    return stage.normalize(
         with_settings(
             "calibrate",
             add_bias_range=reach,
@@ -223,7 +223,7 @@ def test_without_plays_the_last_validation_decides_or_nothing(
         inputs.weights,
         add_bins={"count": [400], "predicted": [200], "happened": [300]},
     )
-    settings = stage.narrow(with_settings("calibrate", by=by))
+    settings = stage.normalize(with_settings("calibrate", by=by))
 
     report = stage.finish(inputs, [], tmp_path / "out", settings, quiet)
 

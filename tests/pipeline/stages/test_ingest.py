@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from infgen.config import IngestSettings
 from infgen.sources.tfrecord import frame
 from infgen.sources.womd import decode_scene
-from pipeline.engine.stage import Done, Inputs, Source, Unit
+from pipeline.engine.stage import FinishedUnit, Inputs, Source, Unit
 from pipeline.stages import ingest
 from pipeline.stages.ingest import STAGE
 from pipeline.storage.scenes import read_scenes
@@ -37,10 +37,10 @@ class Files(Inputs):
         return self._sources
 
 
-def run_unit(path: Path, target: Path, **values) -> Done:
+def run_unit(path: Path, target: Path, **values) -> FinishedUnit:
     unit = Unit(path.name, {"source": "f"}, {"url": str(path)})
     report = STAGE.work(unit, target, IngestSettings(**values), no_progress)
-    return Done(path.name, "key", target, report)
+    return FinishedUnit(path.name, "key", target, report)
 
 
 def run_stage(folder: Path, files: dict[str, list[bytes]]) -> Path:
@@ -283,8 +283,8 @@ def test_the_report_says_which_rows_of_which_file_do_not_count(tmp_path):
         "quarantined": 0,
         "duplicates": 8,
         "units": {
-            "training.tfrecord-0.gz": {"left_out": [[0, 4]]},
-            "training.tfrecord-1": {"left_out": [[0, 1], [2, 5]]},
+            "training.tfrecord-0.gz": {"duplicate_rows": [[0, 4]]},
+            "training.tfrecord-1": {"duplicate_rows": [[0, 1], [2, 5]]},
         },
     }
 

@@ -8,12 +8,12 @@ import pytest
 from infgen.config import RolloutSettings, TokenSettings
 from infgen.model.network import Network
 from infgen.scene import Scene
-from pipeline.engine.stage import Done
+from pipeline.engine.stage import FinishedUnit
 from pipeline.stages import rollout as stage
 from pipeline.stages.calibration import Biases, write_found
 from pipeline.storage.rollouts import read_rollouts
 from pipeline.storage.scenes import SCENES_SCHEMA
-from pipeline.storage.weights import save_network, state_of
+from pipeline.storage.weights import save_network, state_dict_of
 from pipeline.storage.zarr_store import write_records
 from tests.pipeline.finished import TINY, Finished
 
@@ -40,7 +40,7 @@ def inputs(tmp_path, weights, drive, crossing, parked):
         folder = tmp_path / name
         folder.mkdir()
         write_records(folder / "scenes-000.zarr", part, Scene, SCENES_SCHEMA, compress=True)
-        done.append(Done(name, f"key of {name}", folder, {"scenes": len(part)}))
+        done.append(FinishedUnit(name, f"key of {name}", folder, {"scenes": len(part)}))
     return Finished(done, weights)
 
 
@@ -68,7 +68,9 @@ def test_the_split_is_cut_into_units_of_a_few_scenes(inputs):
     [(9, 8, [5, 4]), (17, 8, [6, 6, 5]), (8, 8, [8])],
 )
 def test_units_are_of_about_equal_work(inputs, scenes, most, parts):
-    shard = Done("validation.tfrecord-1", "key", inputs.scenes[1].path, {"scenes": scenes})
+    shard = FinishedUnit(
+        "validation.tfrecord-1", "key", inputs.scenes[1].path, {"scenes": scenes}
+    )
     settings = dataclasses.replace(SETTINGS, scenes_per_unit=most)
 
     units = stage.STAGE.plan(Finished([shard], inputs.weights), settings)
@@ -125,7 +127,7 @@ def test_of_limited_scenes_those_far_apart_are_played(inputs, tmp_path):
 def test_what_is_about_who_enters_or_leaves_decides_nothing_where_nobody_does(
     inputs, nobody, idle
 ):
-    narrow = stage.STAGE.narrow
+    normalize = stage.STAGE.normalize
     plain, other = (
         dataclasses.replace(SETTINGS, scenes=1, **nobody, **more) for more in ({}, idle)
     )
@@ -133,13 +135,15 @@ def test_what_is_about_who_enters_or_leaves_decides_nothing_where_nobody_does(
 
     (unit,) = stage.STAGE.plan(inputs, plain)
 
-    assert narrow({"rollout": other}) == narrow({"rollout": plain}) == {"rollout": plain}
+    assert (
+        normalize({"rollout": other}) == normalize({"rollout": plain}) == {"rollout": plain}
+    )
     assert unit.task["biases"] == {
         "add": 0.75 if plain.inserts else 0.0,
         "leave": -0.5 if plain.removes else 0.0,
     }
     everyone = {"rollout": dataclasses.replace(SETTINGS, **idle)}
-    assert narrow(everyone) == everyone
+    assert normalize(everyone) == everyone
 
 
 def test_every_scene_of_a_unit_is_played_as_often_as_asked(inputs, tmp_path):
@@ -205,7 +209,7 @@ def test_agents_far_away_are_played_where_everyone_is_asked_for(
     folder.mkdir()
     scene = build_scene(path, [0, 0])
     write_records(folder / "scenes-000.zarr", [scene], Scene, SCENES_SCHEMA, compress=True)
-    inputs = Finished([Done(folder.name, "key", folder, {"scenes": 1})], weights)
+    inputs = Finished([FinishedUnit(folder.name, "key", folder, {"scenes": 1})], weights)
     settings = dataclasses.replace(SETTINGS, everyone=everyone, insert=False, remove=False)
 
     _, rollouts = play(stage.STAGE.plan(inputs, settings)[0], tmp_path / "out", settings)
@@ -222,7 +226,7 @@ def test_the_report_says_what_the_weights_play(
 ):
     sizes = dataclasses.replace(TINY, **model)
     network = Network(sizes, metre_moves, bent_roads, TokenSettings())
-    save_network(inputs.folder("train"), network, state_of(network), step=7)
+    save_network(inputs.folder("train"), network, state_dict_of(network), step=7)
     settings = dataclasses.replace(SETTINGS, scenes=1, seconds=1.0)
     (unit,) = stage.STAGE.plan(inputs, settings)
 
@@ -237,7 +241,7 @@ def test_the_stage_sums_up_its_units(inputs, tmp_path):
     done = []
     for unit in stage.STAGE.plan(inputs, SETTINGS):
         report, _ = play(unit, tmp_path / unit.name)
-        done.append(Done(unit.name, "key", tmp_path / unit.name, report))
+        done.append(FinishedUnit(unit.name, "key", tmp_path / unit.name, report))
     target = tmp_path / "stage"
     target.mkdir()
 

@@ -10,7 +10,7 @@ from infgen.config import ConfigError, ReferenceSettings, ScoreSettings, TokenSe
 from infgen.metrics.long_term.protocols import FEATURES, PROTOCOLS
 from infgen.rollout.rollout import NEVER, Rollout
 from infgen.scene import Scene
-from pipeline.engine.stage import Done
+from pipeline.engine.stage import FinishedUnit
 from pipeline.stages import reference, score
 from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
 from pipeline.storage.scenes import SCENES_SCHEMA
@@ -52,13 +52,13 @@ class Inputs:
         return finish(reference, folder, self, self.units("reference"), settings)
 
 
-def do_units(stage, folder: Path, inputs: Inputs, settings) -> list[Done]:
+def do_units(stage, folder: Path, inputs: Inputs, settings) -> list[FinishedUnit]:
     """Do all units of a stage."""
     done = []
     for unit in stage.plan(inputs, settings):
         target = folder / unit.name
         told = json.loads(json.dumps(stage.work(unit, target, settings, silent)))
-        done.append(Done(unit.name, unit.name, target, told))
+        done.append(FinishedUnit(unit.name, unit.name, target, told))
     return done
 
 
@@ -95,19 +95,19 @@ def as_rollout(scene: Scene, index: int = 0, shift_m: float = 0.0, steps=None) -
     )
 
 
-def ingested(folder: Path, scenes, name=SOURCE) -> Done:
+def ingested(folder: Path, scenes, name=SOURCE) -> FinishedUnit:
     folder.mkdir(parents=True)
     write_records(folder / "scenes-000.zarr", scenes, Scene, SCENES_SCHEMA, compress=True)
-    return Done(name, f"key of {name}", folder, {"scenes": len(scenes)})
+    return FinishedUnit(name, f"key of {name}", folder, {"scenes": len(scenes)})
 
 
-def played(folder: Path, rollouts, name=f"{SOURCE}-00000") -> Done:
+def played(folder: Path, rollouts, name=f"{SOURCE}-00000") -> FinishedUnit:
     folder.mkdir(parents=True)
     path = folder / "rollouts-000.zarr"
     write_records(path, rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True)
     index = pl.DataFrame({"scenario_id": [one.scenario_id for one in rollouts]})
     index.write_parquet(folder / "index.parquet")
-    return Done(name, f"key of {name}", folder, {"rollouts": len(rollouts)})
+    return FinishedUnit(name, f"key of {name}", folder, {"rollouts": len(rollouts)})
 
 
 def silent(done, total, note=""):

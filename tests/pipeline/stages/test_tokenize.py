@@ -12,7 +12,7 @@ from infgen.scene import Scene
 from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
-from pipeline.engine.stage import Done, Unit
+from pipeline.engine.stage import FinishedUnit, Unit
 from pipeline.stages import tokenize as stage
 from pipeline.stages import vocabulary
 from pipeline.storage.scenes import SCENES_SCHEMA
@@ -25,7 +25,7 @@ SETTINGS = TokenSettings()
 class Finished:
     """Inputs of the stage: what earlier stages left on disk."""
 
-    scenes: list[Done]
+    scenes: list[FinishedUnit]
     codebooks: Path
     sources: tuple = ()
     asked: list = field(default_factory=list)
@@ -78,7 +78,7 @@ def ingested(tmp_path, scenes):
         folder = tmp_path / name
         folder.mkdir()
         write_records(folder / "scenes-000.zarr", part, Scene, SCENES_SCHEMA, compress=True)
-        done.append(Done(name, f"key of {name}", folder, {"scenes": len(part)}))
+        done.append(FinishedUnit(name, f"key of {name}", folder, {"scenes": len(part)}))
     return done
 
 
@@ -91,10 +91,10 @@ def tokenized(tmp_path, ingested, codebooks):
     ]
 
 
-def _do(unit: Unit, target: Path) -> Done:
+def _do(unit: Unit, target: Path) -> FinishedUnit:
     target.mkdir(parents=True)
     report = stage.work(unit, target, SETTINGS, no_progress)
-    return Done(unit.name, "key", target, report)
+    return FinishedUnit(unit.name, "key", target, report)
 
 
 def test_there_is_one_unit_per_file_and_it_hangs_on_scenes_and_codebooks(
@@ -188,7 +188,7 @@ def test_doing_a_unit_again_writes_the_same_bytes(tmp_path, ingested, codebooks,
 
 def test_an_empty_file_gives_an_empty_unit(tmp_path, codebooks):
     (tmp_path / "none").mkdir()
-    empty = Done("none.tfrecord", "key", tmp_path / "none", {"scenes": 0})
+    empty = FinishedUnit("none.tfrecord", "key", tmp_path / "none", {"scenes": 0})
     (unit,) = stage.plan(Finished([empty], codebooks), SETTINGS)
 
     done = _do(unit, tmp_path / "out")

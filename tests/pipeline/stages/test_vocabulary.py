@@ -11,9 +11,9 @@ from infgen.scene import AgentType, Scene
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from pipeline.engine.atomic import StoreError
 from pipeline.engine.plan import PlanError
-from pipeline.engine.stage import Done, Unit
+from pipeline.engine.stage import FinishedUnit, Unit
 from pipeline.stages import ingest, vocabulary
-from pipeline.stages.vocabulary import load_codebooks
+from pipeline.stages.vocabulary import load_vocabularies
 from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.weights import vocabulary_fingerprint
 from pipeline.storage.zarr_store import write_records
@@ -26,7 +26,7 @@ SHARED = Path(__file__).parents[3] / "../shared/data/womd"
 class Ingested:
     """Inputs of the stage: ingested files."""
 
-    files: list[Done]
+    files: list[FinishedUnit]
     sources: tuple = ()
 
     def units(self, name):
@@ -47,7 +47,7 @@ def no_progress(done, total, note=""):
 
 
 def fingerprint(folder):
-    return vocabulary_fingerprint(*load_codebooks(folder))
+    return vocabulary_fingerprint(*load_vocabularies(folder))
 
 
 def ingested(folder, files):
@@ -57,7 +57,7 @@ def ingested(folder, files):
         path = folder / name
         path.mkdir(parents=True)
         write_records(path / "scenes-000.zarr", scenes, Scene, SCENES_SCHEMA, compress=True)
-        done.append(Done(name, f"key of {name}", path, {"scenes": len(scenes)}))
+        done.append(FinishedUnit(name, f"key of {name}", path, {"scenes": len(scenes)}))
     return Ingested(done)
 
 
@@ -68,7 +68,7 @@ def build(inputs, folder, settings=SETTINGS, order=1):
         target = folder / "units" / unit.name
         target.mkdir(parents=True)
         report = vocabulary.work(unit, target, settings, no_progress)
-        units.append(Done(unit.name, f"key of {unit.name}", target, report))
+        units.append(FinishedUnit(unit.name, f"key of {unit.name}", target, report))
     target = folder / "vocab"
     target.mkdir()
     figures = vocabulary.finish(inputs, units[::order], target, settings, no_progress)
@@ -136,7 +136,7 @@ def test_codebooks_that_are_taken_need_nothing_to_learn_from(two_splits):
 
 def test_codebooks_come_back_as_they_were_written_with_a_report(two_splits, tmp_path):
     folder, figures = build(two_splits, tmp_path)
-    motion, roads = load_codebooks(folder)
+    motion, roads = load_vocabularies(folder)
     assert isinstance(motion, MotionVocabulary)
     assert isinstance(roads, MapVocabulary)
     assert (motion.num_motion_tokens, roads.num_map_tokens) == (96, 48)
@@ -156,7 +156,7 @@ def test_codebooks_come_back_as_they_were_written_with_a_report(two_splits, tmp_
 
 def test_a_logged_speed_is_written_without_error(two_splits, tmp_path):
     folder, _ = build(two_splits, tmp_path)
-    motion, _ = load_codebooks(folder)
+    motion, _ = load_vocabularies(folder)
     ends = motion.end_pose[AgentType.VEHICLE][motion.real[AgentType.VEHICLE], 0]
     for speed_mps in (3.0, 4.7, 6.4, 8.1):
         assert np.abs(ends - speed_mps / 2).min() < 1e-3
@@ -212,7 +212,7 @@ def test_scenes_without_cyclists_or_maps_still_give_whole_codebooks(
     ]
     files = {"training.tfrecord-0": bare[:2], "validation.tfrecord-0": bare[2:]}
     folder, figures = build(ingested(tmp_path / "ingest", files), tmp_path)
-    motion, roads = load_codebooks(folder)
+    motion, roads = load_vocabularies(folder)
     assert motion.path.shape == (3, 96, 6, 3)
     assert roads.curve_m.shape == (48, 11, 2)
     assert figures["real"]["cyclist"] == figures["roads_real"] == 0
@@ -248,7 +248,7 @@ def test_samples_of_a_file_are_bounded(tmp_path, traffic):
 
 def test_a_missing_codebook_is_an_error_that_says_so(tmp_path):
     with pytest.raises((StoreError, FileNotFoundError)):
-        load_codebooks(tmp_path)
+        load_vocabularies(tmp_path)
 
 
 @pytest.mark.slow
@@ -260,11 +260,11 @@ def test_codebooks_from_a_few_real_files_write_held_out_scenes_closely(tmp_path)
         target = tmp_path / "ingest" / file.name
         unit = Unit(file.name, {}, {"url": str(file)})
         report = ingest.work(unit, target, IngestSettings(limit=10), no_progress)
-        done.append(Done(file.name, file.name, target, report))
+        done.append(FinishedUnit(file.name, file.name, target, report))
     folder, figures = build(
         Ingested(done), tmp_path, VocabSettings(segments_per_shard=4096)
     )
-    motion, _ = load_codebooks(folder)
+    motion, _ = load_vocabularies(folder)
     report = json.loads((folder / "report.json").read_text())
 
     assert motion.num_motion_tokens == 2048

@@ -7,7 +7,7 @@ import torch
 from pipeline.stages.train.loop import train
 from pipeline.stages.train.setup import begin
 from pipeline.storage.checkpoint import load_checkpoint, save_checkpoint
-from pipeline.storage.weights import state_of
+from pipeline.storage.weights import state_dict_of
 
 
 def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(course, books):
@@ -16,13 +16,15 @@ def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(course, book
     half = course.folder / "checkpoint-000000004"
     half.mkdir()
     (half / "network.safetensors").write_bytes(b"half")
-    before = {name: value.clone() for name, value in state_of(training.network).items()}
+    before = {
+        name: value.clone() for name, value in state_dict_of(training.network).items()
+    }
     for parameter in training.network.parameters():
         parameter.data += 1
 
     assert load_checkpoint(course.folder, training) == 2
 
-    after = state_of(training.network)
+    after = state_dict_of(training.network)
     assert all(torch.equal(after[name], value) for name, value in before.items())
     save_checkpoint(course.folder, training, 4)
     assert [p.name for p in course.folder.glob("checkpoint-*")] == [half.name]

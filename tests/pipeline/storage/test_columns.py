@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, Int16, Int64
 
 from infgen.scene import Scene
 from infgen.tokens.scene_tokens import SceneTokens
-from pipeline.storage.columns import Unpacked, leaves, names, pack
+from pipeline.storage.columns import PackedRecords, leaves, names, pack
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ carts = st.builds(make_cart, st.text(), sizes, sizes, sizes, sizes, st.integers(
 
 @given(st.lists(carts, max_size=5))
 def test_unpacking_gives_back_what_was_packed(records):
-    unpacked = Unpacked(pack(records, Cart), Cart)
+    unpacked = PackedRecords(pack(records, Cart), Cart)
 
     assert len(unpacked) == len(records)
     for one, other in zip(records, unpacked, strict=True):
@@ -87,18 +87,18 @@ def test_sizes_of_a_dimension_are_kept_once_per_record():
 
     assert columns["dim.box"].tolist() == [2, 5]
     assert columns["offsets"].tolist() == [0, 1, 2, 0, 1, 2, 3, 4, 5]
-    assert Unpacked(columns, Cart).sizes("box").tolist() == [2, 5]
+    assert PackedRecords(columns, Cart).sizes("box").tolist() == [2, 5]
 
 
 def test_records_without_any_dimension_are_counted():
     coins = [Coin(1, 2.5), Coin(2, 3.5)]
 
-    assert list(Unpacked(pack(coins, Coin), Coin)) == coins
+    assert list(PackedRecords(pack(coins, Coin), Coin)) == coins
 
 
 def test_rows_count_from_the_end_and_slice_as_in_a_list():
     records = [make_cart(name) for name in "abcd"]
-    unpacked = Unpacked(pack(records, Cart), Cart)
+    unpacked = PackedRecords(pack(records, Cart), Cart)
 
     assert unpacked[-1].name == "d"
     assert [record.name for record in unpacked[1:3]] == ["b", "c"]
@@ -107,7 +107,7 @@ def test_rows_count_from_the_end_and_slice_as_in_a_list():
 
 
 def test_arrays_are_views_of_the_columns():
-    unpacked = Unpacked(pack([make_cart(), make_cart()], Cart), Cart)
+    unpacked = PackedRecords(pack([make_cart(), make_cart()], Cart), Cart)
 
     assert np.shares_memory(unpacked[1].path_m, unpacked.column("path_m"))
 
@@ -138,10 +138,10 @@ def test_the_records_of_the_project_fit(kind):
     empty = pack([], kind)
 
     assert empty.keys() == names(kind)
-    assert len(Unpacked(empty, kind)) == 0
+    assert len(PackedRecords(empty, kind)) == 0
 
 
 def test_a_scene_comes_back(crossing):
     scene = crossing()
 
-    assert_equal_records(scene, Unpacked(pack([scene, scene], Scene), Scene)[1])
+    assert_equal_records(scene, PackedRecords(pack([scene, scene], Scene), Scene)[1])

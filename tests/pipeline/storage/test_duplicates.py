@@ -15,11 +15,11 @@ from pipeline.engine.events import Events
 from pipeline.engine.inputs import FinishedInputs
 from pipeline.engine.layout import Root
 from pipeline.engine.manifest import read_manifest
-from pipeline.engine.runner import Orders, run
-from pipeline.engine.stage import Done
+from pipeline.engine.runner import RunOptions, run
+from pipeline.engine.stage import FinishedUnit
 from pipeline.settings.request import Request
 from pipeline.settings.stages_file import DEFAULT_FILE
-from pipeline.storage.duplicates import read_scenes_of, rows_that_count, scenes_of
+from pipeline.storage.duplicates import read_task_scenes, scenes_task, unique_rows
 from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.splits import spread
 from pipeline.storage.zarr_store import write_records
@@ -30,9 +30,12 @@ SECOND = "validation.tfrecord-00001-of-00002"
 TWIN = f"{FIRST}.gz"
 
 
-def file_of(path: Path, scenes: int, *left_out: list[int]) -> Done:
-    report = {"scenes": scenes, **({"left_out": list(left_out)} if left_out else {})}
-    return Done(path.name, "key", path, report)
+def file_of(path: Path, scenes: int, *duplicate_rows: list[int]) -> FinishedUnit:
+    report = {
+        "scenes": scenes,
+        **({"duplicate_rows": list(duplicate_rows)} if duplicate_rows else {}),
+    }
+    return FinishedUnit(path.name, "key", path, report)
 
 
 @pytest.fixture
@@ -47,23 +50,23 @@ def ingested(tmp_path, scenes):
 def test_without_duplicates_all_scenes_count_and_tasks_say_no_more_than_where(tmp_path):
     done = file_of(tmp_path, 3)
 
-    assert rows_that_count(done) == [0, 1, 2]
-    assert scenes_of(done) == {"scenes": str(tmp_path)}
+    assert unique_rows(done) == [0, 1, 2]
+    assert scenes_task(done) == {"scenes": str(tmp_path)}
 
 
 @pytest.mark.parametrize(
-    ("left_out", "rows"),
+    ("duplicate_rows", "rows"),
     [([], [0, 1, 2]), ([[1, 2]], [0, 2]), ([[0, 1], [2, 3]], [1]), ([[0, 3]], [])],
 )
 def test_who_reads_the_scenes_that_a_task_names_reads_those_that_count(
-    ingested, scenes, left_out, rows
+    ingested, scenes, duplicate_rows, rows
 ):
-    done = file_of(ingested, 3, *left_out)
+    done = file_of(ingested, 3, *duplicate_rows)
 
-    task = json.loads(json.dumps(scenes_of(done)))
+    task = json.loads(json.dumps(scenes_task(done)))
 
-    assert rows_that_count(done) == rows
-    found = [scene.scenario_id for scene in read_scenes_of(task)]
+    assert unique_rows(done) == rows
+    found = [scene.scenario_id for scene in read_task_scenes(task)]
     assert found == [scenes[row].scenario_id for row in rows]
 
 
@@ -82,7 +85,7 @@ def made(folder: Path, *names: str) -> tuple[Root, dict[str, FinishedInputs]]:
     taken = ("build-vocab.start=builtin",)
     request = Request(root, DEFAULT_FILE, None, tuple(records), taken)
     plan = request.plan(["tokenize", "reference"], {})
-    results = run(plan, Orders(), Events(root))
+    results = run(plan, RunOptions(), Events(root))
     assert [result.errors for result in results] == [{}] * len(results)
     return root, {name: FinishedInputs(root, plan[name]) for name in plan.stages}
 
@@ -101,26 +104,28 @@ def test_a_file_that_is_there_twice_changes_nothing(tmp_path, source, monkeypatc
     root, plain = made(tmp_path / "plain", FIRST, SECOND)
     again, twice = made(tmp_path / "twice", FIRST, SECOND, TWIN)
 
-    report = read_manifest(again.pointed("ingest"))["report"]
+    report = read_manifest(again.latest_folder("ingest"))["report"]
     assert (report["scenes"], report["duplicates"]) == (5, 2)
-    assert twice["tokenize"].units("ingest")[1].report["left_out"] == [[0, 2]]
+    assert twice["tokenize"].units("ingest")[1].report["duplicate_rows"] == [[0, 2]]
     for stage in ("build-vocab", "tokenize", "reference"):
         keys = [
             {
                 unit["name"]: unit["key"]
-                for unit in read_manifest(each.pointed(stage))["units"]
+                for unit in read_manifest(each.latest_folder(stage))["units"]
                 if unit["name"] != TWIN
             }
             for each in (root, again)
         ]
         assert keys[0] == keys[1]
     names = [
-        pl.read_parquet(each.pointed("tokenize") / "index.parquet")["scenario_id"].to_list()
+        pl.read_parquet(each.latest_folder("tokenize") / "index.parquet")[
+            "scenario_id"
+        ].to_list()
         for each in (root, again)
     ]
     assert len(names[0]) == 3
     assert names[0] == names[1]
-    counts = [each.pointed("reference") / "counts.zarr" for each in (root, again)]
+    counts = [each.latest_folder("reference") / "counts.zarr" for each in (root, again)]
     files = [
         {
             path.relative_to(each): path.read_bytes()

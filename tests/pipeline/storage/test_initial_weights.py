@@ -12,11 +12,16 @@ from infgen.pretrained import builtin_weights
 from infgen.scene import Scene
 from pipeline.engine.atomic import StoreError, write_json
 from pipeline.engine.layout import Root
-from pipeline.engine.stage import Done
+from pipeline.engine.stage import FinishedUnit
 from pipeline.stages import vocabulary
-from pipeline.storage.initial_weights import ABOUT, WEIGHTS, find_start
+from pipeline.storage.initial_weights import DESCRIPTION, WEIGHTS, find_initial_weights
 from pipeline.storage.scenes import SCENES_SCHEMA
-from pipeline.storage.weights import load_codebooks, load_network, read_about, take_weights
+from pipeline.storage.weights import (
+    copy_weights,
+    load_network,
+    load_vocabularies,
+    read_description,
+)
 from pipeline.storage.weights import vocabulary_fingerprint as fingerprint
 from pipeline.storage.zarr_store import write_records
 
@@ -47,21 +52,21 @@ class Files:
 
 
 def test_nothing_is_found_where_nothing_is_named(tmp_path):
-    assert find_start(tmp_path, "train.start", "") == []
+    assert find_initial_weights(tmp_path, "train.start", "") == []
 
 
 def test_the_packages_own_weights_go_by_a_word(tmp_path):
-    (source,) = find_start(tmp_path, "train.start", "builtin")
+    (source,) = find_initial_weights(tmp_path, "train.start", "builtin")
 
     assert source.url == str(builtin_weights())
-    assert source.fingerprint == read_about(builtin_weights())["weights"]
+    assert source.fingerprint == read_description(builtin_weights())["weights"]
 
 
 def test_the_packages_weights_are_small_and_load():
     network = load_network(builtin_weights())
 
     files = {path.name: path.stat().st_size for path in builtin_weights().iterdir()}
-    assert set(files) == {WEIGHTS, ABOUT}
+    assert set(files) == {WEIGHTS, DESCRIPTION}
     assert sum(files.values()) <= LARGEST_BYTES
     assert network.settings.insertion_and_removal
     assert sum(p.numel() for p in network.parameters()) > 900_000
@@ -71,33 +76,33 @@ def test_the_start_of_a_key_is_enough_if_it_is_of_one_run_only(tmp_path):
     made = [Root(tmp_path).stage("train") / key for key in ("abcd01", "abcd02")]
     for folder in made:
         folder.mkdir(parents=True)
-        write_json(folder / ABOUT, {"weights": folder.name * 8})
+        write_json(folder / DESCRIPTION, {"weights": folder.name * 8})
 
-    (source,) = find_start(tmp_path, "train.start", "abcd02")
+    (source,) = find_initial_weights(tmp_path, "train.start", "abcd02")
     assert source.url == str(made[1])
     with pytest.raises(ConfigError, match=r"x.start is 'abcd', but several have it"):
-        find_start(tmp_path, "x.start", "abcd")
+        find_initial_weights(tmp_path, "x.start", "abcd")
     with pytest.raises(ConfigError, match=r"expected 'builtin', a folder with"):
-        find_start(tmp_path, "x.start", "ef")
+        find_initial_weights(tmp_path, "x.start", "ef")
 
 
 @pytest.mark.parametrize("about", [{}, [], {"schema": "infgen.model/1"}])
 def test_a_page_that_does_not_tell_of_weights_is_refused(tmp_path, about):
-    write_json(tmp_path / ABOUT, about)
+    write_json(tmp_path / DESCRIPTION, about)
 
     with pytest.raises(ConfigError, match=r"x.start: .*model.json lacks the entry 'weig"):
-        find_start(tmp_path, "x.start", str(tmp_path))
+        find_initial_weights(tmp_path, "x.start", str(tmp_path))
 
 
 def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_it():
     small = ModelSettings(
         width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4
     )
-    books = load_codebooks(builtin_weights())
+    books = load_vocabularies(builtin_weights())
     network = Network(small, *books, TokenSettings())
 
     with pytest.raises(StoreError) as told:
-        take_weights(network, builtin_weights())
+        copy_weights(network, builtin_weights())
 
     message = str(told.value)
     assert re.search(r"for \S+, \S+, \S+ and \d+ more tensors; they were", message)
@@ -114,19 +119,19 @@ def test_codebooks_are_those_of_the_weights_and_measured_on_the_records(tmp_path
         path.mkdir()
         scenes = [drive(speed_mps=speed_mps)]
         write_records(path / "scenes-000.zarr", scenes, Scene, SCENES_SCHEMA, compress=True)
-        files.append(Done(path.name, "key", path, {"scenes": 1}))
+        files.append(FinishedUnit(path.name, "key", path, {"scenes": 1}))
     inputs = Files(files, vocabulary.reads(tmp_path, settings))
     units = []
     for unit in vocabulary.plan(inputs, settings):
         folder = tmp_path / "units" / unit.name
         folder.mkdir(parents=True)
         report = vocabulary.work(unit, folder, settings, quiet)
-        units.append(Done(unit.name, "key", folder, report))
+        units.append(FinishedUnit(unit.name, "key", folder, report))
     (tmp_path / "vocab").mkdir()
     report = vocabulary.finish(inputs, units, tmp_path / "vocab", settings, quiet)
 
-    motion, roads = vocabulary.load_codebooks(tmp_path / "vocab")
-    assert fingerprint(motion, roads) == read_about(builtin_weights())["vocabulary"]
-    np.testing.assert_array_equal(motion.path, load_codebooks(builtin_weights())[0].path)
+    motion, roads = vocabulary.load_vocabularies(tmp_path / "vocab")
+    assert fingerprint(motion, roads) == read_description(builtin_weights())["vocabulary"]
+    np.testing.assert_array_equal(motion.path, load_vocabularies(builtin_weights())[0].path)
     assert report["real"]["vehicle"] == int(motion.real[0].sum())
     assert 0 <= report["error_m"]["vehicle"] < 0.2

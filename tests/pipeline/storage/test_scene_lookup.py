@@ -12,10 +12,10 @@ from pipeline.engine.stage import Unit
 from pipeline.stages import ingest
 from pipeline.storage import scene_lookup
 from pipeline.storage.scene_lookup import (
-    MissingLogError,
-    RecordLogs,
-    StoreLogs,
-    open_logs,
+    MissingSceneError,
+    RecordLookup,
+    StoreLookup,
+    open_scene_lookup,
     unit_folders,
 )
 
@@ -42,9 +42,9 @@ def ingested(source, tmp_path_factory):
     return target
 
 
-@pytest.mark.parametrize("kept_bytes", [1 << 30, 0], ids=["all kept", "none kept"])
-def test_records_are_found_in_any_order(source, records, kept_bytes):
-    found = RecordLogs([str(source)], kept_bytes)
+@pytest.mark.parametrize("cache_bytes", [1 << 30, 0], ids=["all kept", "none kept"])
+def test_records_are_found_in_any_order(source, records, cache_bytes):
+    found = RecordLookup([str(source)], cache_bytes)
 
     for scenario_id in [*reversed(records), *records]:
         assert found.find(scenario_id).scenario_id == scenario_id
@@ -53,7 +53,7 @@ def test_records_are_found_in_any_order(source, records, kept_bytes):
 def test_plain_records_are_found_again_by_their_offset(tmp_path, source, records):
     plain = tmp_path / "plain.tfrecord"
     plain.write_bytes(gzip.decompress(source.read_bytes()))
-    found = RecordLogs([str(plain)], kept_bytes=0)
+    found = RecordLookup([str(plain)], cache_bytes=0)
 
     for scenario_id in [*reversed(records), *records]:
         assert found.find(scenario_id).scenario_id == scenario_id
@@ -61,14 +61,14 @@ def test_plain_records_are_found_again_by_their_offset(tmp_path, source, records
 
 def test_records_that_nobody_asks_for_are_not_all_kept(source, records):
     largest = max(len(record.data) for record in records.values())
-    found = RecordLogs([str(source)], largest)
+    found = RecordLookup([str(source)], largest)
     found.find(list(records)[-1])
 
-    assert sum(map(len, found._kept.values())) <= largest
+    assert sum(map(len, found._cached.values())) <= largest
 
 
 def test_ingested_scenes_are_found_in_any_order(ingested, records):
-    found = StoreLogs([ingested])
+    found = StoreLookup([ingested])
 
     for scenario_id in [*reversed(records), *records]:
         assert found.find(scenario_id).scenario_id == scenario_id
@@ -77,17 +77,19 @@ def test_ingested_scenes_are_found_in_any_order(ingested, records):
 
 def test_both_hold_the_same_logs(source, ingested, records):
     scenario_id = next(iter(records))
-    raw, kept = (open_logs([str(name)]).find(scenario_id) for name in (source, ingested))
+    raw, kept = (
+        open_scene_lookup([str(name)]).find(scenario_id) for name in (source, ingested)
+    )
 
     assert isinstance(raw, Scene)
     assert raw.tracks.xyz_m.tobytes() == kept.tracks.xyz_m.tobytes()
 
 
 def test_a_missing_log_says_how_many_there_are(source, ingested, records):
-    with pytest.raises(MissingLogError, match=f"stray: none of {len(records)} records"):
-        open_logs([str(source)]).find("stray")
-    with pytest.raises(MissingLogError, match=f"scene stray: none of {len(records)} ing"):
-        open_logs([str(ingested)]).find("stray")
+    with pytest.raises(MissingSceneError, match=f"stray: none of {len(records)} records"):
+        open_scene_lookup([str(source)]).find("stray")
+    with pytest.raises(MissingSceneError, match=f"scene stray: none of {len(records)} ing"):
+        open_scene_lookup([str(ingested)]).find("stray")
 
 
 def test_a_damaged_record_is_named_where_a_log_is_missing(tmp_path, source, records):
@@ -97,9 +99,9 @@ def test_a_damaged_record_is_named_where_a_log_is_missing(tmp_path, source, reco
     damaged.write_bytes(gzip.compress(bytes(data)))
 
     with pytest.raises(
-        MissingLogError, match=r"1 unusable records: .*record 0: data check"
+        MissingSceneError, match=r"1 unusable records: .*record 0: data check"
     ):
-        RecordLogs([str(damaged)]).find(next(iter(records)))
+        RecordLookup([str(damaged)]).find(next(iter(records)))
 
 
 def test_a_file_without_any_record_is_a_wrong_word(tmp_path):
@@ -107,23 +109,23 @@ def test_a_file_without_any_record_is_a_wrong_word(tmp_path):
     path.write_text("nothing of the kind, and long enough")
 
     with pytest.raises(ConfigError, match=r"no usable record: .*not a TFRecord"):
-        open_logs([str(path)]).find("any")
+        open_scene_lookup([str(path)]).find("any")
     with pytest.raises(ConfigError, match="no records match"):
-        open_logs([str(tmp_path / "*.nothing")])
+        open_scene_lookup([str(tmp_path / "*.nothing")])
 
 
 def test_a_folder_of_records_is_no_store(tmp_path, source, records):
     (tmp_path / source.name).write_bytes(source.read_bytes())
 
     assert unit_folders(tmp_path) is None
-    assert open_logs([str(tmp_path)]).find(next(iter(records)))
+    assert open_scene_lookup([str(tmp_path)]).find(next(iter(records)))
 
 
 def test_a_store_of_other_things_is_refused(tmp_path):
     (tmp_path / "tokens-000.zarr").mkdir()
 
     with pytest.raises(ConfigError, match="holds no ingested scenes"):
-        open_logs([str(tmp_path)])
+        open_scene_lookup([str(tmp_path)])
 
 
 def test_the_id_is_that_of_the_decoded_scene(records):

@@ -12,10 +12,10 @@ from infgen.config import ConfigError
 from infgen.sources.tfrecord import BadRecord, iter_records
 from infgen.sources.womd_write import encode_scenario
 from pipeline.engine.events import Events
-from pipeline.engine.garbage import sweep
+from pipeline.engine.garbage import remove_garbage
 from pipeline.engine.layout import Root
-from pipeline.engine.runner import Orders, run
-from pipeline.engine.status import standings
+from pipeline.engine.runner import RunOptions, run
+from pipeline.engine.status import stage_statuses
 from pipeline.settings.request import Request
 from pipeline.settings.stages_file import DEFAULT_FILE
 from pipeline.storage.source_files import absolute, find_sources, fingerprint
@@ -153,10 +153,10 @@ def ingest(root):
     def make(*files):
         request = Request(root, DEFAULT_FILE, None, tuple(map(str, files)), ())
         plan = request.plan(("ingest",), {})
-        (standing,) = standings(plan, request.made())
+        (stage_status,) = stage_statuses(plan, request.made())
         request.remember(plan)
-        (result,) = run(plan, Orders(), Events(root, ()))
-        return standing, result
+        (result,) = run(plan, RunOptions(), Events(root, ()))
+        return stage_status, result
 
     return make
 
@@ -189,12 +189,12 @@ def test_a_damaged_file_is_read_again_when_it_was_mended(write, ingest, damaged,
 
     download(damaged, *records)
 
-    standing, mended = ingest(damaged, good)
-    assert (standing.state, standing.why) == (
+    stage_status, repaired = ingest(damaged, good)
+    assert (stage_status.state, stage_status.why) == (
         "stale",
         "1 changed file bad.tfrecord; 1 of 2 units made",
     )
-    assert (mended.state, mended.made, mended.report["quarantined"]) == ("made", 1, 0)
+    assert (repaired.state, repaired.made, repaired.report["quarantined"]) == ("made", 1, 0)
     assert ingest(damaged, good)[0].state == "cached"
 
 
@@ -202,16 +202,16 @@ def test_a_damaged_file_is_read_again_when_it_was_mended(write, ingest, damaged,
 def test_a_mended_file_stays_told_by_all_its_bytes(ingest, damaged, records, root, lost):
     ingest(damaged)
     download(damaged, *records)
-    _, mended = ingest(damaged)
+    _, repaired = ingest(damaged)
 
     os.utime(damaged, ns=(1, 1))
     if lost == "memory":
         root.fingerprints.unlink()
     elif lost:
-        assert len(sweep(root)) == 2  # The stage and its unit.
+        assert len(remove_garbage(root)) == 2  # The stage and its unit.
 
-    standing, again = ingest(damaged)
-    assert (standing.state, again.key) == ("cached", mended.key)
+    stage_status, again = ingest(damaged)
+    assert (stage_status.state, again.key) == ("cached", repaired.key)
 
 
 def test_a_file_cut_short_is_told_as_any_other_once_it_is_whole(write, records, root):
@@ -231,8 +231,8 @@ def test_a_file_that_is_still_as_damaged_is_not_read_again(ingest, damaged):
     copy.write_bytes(damaged.read_bytes())
     copy.replace(damaged)
 
-    standing, after = ingest(damaged)
-    assert (standing.state, after.key) == ("cached", before.key)
+    stage_status, after = ingest(damaged)
+    assert (stage_status.state, after.key) == ("cached", before.key)
 
 
 def test_sound_records_that_are_no_use_give_no_reason_to_read_a_file_again(
@@ -244,8 +244,8 @@ def test_sound_records_that_are_no_use_give_no_reason_to_read_a_file_again(
 
     os.utime(path, ns=(1, 1))
 
-    standing, after = ingest(path)
-    assert (standing.state, after.key) == ("cached", before.key)
+    stage_status, after = ingest(path)
+    assert (stage_status.state, after.key) == ("cached", before.key)
 
 
 def test_nothing_found_is_an_error_that_names_the_pattern(root, tmp_path):

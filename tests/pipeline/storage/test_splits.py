@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.engine.plan import PlanError
-from pipeline.engine.stage import Done
-from pipeline.storage.splits import files_of, in_split, split_of, spread
+from pipeline.engine.stage import FinishedUnit
+from pipeline.storage.splits import files_of_split, in_split, split_of, spread_evenly
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,9 @@ ALL = [list(range(9)), [0], [0, 1, 2, 3]]
 
 
 def ingested(*counts):
-    return [Done(str(at), "key", Path(), {"scenes": n}) for at, n in enumerate(counts)]
+    return [
+        FinishedUnit(str(at), "key", Path(), {"scenes": n}) for at, n in enumerate(counts)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -52,26 +54,26 @@ def ingested(*counts):
     ],
 )
 def test_scenes_are_taken_evenly_from_all_files_and_within_each(most, taken):
-    assert spread(ingested(9, 1, 4), most) == taken
+    assert spread_evenly(ingested(9, 1, 4), most) == taken
 
 
 def test_of_towns_of_ten_views_each_one_view_is_taken_of_every_town():
-    assert spread(ingested(20, 20, 20), 6) == [[0, 10]] * 3
-    assert spread([], 6) == []
+    assert spread_evenly(ingested(20, 20, 20), 6) == [[0, 10]] * 3
+    assert spread_evenly([], 6) == []
 
 
 def test_a_split_without_a_scene_is_refused_with_the_splits_there_are():
     files = [
-        Done("training.tfrecord-0", "key", Path(), {"scenes": 3}),
-        Done("validation.tfrecord-0", "key", Path(), {"scenes": 0}),
-        Done("validation.tfrecord-1", "key", Path(), {"scenes": 2}),
+        FinishedUnit("training.tfrecord-0", "key", Path(), {"scenes": 3}),
+        FinishedUnit("validation.tfrecord-0", "key", Path(), {"scenes": 0}),
+        FinishedUnit("validation.tfrecord-1", "key", Path(), {"scenes": 2}),
     ]
 
-    found = files_of(files, "validation", to="play", setting="rollout.split")
+    found = files_of_split(files, "validation", to="play", setting="rollout.split")
 
     assert [done.name for done in found] == [done.name for done in files[1:]]
     wrong = r"no file of split 'test' to play \(there is: training, validation\); set"
     with pytest.raises(PlanError, match=wrong):
-        files_of(files, "test", to="play", setting="rollout.split")
+        files_of_split(files, "test", to="play", setting="rollout.split")
     with pytest.raises(PlanError, match="no record of its 1 files is usable"):
-        files_of(files[:2], "validation", to="play", setting="rollout.split")
+        files_of_split(files[:2], "validation", to="play", setting="rollout.split")

@@ -11,9 +11,9 @@ import pytest
 
 from infgen.config import ConfigError
 from pipeline.engine.locks import LockedError
-from pipeline.engine.runner import Orders
+from pipeline.engine.runner import RunOptions
 from pipeline.engine.units import InProcess, WorkersLostError
-from pipeline.workers.dask_cluster import DaskWorkers, gpu_workers, parse, pick_gpus
+from pipeline.workers.dask_cluster import DaskWorkers, gpu_workers, parse, select_gpus
 from tests.clusters import Cluster
 
 # Dask leaves sockets and child processes to the garbage collector when it closes.
@@ -74,7 +74,7 @@ def test_without_a_device_gpu_workers_are_refused():
 def test_devices_are_named_as_this_process_sees_them(monkeypatch, wanted, visible, names):
     monkeypatch.setattr("torch.cuda.device_count", lambda: 3)
 
-    assert pick_gpus(wanted, visible) == names
+    assert select_gpus(wanted, visible) == names
 
 
 @pytest.mark.parametrize("wanted", ["3", "0,0"])
@@ -82,7 +82,7 @@ def test_devices_that_are_not_there_are_refused(monkeypatch, wanted):
     monkeypatch.setattr("torch.cuda.device_count", lambda: 3)
 
     with pytest.raises(ConfigError, match=f"--dask gpu:{wanted}: expected .* from 0 to 2"):
-        pick_gpus(wanted, None)
+        select_gpus(wanted, None)
 
 
 def seen_by_this_process():
@@ -113,7 +113,7 @@ def test_workers_write_the_same_bytes_as_this_process(workshop):
     workshop.run()
     here = workshop.files()
     results = workshop.run(
-        orders=Orders(force=frozenset({"count"}), workers=DaskWorkers("local:2"))
+        run_options=RunOptions(force=frozenset({"count"}), workers=DaskWorkers("local:2"))
     )
 
     assert {result.state for result in results.values()} == {"made"}
@@ -125,9 +125,9 @@ def test_workers_write_the_same_bytes_as_this_process(workshop):
 def test_a_unit_that_fails_or_kills_its_worker_is_recorded_and_the_rest_goes_on(workshop):
     workshop.text("c.txt", "fail")
     workshop.text("d.txt", "die")
-    orders = Orders(workers=DaskWorkers("local:2"), keep_going=True)
+    run_options = RunOptions(workers=DaskWorkers("local:2"), keep_going=True)
 
-    results = workshop.run(orders=orders, targets=("count",))
+    results = workshop.run(run_options=run_options, targets=("count",))
 
     assert results["count"].state == "failed"
     assert results["count"].made == 2
@@ -186,7 +186,7 @@ def done_units(workshop):
 def test_a_cluster_that_is_already_there_is_used(workshop, cluster):
     words, _ = cluster()
 
-    results = workshop.run(orders=Orders(workers=DaskWorkers(words)))
+    results = workshop.run(run_options=RunOptions(workers=DaskWorkers(words)))
 
     assert results["count"].made == 2
 
@@ -198,7 +198,7 @@ def test_a_killed_worker_is_told_of_and_its_unit_begins_again(workshop, cluster)
     job = functools.partial(
         workshop.run,
         "count.sleep_s=3",
-        orders=Orders(workers=DaskWorkers(words)),
+        run_options=RunOptions(workers=DaskWorkers(words)),
         events=events,
     )
 
@@ -219,9 +219,9 @@ def test_a_worker_that_fills_its_memory_is_restarted_and_told_of(workshop, clust
     workshop.text("c.txt", "hoard")
     workshop.text("d.txt", "after it")
     events = []
-    orders = Orders(workers=DaskWorkers(words), keep_going=True)
+    run_options = RunOptions(workers=DaskWorkers(words), keep_going=True)
 
-    results = workshop.run(orders=orders, targets=("count",), events=events)
+    results = workshop.run(run_options=run_options, targets=("count",), events=events)
 
     assert results["count"].made == 3
     assert list(results["count"].errors) == ["c.txt"]
@@ -242,12 +242,12 @@ def test_a_worker_that_fills_its_memory_is_restarted_and_told_of(workshop, clust
     ],
 )
 def test_a_scheduler_that_is_not_there_ends_the_run(workshop, monkeypatch, words, says):
-    monkeypatch.setattr("pipeline.workers.dask_cluster.SILENT_S", 0.3)
+    monkeypatch.setattr("pipeline.workers.dask_cluster.SCHEDULER_TIMEOUT_S", 0.3)
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
         pytest.raises(WorkersLostError, match=says),
     ):
-        workshop.run(orders=Orders(workers=DaskWorkers(words)))
+        workshop.run(run_options=RunOptions(workers=DaskWorkers(words)))
 
 
 @pytest.mark.slow
@@ -255,10 +255,10 @@ def test_a_lost_scheduler_ends_the_run_and_the_next_one_goes_on(workshop, cluste
     for number in range(4):
         workshop.text(f"{number}.txt", "word " * number)
     words, started = cluster(workers=2)
-    orders = Orders(workers=DaskWorkers(words), keep_going=True)
+    run_options = RunOptions(workers=DaskWorkers(words), keep_going=True)
     running, found = in_background(
         functools.partial(
-            workshop.run, "count.sleep_s=2", orders=orders, targets=("count",)
+            workshop.run, "count.sleep_s=2", run_options=run_options, targets=("count",)
         )
     )
     wait_for(lambda: done_units(workshop))
@@ -283,12 +283,14 @@ def test_a_lost_scheduler_ends_the_run_and_the_next_one_goes_on(workshop, cluste
 
 @pytest.mark.slow
 def test_a_scheduler_that_hangs_ends_the_run(workshop, cluster, monkeypatch):
-    monkeypatch.setattr("pipeline.workers.dask_cluster.SILENT_S", 2.0)
+    monkeypatch.setattr("pipeline.workers.dask_cluster.SCHEDULER_TIMEOUT_S", 2.0)
     monkeypatch.setattr("pipeline.workers.dask_cluster.CLOSE_S", 2.0)
     words, started = cluster()
     running, found = in_background(
         functools.partial(
-            workshop.run, "count.sleep_s=3", orders=Orders(workers=DaskWorkers(words))
+            workshop.run,
+            "count.sleep_s=3",
+            run_options=RunOptions(workers=DaskWorkers(words)),
         )
     )
     wait_for(lambda: list(workshop.root.units("count").glob("*.partial")))
@@ -302,18 +304,20 @@ def test_a_scheduler_that_hangs_ends_the_run(workshop, cluster, monkeypatch):
 def test_a_second_run_queues_if_told_to(workshop):
     refused, waited = [], []
 
-    def run(orders, done):
+    def run(run_options, done):
         try:
-            done.append(workshop.run("count.sleep_s=1.5", orders=orders)["count"].state)
+            done.append(
+                workshop.run("count.sleep_s=1.5", run_options=run_options)["count"].state
+            )
         except LockedError as error:
             done.append(error)
 
-    first = threading.Thread(target=run, args=(Orders(), []))
+    first = threading.Thread(target=run, args=(RunOptions(), []))
     first.start()
     while not workshop.root.attempt("count").is_file():
         time.sleep(0.01)
-    run(Orders(), refused)
-    run(Orders(wait=True), waited)
+    run(RunOptions(), refused)
+    run(RunOptions(wait=True), waited)
     first.join()
 
     assert isinstance(refused[0], LockedError)

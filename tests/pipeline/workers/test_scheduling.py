@@ -1,4 +1,4 @@
-"""Handing out units, with a crew of threads instead of machines."""
+"""Handing out units, with a pool of threads instead of machines."""
 
 import functools
 import threading
@@ -14,12 +14,12 @@ from pipeline.engine.stage import Unit
 from pipeline.engine.units import Outcome, Task, WorkersLostError
 from pipeline.workers import scheduling
 from pipeline.workers.scheduling import (
-    Broken,
-    ByCrew,
-    Ended,
-    Full,
-    Lost,
-    Share,
+    PoolExecutor,
+    TaskEnded,
+    TaskFailure,
+    TaskProgress,
+    WorkerLost,
+    WorkerMemoryFull,
 )
 
 
@@ -29,7 +29,7 @@ class KilledError(Exception):
 
 @dataclass
 class Threads:
-    """A crew of threads. ``jobs`` say what a unit does besides being done."""
+    """A pool of threads. ``jobs`` say what a unit does besides being done."""
 
     size: int = 2
     jobs: dict = field(default_factory=dict)
@@ -51,7 +51,7 @@ class Threads:
         self.begun.append(name)
         future = self._pool.submit(self._do, name, task)
         self._futures[name] = future
-        future.add_done_callback(lambda _: self.inbox.put(Ended(name)))
+        future.add_done_callback(lambda _: self.inbox.put(TaskEnded(name)))
 
     def _do(self, name, task):
         self.jobs.get(task.unit.name, lambda name: None)(name)
@@ -64,7 +64,7 @@ class Threads:
         if isinstance(error, WorkersLostError):
             raise error
         if error is not None:
-            return Broken(error, "", isinstance(error, KilledError))
+            return TaskFailure(error, "", isinstance(error, KilledError))
         return Outcome(name, {}, 0.0)
 
     def threads(self):
@@ -80,41 +80,41 @@ def tasks(count):
     ]
 
 
-def run(crew, count, go_on=lambda: True, told=None, heard=None):
+def run(pool, count, may_start=lambda: True, told=None, heard=None):
     def progress(done, total, note=""):
         (heard if heard is not None else []).append((done, total, note))
 
     def tell(event, **figures):
         (told if told is not None else []).append((event, figures))
 
-    return list(ByCrew(crew).run(tasks(count), go_on, progress, tell))
+    return list(PoolExecutor(pool).run(tasks(count), may_start, progress, tell))
 
 
 def test_never_more_than_two_tasks_a_thread_are_handed_out():
-    crew = Threads(size=3)
+    pool = Threads(size=3)
 
-    outcomes = run(crew, 5500)  # All of validation, eight scenes a unit.
+    outcomes = run(pool, 5500)  # All of validation, eight scenes a unit.
 
     assert len(outcomes) == 5500
-    assert 3 <= crew.most <= 6
+    assert 3 <= pool.most <= 6
 
 
 def test_tasks_are_begun_in_order():
-    crew = Threads(size=1)
+    pool = Threads(size=1)
 
-    run(crew, 5)
+    run(pool, 5)
 
-    assert crew.begun == [f"play-k{at}" for at in range(5)]
+    assert pool.begun == [f"play-k{at}" for at in range(5)]
 
 
 def test_none_is_begun_once_it_is_not_to_go_on():
-    crew, asked = Threads(size=1), []
+    pool, asked = Threads(size=1), []
 
-    def go_on():
+    def may_start():
         asked.append(None)
         return len(asked) <= 3
 
-    assert len(run(crew, 100, go_on)) == len(crew.begun) <= 3
+    assert len(run(pool, 100, may_start)) == len(pool.begun) <= 3
 
 
 def die(names, name):
@@ -128,24 +128,24 @@ def test_who_was_beside_a_killer_is_done_in_the_end_alone():
         "u1": functools.partial(die, {"play-k1", "play-k1-alone"}),
         "u2": functools.partial(die, {"play-k2"}),
     }
-    crew = Threads(size=2, jobs=jobs)
+    pool = Threads(size=2, jobs=jobs)
 
-    outcomes = {outcome.name: outcome for outcome in run(crew, 6)}
+    outcomes = {outcome.name: outcome for outcome in run(pool, 6)}
 
     assert outcomes["u1"].error == "KilledError: play-k1-alone"
     assert "play-k2-alone" in outcomes, "it is done"
     assert len(outcomes) == 6
-    assert crew.begun[-2:] == ["play-k1-alone", "play-k2-alone"]
+    assert pool.begun[-2:] == ["play-k1-alone", "play-k2-alone"]
 
 
 def test_other_errors_are_not_tried_again():
     def fail(name):
         raise ValueError("bad")
 
-    crew = Threads(jobs={"u0": fail})
+    pool = Threads(jobs={"u0": fail})
 
-    assert [each.error for each in run(crew, 2)].count("ValueError: bad") == 1
-    assert crew.begun == ["play-k0", "play-k1"]
+    assert [each.error for each in run(pool, 2)].count("ValueError: bad") == 1
+    assert pool.begun == ["play-k0", "play-k1"]
 
 
 def test_a_crew_that_is_lost_ends_the_run_at_once():
@@ -157,54 +157,54 @@ def test_a_crew_that_is_lost_ends_the_run_at_once():
 
 
 def test_a_crew_that_does_not_answer_ends_the_run(monkeypatch):
-    monkeypatch.setattr(scheduling, "LOOK_S", 0.05)
-    crew = Threads()
+    monkeypatch.setattr(scheduling, "COUNT_WORKERS_EVERY_S", 0.05)
+    pool = Threads()
 
     def hang(name):
-        crew.lost = True
+        pool.lost = True
         time.sleep(0.5)
 
-    crew.jobs["u0"] = hang
+    pool.jobs["u0"] = hang
     with pytest.raises(WorkersLostError, match="lost"):
-        run(crew, 3)
+        run(pool, 3)
 
 
 def test_without_workers_a_run_waits_for_some_time(monkeypatch):
-    monkeypatch.setattr(scheduling, "LOOK_S", 0.02)
-    monkeypatch.setattr(scheduling, "NOBODY_S", 0.2)
-    told, crew = [], Threads(size=0, jobs={"u0": lambda name: time.sleep(1)})
+    monkeypatch.setattr(scheduling, "COUNT_WORKERS_EVERY_S", 0.02)
+    monkeypatch.setattr(scheduling, "NO_WORKER_TIMEOUT_S", 0.2)
+    told, pool = [], Threads(size=0, jobs={"u0": lambda name: time.sleep(1)})
 
     with pytest.raises(WorkersLostError, match=r"no worker for 0.00333333 minutes"):
-        run(crew, 1, told=told)
+        run(pool, 1, told=told)
 
     assert [event for event, _ in told] == ["workers-missing"]
 
 
 def test_a_cluster_that_grows_is_given_more(monkeypatch):
-    monkeypatch.setattr(scheduling, "LOOK_S", 0.02)
-    crew = Threads(size=1)
-    crew._pool = ThreadPoolExecutor(8)
+    monkeypatch.setattr(scheduling, "COUNT_WORKERS_EVERY_S", 0.02)
+    pool = Threads(size=1)
+    pool._pool = ThreadPoolExecutor(8)
 
     def grow(name):
-        crew.size = 4
+        pool.size = 4
         time.sleep(0.1)
 
-    crew.jobs = {f"u{at}": grow for at in range(20)}
-    run(crew, 20)
+    pool.jobs = {f"u{at}": grow for at in range(20)}
+    run(pool, 20)
 
-    assert 2 < crew.most <= 8
+    assert 2 < pool.most <= 8
 
 
 def test_what_happens_to_workers_is_told():
-    told, crew = [], Threads(size=1)
+    told, pool = [], Threads(size=1)
 
     def fall(name):
-        crew.inbox.put(Full("tcp://w", 3 << 30))
-        crew.inbox.put(Lost("tcp://w", (name, "another run's")))
+        pool.inbox.put(WorkerMemoryFull("tcp://w", 3 << 30))
+        pool.inbox.put(WorkerLost("tcp://w", (name, "another run's")))
         time.sleep(0.1)
 
-    crew.jobs["u0"] = fall
-    run(crew, 1, told=told)
+    pool.jobs["u0"] = fall
+    run(pool, 1, told=told)
 
     assert told == [
         ("worker-full", {"worker": "tcp://w", "memory_gib": 3.0}),
@@ -214,13 +214,13 @@ def test_what_happens_to_workers_is_told():
 
 def test_a_unit_that_filled_the_memory_of_workers_fails_with_that_reason():
     def fill(name):
-        crew.inbox.put(Full("tcp://w", 3 << 30))
-        crew.inbox.put(Lost("tcp://w", (name,)))
+        pool.inbox.put(WorkerMemoryFull("tcp://w", 3 << 30))
+        pool.inbox.put(WorkerLost("tcp://w", (name,)))
         raise KilledError("four times")
 
-    crew = Threads(size=1, jobs={"u0": fill})
+    pool = Threads(size=1, jobs={"u0": fill})
 
-    (failed, _) = sorted(run(crew, 2), key=lambda outcome: not outcome.error)
+    (failed, _) = sorted(run(pool, 2), key=lambda outcome: not outcome.error)
 
     assert failed.error == (
         "KilledError: four times (a worker that did it filled its memory)"
@@ -228,15 +228,15 @@ def test_a_unit_that_filled_the_memory_of_workers_fails_with_that_reason():
 
 
 def test_progress_of_several_units_is_one_sum():
-    heard, crew, both = [], Threads(size=2), threading.Barrier(2)
+    heard, pool, both = [], Threads(size=2), threading.Barrier(2)
 
     def work(done, name):
-        crew.inbox.put(Share(name, done, 32.0, "5 rollouts/s"))
+        pool.inbox.put(TaskProgress(name, done, 32.0, "5 rollouts/s"))
         both.wait(10)
         time.sleep(0.1)
 
-    crew.jobs = {f"u{at}": functools.partial(work, 8.0 * (at + 1)) for at in range(2)}
-    run(crew, 2, heard=heard)
+    pool.jobs = {f"u{at}": functools.partial(work, 8.0 * (at + 1)) for at in range(2)}
+    run(pool, 2, heard=heard)
 
     assert heard[0] in ((8.0, 32.0, "5 rollouts/s"), (16.0, 32.0, "5 rollouts/s"))
     assert heard[1] == (0.75, 1.0, "2 at a time, one of them: 5 rollouts/s")

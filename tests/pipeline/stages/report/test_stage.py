@@ -23,7 +23,7 @@ from infgen.scene import Scene
 from infgen.sources.towns import builtin_records
 from infgen.sources.womd import iter_scenes
 from pipeline.engine.atomic import write_json
-from pipeline.engine.stage import Done, Stage
+from pipeline.engine.stage import FinishedUnit, Stage
 from pipeline.stages import reference, score
 from pipeline.stages.reference_files import read_counts
 from pipeline.stages.report import stage as report
@@ -133,8 +133,10 @@ def finished(root: Path) -> Inputs:
         for scene, _ in zip(iter_scenes(builtin_records()[-1]), range(SCENES), strict=False)
     ]
     rollouts = [cruise(scene, index) for scene in scenes for index in range(2)]
-    logs = Done(SOURCE, "k1", root / "units" / "logs", {"scenes": len(scenes)})
-    played = Done(f"{SOURCE}-00000", "k2", root / "units" / "played", {"rollouts": 4})
+    logs = FinishedUnit(SOURCE, "k1", root / "units" / "logs", {"scenes": len(scenes)})
+    played = FinishedUnit(
+        f"{SOURCE}-00000", "k2", root / "units" / "played", {"rollouts": 4}
+    )
     for done in (logs, played):
         done.path.mkdir(parents=True)
     write_records(
@@ -191,12 +193,12 @@ def _score(root: Path, inputs: Inputs) -> None:
     manifest(root, "score", settings, told, done)
 
 
-def _do(stage, root: Path, inputs: Inputs, settings) -> list[Done]:
+def _do(stage, root: Path, inputs: Inputs, settings) -> list[FinishedUnit]:
     done = []
     for unit in stage.plan(inputs, settings):
         target = root / "units" / f"{stage.STAGE.name}-{unit.name}"
         told = json.loads(json.dumps(stage.work(unit, target, settings, silent)))
-        done.append(Done(unit.name, unit.name, target, told))
+        done.append(FinishedUnit(unit.name, unit.name, target, told))
     return done
 
 

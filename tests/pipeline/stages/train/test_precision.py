@@ -72,7 +72,7 @@ from pipeline.stages.train.setup import Course, begin
 from pipeline.stages.train.process_group import Team
 from pipeline.stages.train.loader import TokenScenes
 from pipeline.stages.train.precision import Pass
-from pipeline.stages.vocabulary import load_codebooks
+from pipeline.stages.vocabulary import load_vocabularies
 
 shards = Path(sys.argv[1])
 scenes = TokenScenes([shards / "training"])
@@ -82,7 +82,7 @@ model = ModelSettings(
 )
 grid = TokenSettings(grid_radius_m=60.0, grid_cell_m=4.0)
 course = Course(model, TrainSettings(batch_scenes=2), grid, scenes, [], shards)
-network = begin(course, *load_codebooks(shards / "vocab")).network
+network = begin(course, *load_vocabularies(shards / "vocab")).network
 batch = course.recipe(Team())[0][0]
 plain = Pass(network, TrainSettings(compile="false"))(batch)
 forward = Pass(network, TrainSettings(compile="true"))

@@ -41,9 +41,9 @@ def tell(done, total, note=""):
     signals.check()
 
 
-with joined(os.environ) as first, signals.listening():
+with joined(os.environ) as first, signals.handling_signals():
     if first and task:
-        with signals.patient():
+        with signals.deferred():
             work(Unit("weights", {}, task), Path(target), settings, tell)
 """
 

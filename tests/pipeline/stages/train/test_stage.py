@@ -22,7 +22,7 @@ from pipeline.engine.atomic import MANIFEST, StoreError
 from pipeline.engine.layout import RUN_FOLDER
 from pipeline.engine.manifest import list_files
 from pipeline.engine.signals import Stopped
-from pipeline.engine.stage import Done, Source
+from pipeline.engine.stage import FinishedUnit, Source
 from pipeline.engine.units import Task, do
 from pipeline.stages.train.stage import (
     DONE,
@@ -36,7 +36,7 @@ from pipeline.stages.train.stage import (
 )
 from pipeline.stages.train.train_log import read_log
 from pipeline.storage.checkpoint import POINTER
-from pipeline.storage.weights import read_about
+from pipeline.storage.weights import read_description
 
 TERMS = (
     *("motion", "keep", "add", "position", "agent_type"),
@@ -72,7 +72,7 @@ def test_a_run_leaves_weights_their_page_and_their_log(whole):
     assert sorted(p.name for p in folder.iterdir()) == sorted([*OUTPUTS, RUN_FOLDER])
     assert report["steps"] == 6
     assert report["scenes"] == report["validation_split"] == 3
-    assert report["weights"] == read_about(folder)["weights"]
+    assert report["weights"] == read_description(folder)["weights"]
     assert report["validation"]["total"] > 0
     assert report["run"]["processes"] == 1
     assert report["run"]["scenes_per_s"] > 0
@@ -153,8 +153,8 @@ def do_unit(train_unit, train_settings, quiet):
 LAST_MOMENTS = (
     "pipeline.stages.train.loop.validate",
     "pipeline.storage.weights.save_network",
-    "pipeline.storage.checkpoint.drop_checkpoints",
-    "pipeline.engine.units.seal",
+    "pipeline.storage.checkpoint.remove_checkpoints",
+    "pipeline.engine.units.write_manifest",
     "pipeline.engine.atomic.sync_tree",
 )
 """What is called after the last step, in this order."""
@@ -183,7 +183,7 @@ def test_a_stop_after_the_last_step_waits_until_the_unit_has_its_name(
     stop = partial(os.kill, os.getpid(), signal.SIGTERM)
     happen_after(monkeypatch, moment, 1, stop)
 
-    with signals.listening(), pytest.raises(Stopped):
+    with signals.handling_signals(), pytest.raises(Stopped):
         do_unit(tmp_path / "unit", **RARELY, steps=1, validate_every_steps=0)
 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["unit"]
@@ -342,7 +342,7 @@ def test_missing_or_damaged_weights_are_named(whole, tmp_path, name):
 def test_weights_of_other_sizes_are_refused(whole, tmp_path):
     for file in OUTPUTS:
         (tmp_path / file).write_bytes((whole[0] / file).read_bytes())
-    about = read_about(tmp_path)
+    about = read_description(tmp_path)
     about["model"]["width"] = 32
     (tmp_path / "model.json").write_text(json.dumps(about))
 
@@ -355,7 +355,11 @@ def test_finish_gathers_what_the_unit_made(whole, train_settings, quiet, tmp_pat
     target = tmp_path / "stage"
 
     found = finish(
-        MadeInputs(), [Done("weights", "k", folder, report)], target, train_settings, quiet
+        MadeInputs(),
+        [FinishedUnit("weights", "k", folder, report)],
+        target,
+        train_settings,
+        quiet,
     )
 
     assert contents(target) == contents(folder)
@@ -373,7 +377,7 @@ class MadeInputs:
 
     def units(self, stage):
         assert stage == "tokenize"
-        return [Done(n, f"key-{n}", Path("/tokens") / n, {}) for n in self.names]
+        return [FinishedUnit(n, f"key-{n}", Path("/tokens") / n, {}) for n in self.names]
 
     def folder(self, stage):
         return Path("/") / stage
