@@ -21,7 +21,7 @@ from pipeline.settings.request import Request
 from pipeline.settings.stages_file import DEFAULT_FILE
 from pipeline.storage.duplicates import read_task_scenes, scenes_task, unique_rows
 from pipeline.storage.scenes import SCENES_SCHEMA
-from pipeline.storage.splits import spread
+from pipeline.storage.splits import spread_evenly
 from pipeline.storage.zarr_store import write_records
 from tests.sources.records import write_tfrecord
 
@@ -73,8 +73,8 @@ def test_who_reads_the_scenes_that_a_task_names_reads_those_that_count(
 def test_scenes_are_taken_evenly_from_those_that_count(tmp_path):
     files = [file_of(tmp_path, 6, [1, 3]), file_of(tmp_path, 4, [0, 4])]
 
-    assert spread(files, 0) == [[0, 3, 4, 5], []]
-    assert spread(files, 2) == [[0, 4], []]
+    assert spread_evenly(files, 0) == [[0, 3, 4, 5], []]
+    assert spread_evenly(files, 2) == [[0, 4], []]
 
 
 def made(folder: Path, *names: str) -> tuple[Root, dict[str, FinishedInputs]]:
@@ -136,7 +136,7 @@ def test_a_file_that_is_there_twice_changes_nothing(tmp_path, source, monkeypatc
     ]
     assert files[0] == files[1]
     played = [
-        sum(map(len, spread(each["tokenize"].units("ingest"), 0)))
+        sum(map(len, spread_evenly(each["tokenize"].units("ingest"), 0)))
         for each in (plain, twice)
     ]
     assert played == [3, 3]

@@ -72,7 +72,7 @@ def test_ingested_scenes_are_found_in_any_order(ingested, records):
 
     for scenario_id in [*reversed(records), *records]:
         assert found.find(scenario_id).scenario_id == scenario_id
-    assert len(found._open) == scene_lookup.OPEN_GROUPS
+    assert len(found._open) == scene_lookup.MAX_OPEN_GROUPS
 
 
 def test_both_hold_the_same_logs(source, ingested, records):
