@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from infgen import __version__
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.commands import tables, tools
 from pipeline.commands.doctor import examine
 from pipeline.commands.options import (
@@ -154,7 +154,7 @@ _stage_verb("train", "Train the network; goes on where a killed run stopped.")
 _stage_verb(
     "calibrate",
     "Find what rollouts add to their odds, so that as many come and go as in logs.",
-    "--profile small -s calibrate.by=play --dask local:2",
+    "--profile small -s calibrate.method=simulate --dask local:2",
 )
 _stage_verb(
     "rollout",

@@ -30,7 +30,8 @@ from newcomers import STEPS_PER_S, Newcomers, apart_bits
 from numpy.lib.stride_tricks import sliding_window_view
 
 from infgen.clock import CLOCK
-from infgen.config import TokenSettings, build
+from infgen.config import TokenSettings
+from infgen.settings import build
 from infgen.metrics.intervals import Interval, bootstrap
 from infgen.metrics.kinematics import speed, speed_valid
 from infgen.metrics.placement import count_per_token

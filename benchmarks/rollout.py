@@ -165,7 +165,10 @@ def make_session(case: Case) -> tuple[Session, SceneTokens]:
     history = tokenize_scene(scene, motion, roads, seen, until=scene.now)
     history = _cropped(history, case.roads)
     settings = RolloutSettings(
-        mode=case.mode, seconds=case.seconds, batch=case.batch, **PLAYED[case.played]
+        mode=case.mode,
+        seconds=case.seconds,
+        batch_rollouts=case.batch,
+        **PLAYED[case.played],
     )
     player = Player(
         Stepper(network), motion, roads, tokens, settings, torch.device(case.device)

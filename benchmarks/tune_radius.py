@@ -14,7 +14,8 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from infgen.config import ReferenceSettings, build
+from infgen.config import ReferenceSettings
+from infgen.settings import build
 from infgen.metrics.long_term.protocols import PROTOCOLS
 from infgen.metrics.long_term.tune_radius import best_radius_m, placement_by_radius
 from pipeline.engine.manifest import read_manifest

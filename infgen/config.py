@@ -1,13 +1,9 @@
-"""Every setting, as frozen dataclasses, one per stage; each lives in the room it acts in.
+"""All settings in one place: ``stages.yaml`` and ``-s key=value`` become these classes.
 
-``stages.yaml`` and ``-s key=value`` become these through ``build``, once, before anything
-runs. A value that follows from others is a property, not a setting.
+Each class lives in the package it acts in. Whoever needs one class inside ``infgen``
+imports it from there.
 """
 
-from infgen.coerce import ConfigError as ConfigError
-from infgen.coerce import build as build
-from infgen.coerce import key_values as key_values
-from infgen.coerce import settle as settle
 from infgen.metrics.settings import ReferenceSettings as ReferenceSettings
 from infgen.metrics.settings import ScoreSettings as ScoreSettings
 from infgen.model.settings import ModelSettings as ModelSettings

@@ -3,7 +3,7 @@
     python tests/kill_and_resume.py --kills 20 --records '../data/*.tfrecord*'
     python tests/kill_and_resume.py --kills 20 --profile tiny --stages train --workers
     python tests/kill_and_resume.py --kills 10 --profile tiny --stages rollout \\
-        --set ingest.limit=6 rollout.scenes=6 rollout.count=2 \\
+        --set ingest.max_scenes_per_file=6 rollout.max_scenes=6 rollout.count=2 \\
         --victims run worker scheduler
 
 For each stage and kill: start the stage, wait until it is at work, SIGKILL a victim at a

@@ -144,7 +144,7 @@ def test_settings_of_one_section_or_one_alone(infgen):  # noqa: F811
     Path("stages.yaml").unlink()  # The real stages.
 
     out = infgen("settings", "ingest")[1]
-    assert "ingest.limit" in out
+    assert "ingest.max_scenes_per_file" in out
     assert "train.steps" not in out
     out = infgen("settings", "train.steps")[1]
     assert "100000" in out

@@ -6,7 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infgen.coerce import ConfigError, build, check_numbers, coerce
+from infgen.config import check_numbers, coerce
+from infgen.errors import ConfigError
+from infgen.settings import build
 
 
 @given(st.integers(-(2**80), 2**80))

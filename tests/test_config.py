@@ -6,7 +6,6 @@ import pytest
 
 from cli import main
 from infgen.config import (
-    ConfigError,
     IngestSettings,
     ModelSettings,
     ReferenceSettings,
@@ -15,6 +14,7 @@ from infgen.config import (
     TokenSettings,
     TrainSettings,
 )
+from infgen.errors import ConfigError
 
 SECTIONS = {
     "ingest": IngestSettings,
@@ -119,7 +119,11 @@ def test_the_largest_seed_is_one():
 @pytest.mark.parametrize(
     "word",
     [
-        *("tokenize.heading_bin_deg=0", "reference.stride_s=0", "ingest.limit=-1"),
+        *(
+            "tokenize.heading_bin_deg=0",
+            "reference.stride_s=0",
+            "ingest.max_scenes_per_file=-1",
+        ),
         *(
             "train.checkpoint_every_steps=-1",
             "train.validate_every_steps=-1",

@@ -14,7 +14,14 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def trial(tmp_path_factory):
-    words = ("--records", "builtin", "--profile", "smoke", "-s", "ingest.limit=0")
+    words = (
+        "--records",
+        "builtin",
+        "--profile",
+        "smoke",
+        "-s",
+        "ingest.max_scenes_per_file=0",
+    )
     return script.Trial(words, tmp_path_factory.mktemp("trial"))
 
 
@@ -34,7 +41,7 @@ def test_two_workers_write_the_bytes_of_one_process(trial, quiet):
     script.compare_workers(trial, "local:2", quiet, script.STAGES)
 
 
-PLAYED = ("ingest.limit=6", "rollout.scenes=6", "rollout.count=2")
+PLAYED = ("ingest.max_scenes_per_file=6", "rollout.max_scenes=6", "rollout.count=2")
 
 
 @pytest.fixture(scope="module")

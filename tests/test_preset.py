@@ -50,8 +50,8 @@ SETTINGS = (
         "-s",
         "train.checkpoint_every_steps=0",
     ),
-    *("-s", "train.validation_scenes=1", "-s", "ingest.limit=1"),
-    *("-s", "score.resamples=20", "--root", "R"),
+    *("-s", "train.validation_scenes=1", "-s", "ingest.max_scenes_per_file=1"),
+    *("-s", "score.bootstrap_resamples=20", "--root", "R"),
 )
 FROM = ("--records", "builtin", "--file", "presets.yaml")
 PAIR = ("run", "report", "--preset", "pair", *SETTINGS)

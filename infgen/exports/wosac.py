@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from infgen.clock import CLOCK
-from infgen.coerce import ConfigError
+from infgen.errors import ConfigError
 from infgen.metrics.wosac.logged import FUTURE_STEPS
 from infgen.metrics.wosac.rollouts import Rollouts, RolloutsError, from_rollouts, list_ids
 from infgen.metrics.wosac.submission import NUM_ROLLOUTS

@@ -1,65 +1,47 @@
-"""Settings of what comes after rollouts: logs to hold them against, scores, the report."""
+"""Settings of stages ``reference`` and ``score``: how logs and rollouts are measured."""
 
-from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import AfterValidator
+from pydantic.dataclasses import dataclass
 
 from infgen.clock import CLOCK
-from infgen.coerce import ConfigError, check_numbers
+from infgen.settings import RULES, Count, NonNegative, Seed
 
 
-@dataclass(frozen=True, slots=True)
+def _whole_token_steps(seconds: float) -> float:
+    CLOCK.tokens_in(seconds)
+    return seconds
+
+
+Window = Annotated[NonNegative, AfterValidator(_whole_token_steps)]
+
+
+@dataclass(frozen=True, slots=True, config=RULES)
 class ReferenceSettings:
-    """How logs are measured, and with them the rollouts that are scored against them.
-
-    Attributes:
-        split: Whose logs; that of the rollouts.
-        window_s: Length of a window.
-        stride_s: From one window to the next.
-        count_radius_m: Agents within it of the ego are counted; ACE is given for it and for
-            no limit.
-    """
+    """How logs, and the rollouts that are scored against them, are cut into windows."""
 
     split: str = "validation"
-    window_s: float = 8.0
-    stride_s: float = 0.5
-    count_radius_m: float = 75.0
-
-    def __post_init__(self) -> None:
-        """Refuse what no log can be cut into.
-
-        Raises:
-            ConfigError: naming the setting, its value and what is expected.
-        """
-        check_numbers(self, "reference", {})
-        for name in ("window_s", "stride_s"):
-            try:
-                CLOCK.tokens_in(getattr(self, name))
-            except ValueError as error:
-                raise ConfigError(f"reference.{name}: {error}") from error
+    """Split of the logs: that of the rollouts."""
+    window_s: Window = 8.0
+    """Length of a window."""
+    stride_s: Window = 0.5
+    """Time from one window to the next."""
+    count_radius_m: NonNegative = 75.0
+    """Agents within this distance of the ego are counted. The agent count error is given
+    for it and for no limit."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=RULES)
 class ScoreSettings:
-    """How rollouts are scored (METRICS.md).
+    """How rollouts are scored (METRICS.md)."""
 
-    Attributes:
-        presence_radius_m: For models that neither insert nor remove: who crosses this
-            distance to the ego enters or leaves, and who is beyond it is not there; 0 for
-            never.
-        wosac: Version of the Waymo metric, for the first eight seconds.
-        resamples: Bootstrap resamples of the scenes behind the 95 % intervals.
-        seed: Of the bootstrap.
-    """
-
-    presence_radius_m: float = 0.0
-    wosac: str = "wosac-2025"
-    resamples: int = 1000
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Refuse what nothing can be scored with.
-
-        Raises:
-            ConfigError: naming the setting, its value and what is expected.
-        """
-        bounds = {"seed": (0, 2**63 - 1)}
-        check_numbers(self, "score", bounds)
+    presence_radius_m: NonNegative = 0.0
+    """For models that neither insert nor remove: an agent counts as present within this
+    distance of the ego only, and enters or exits where it crosses it; 0 for no limit."""
+    wosac_version: str = "wosac-2025"
+    """Version of the Waymo metric, computed on the first eight seconds."""
+    bootstrap_resamples: Count = 1000
+    """Bootstrap resamples of the scenes behind the 95 % intervals."""
+    seed: Seed = 0
+    """Seed of the bootstrap."""

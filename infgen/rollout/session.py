@@ -302,7 +302,7 @@ class Session:
         steps = CLOCK.steps_per_token
         shown = np.ones((*moved.life.shape, steps), dtype=bool)
         packed = said.packed
-        if packed.pattern_logits is None or not self._player.settings.patterns:
+        if packed.pattern_logits is None or not self._player.settings.validity_patterns:
             return shown
         luck = self._luck(packed.rows, token, Purpose.PATTERN)
         drawn = choose(packed.pattern_logits, luck)

@@ -1,26 +1,32 @@
-"""Settings of rollouts: what is played, how choices are sampled, and who may enter."""
+"""Settings of stage ``rollout``: what is simulated and how choices are sampled."""
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass as plain_dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
 
 from infgen.clock import CLOCK
-from infgen.coerce import ConfigError, check_numbers
+from infgen.settings import RULES, AtLeastOne, Bool, Count, Float, NonNegative, Seed
+
+Temperature = Annotated[Float, Field(gt=0)]
+Nucleus = Annotated[Float, Field(gt=0, le=1)]
 
 
-@dataclass(frozen=True, slots=True)
+@plain_dataclass(frozen=True, slots=True)
 class RolloutMode:
     """What one word for a kind of rollout stands for.
 
     Attributes:
-        seconds: Length.
-        everyone: Whether everyone of the log is played, however far from the ego.
-        insert: Whether agents may enter.
-        remove: Whether agents may leave.
-        fixed: Names of those of the above that a setting of their own must not change.
+        seconds: Length after the history.
+        all_agents: Whether all agents of the log are simulated, however far from the ego.
+        insert: Whether agents are inserted.
+        remove: Whether agents are removed.
+        fixed: Names of those of the above that no setting may change.
     """
 
     seconds: float
-    everyone: bool
+    all_agents: bool
     insert: bool
     remove: bool
     fixed: tuple[str, ...]
@@ -30,194 +36,152 @@ MODES = {
     "long": RolloutMode(30.0, False, True, True, ()),
     "motion-only": RolloutMode(30.0, False, False, False, ("insert", "remove")),
     "wosac": RolloutMode(
-        8.0, True, False, False, ("seconds", "everyone", "insert", "remove")
+        8.0, True, False, False, ("seconds", "all_agents", "insert", "remove")
     ),
 }
-"""``long``: agents come and go. ``motion-only``: nobody does (the paper's table 3).
-``wosac``: Waymo's protocol, which fixes all four."""
+"""``long``: agents are inserted and removed. ``motion-only``: none are (the paper's table
+3). ``wosac``: Waymo's protocol, which fixes all four."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=RULES)
 class RolloutSettings:
-    """How futures are played (SPEC 6).
+    """How scenes are simulated (SPEC 6).
 
-    What the mode leaves open, ``seconds``, ``everyone``, ``insert`` and ``remove`` may say
-    otherwise; where the mode fixes it, another value is an error.
-
-    Attributes:
-        split: Split whose scenes are played (start of the file name).
-        mode: ``long``, ``motion-only`` or ``wosac``: see ``MODES``.
-        seconds: Length of a rollout after the history; the mode's if None.
-        count: Rollouts per scene.
-        scenes: Scenes to play, evenly spread over those of the split; 0 for all.
-        scenes_per_unit: Scenes of one unit of work.
-        batch: Rollouts that are played at once.
-        everyone: Whether to play every agent of the log that is there at now, however far
-            from the ego, or those within ``tokenize.max_ego_distance_m``; the mode's if
-            None.
-        insert: Whether agents may enter; the mode's if None.
-        remove: Whether agents may leave; the mode's if None.
-        removal_radius_m: Whoever gets farther from the ego leaves, if anyone may; 0 for
-            nobody. For weights that do not say who leaves (SPEC 7).
-        lights: What traffic lights show after the history, to weights that see them change:
-            ``now`` for nothing but what they showed last, ``log`` for what they do in the
-            log while it goes on. Not in mode ``wosac``, which forbids to look.
-        patterns: Whether agents are seen and lost as by a detector, with weights that have
-            learned validity patterns.
-        motion_top_k: Most likely moves that are sampled from; 0 for all.
-        position_top_k: Most likely cells that are sampled from; 0 for all.
-        motion_top_p: Least share of probability that the moves sampled from have together,
-            the most likely first; 1 for all. Moves that stand still and those that do not
-            have a nucleus each and keep their probability: who seldom sets off still does.
-        position_top_p: The same for cells.
-        max_motion_samples: Moves that are drawn for who would run into somebody ahead
-            within 1.5 s, everybody going on alike, until one does not lead there; 1 for
-            whatever is drawn first, as in the paper.
-        reject_off_road: Whether half of these draws are also for vehicles that would leave
-            the road before they could stop, or go farther off it. Who is more than a metre
-            off may; who is too fast for every draw takes the slowest.
-        max_stall_s: Vehicles that have stood in a lane for so long set off, unless a light
-            that is not green is ahead or they would run into somebody; 0 for who stands as
-            long as it likes, as in the paper. A network that looks back for a few seconds
-            takes whoever has stood all of them for parked.
-        motion_temperature: Logits of moves are divided by it: below 1 the likely become
-            likelier.
-        position_temperature: The same for cells.
-        heading_temperature: The same for heading bins.
-        add_bias: Added to the log-odds that one more agent enters, on top of what stage
-            ``calibrate`` finds.
-        remove_bias: The same for an agent's leaving.
-        density_control: How firmly the number of agents around the ego is held to what it
-            was at now: the odds that one more enters are multiplied by that number, over
-            the number there is, to this power; 0 for not at all, as in the paper. A network
-            that looks back for a few seconds forgets how full the street was. Where a map
-            ends there are to be fewer.
-        insertion_mask: Whether newcomers are kept off other boxes, also off where these
-            will be in half a second, and vehicles near lanes. The paper lets them in
-            anywhere.
-        insertion_lane_distance_m: Farthest from a lane's middle that a vehicle may enter.
-            Most logged newcomers are parked cars that come into view: of all, 47 % are
-            within 5 m, 69 % within 10 m, 78 % within 15 m; of those that drive, 96, 97 and
-            97 %.
-        max_insertion_attempts: Cells that are tried for one newcomer before there is none.
-        max_insertions: Newcomers per half second.
-        max_agents: Agents at any one time; or as many as a scene has at now, if more.
-        seed: Of all random streams.
+    `seconds`, `all_agents`, `insert` and `remove` overrule what the mode says. Where the
+    mode fixes one of them, another value is an error.
     """
 
     split: str = "validation"
-    mode: str = "long"
-    seconds: float | None = None
-    count: int = 32
-    scenes: int = 0
-    scenes_per_unit: int = 8
-    batch: int = 32
-    everyone: bool | None = None
-    insert: bool | None = None
-    remove: bool | None = None
-    removal_radius_m: float = 0.0
-    lights: str = "now"
-    patterns: bool = False
-    motion_top_k: int = 5
-    position_top_k: int = 10
-    motion_top_p: float = 1.0
-    position_top_p: float = 1.0
-    max_motion_samples: int = 1
-    reject_off_road: bool = False
-    max_stall_s: float = 0.0
-    motion_temperature: float = 1.0
-    position_temperature: float = 1.0
-    heading_temperature: float = 1.0
-    add_bias: float = 0.0
-    remove_bias: float = 0.0
-    density_control: float = 0.0
-    insertion_mask: bool = True
-    insertion_lane_distance_m: float = 15.0
-    max_insertion_attempts: int = 4
-    max_insertions: int = 16
-    max_agents: int = 128
-    seed: int = 0
+    """Split whose scenes are simulated (start of the file name)."""
+    mode: Literal["long", "motion-only", "wosac"] = "long"
+    """`long` inserts and removes agents for 30 s, `motion-only` does neither, `wosac` is
+    Waymo's protocol of 8 s."""
+    seconds: Float | None = None
+    """Length of a rollout after the history; that of the mode if not set."""
+    count: AtLeastOne = 32
+    """Rollouts per scene."""
+    max_scenes: Count = 0
+    """Scenes to simulate, evenly spread over the split; 0 for all."""
+    scenes_per_unit: AtLeastOne = 8
+    """Scenes of one unit of work."""
+    batch_rollouts: AtLeastOne = 32
+    """Rollouts that are simulated at once."""
+    all_agents: Bool | None = None
+    """Whether to simulate all agents that the log has at the end of the history, however
+    far from the ego, or those within `tokenize.max_ego_distance_m`; as the mode says if not
+    set."""
+    insert: Bool | None = None
+    """Whether agents are inserted; as the mode says if not set."""
+    remove: Bool | None = None
+    """Whether agents are removed; as the mode says if not set."""
+    removal_radius_m: NonNegative = 0.0
+    """An agent that gets farther from the ego is removed, where the mode removes; 0 for no
+    limit. For weights without remove tokens (SPEC 7)."""
+    signals: Literal["now", "log"] = "now"
+    """What traffic signals show after the history, to weights with
+    `model.signals_each_step`: `now` for what they showed last, `log` for what the log
+    shows as long as it goes on. Mode `wosac` forbids `log`."""
+    validity_patterns: Bool = False
+    """Whether agents are detected and missed as by a detector, with weights that have
+    `model.validity_pattern_tokens`."""
+    motion_top_k: Count = 5
+    """Number of the most likely motion tokens that are sampled from; 0 for all."""
+    position_top_k: Count = 10
+    """Number of the most likely position tokens that are sampled from; 0 for all."""
+    motion_top_p: Nucleus = 1.0
+    """Motion tokens are sampled from the nucleus: the most likely ones that together have
+    this probability; 1 for all. Tokens that stand still and tokens that move have a nucleus
+    each and keep their probability, so that an agent that seldom sets off still does."""
+    position_top_p: Nucleus = 1.0
+    """The same for position tokens."""
+    max_motion_samples: AtLeastOne = 1
+    """A motion token is rejected and sampled again, up to so often, if the agent would hit
+    one ahead of it within 1.5 s, all agents going on alike; 1 to accept the first, as in
+    the paper."""
+    reject_off_road: Bool = False
+    """Whether motion tokens of vehicles that would leave the road before they could stop,
+    or get farther off it, are rejected too, for half of these samples. A vehicle that is
+    more than a metre off the road is exempt. If all samples are rejected, the slowest is
+    taken."""
+    max_stall_s: NonNegative = 0.0
+    """A vehicle that has stood in a lane for so long sets off, unless a signal ahead is not
+    green or it would hit an agent; 0 for no limit, as in the paper. A network that sees a
+    few seconds of the past takes a vehicle that stood all of them for parked."""
+    motion_temperature: Temperature = 1.0
+    """Motion logits are divided by it: below 1 the likely tokens become likelier (for the
+    most likely one alone, set `rollout.motion_top_k=1`)."""
+    position_temperature: Temperature = 1.0
+    """The same for position tokens."""
+    heading_temperature: Temperature = 1.0
+    """The same for heading bins."""
+    add_bias: Float = 0.0
+    """Added to the log-odds that one more agent is inserted, on top of what stage
+    `calibrate` finds."""
+    remove_bias: Float = 0.0
+    """The same for the removal of an agent."""
+    density_control: NonNegative = 0.0
+    """How firmly the number of agents around the ego is held at what it was at the end of
+    the history: the odds of one more insertion are multiplied by that number over the
+    present one, to this power; 0 for not at all, as in the paper. A network that sees a few
+    seconds of the past forgets how dense traffic was. Where a map ends fewer are aimed
+    at."""
+    insertion_mask: Bool = True
+    """Whether agents are inserted only clear of other boxes, now and half a second later,
+    and vehicles only near lanes. In the paper they are inserted anywhere."""
+    insertion_lane_distance_m: NonNegative = 15.0
+    """Largest distance from a lane's centre at which a vehicle is inserted. Most insertions
+    of the logs are parked cars that come into view: of all, 47 % are within 5 m, 69 %
+    within 10 m, 78 % within 15 m; of those that drive, 96, 97 and 97 %."""
+    max_insertion_attempts: AtLeastOne = 4
+    """Position tokens that are sampled for one agent before its insertion is given up."""
+    max_insertions: Count = 16
+    """Insertions per token step."""
+    max_agents: AtLeastOne = 128
+    """Agents at any one time; or as many as a scene has at the end of the history, if
+    more."""
+    seed: Seed = 0
+    """Seed of all random streams."""
 
-    def __post_init__(self) -> None:
-        """Refuse contradictions.
-
-        Raises:
-            ConfigError: naming the setting, its value and the way out.
-        """
-        if self.mode not in MODES:
-            raise ConfigError(
-                f"rollout.mode is {self.mode!r}; expected {' or '.join(MODES)}"
-            )
-        for name in MODES[self.mode].fixed:
-            given, fixed = getattr(self, name), getattr(MODES[self.mode], name)
+    @model_validator(mode="after")
+    def _check(self) -> "RolloutSettings":
+        mode = MODES[self.mode]
+        for name in mode.fixed:
+            given, fixed = getattr(self, name), getattr(mode, name)
             if given is not None and given != fixed:
-                raise ConfigError(
-                    f"rollout.{name} is {given}, but rollout.mode={self.mode} is played "
-                    f"with {fixed}; say so, leave it out, or choose another mode"
+                raise ValueError(
+                    f"{name} is {given}, but mode={self.mode} has {fixed}; set it to that, "
+                    "leave it out, or choose another mode"
                 )
-        if self.lights not in ("now", "log"):
-            raise ConfigError(f"rollout.lights is {self.lights!r}; expected now or log")
-        if self.lights == "log" and self.mode == "wosac":
-            raise ConfigError(
-                "rollout.lights=log looks into the future, which rollout.mode=wosac "
-                "forbids; say rollout.lights=now"
+        if self.signals == "log" and self.mode == "wosac":
+            raise ValueError(
+                "signals=log shows the future, which mode=wosac forbids; set signals=now"
             )
-        if self.reject_off_road and self.max_motion_samples < 2:
-            raise ConfigError(
-                "rollout.reject_off_road samples again, but rollout.max_motion_samples "
-                f"is {self.max_motion_samples}; say rollout.max_motion_samples=32 too"
-            )
-        if self.max_stall_s and self.max_motion_samples < 2:
-            raise ConfigError(
-                f"rollout.max_stall_s is {self.max_stall_s}, but "
-                f"rollout.max_motion_samples is {self.max_motion_samples}: a released "
-                "vehicle may collide; say rollout.max_motion_samples=32 too"
-            )
-        self._check_numbers()
-
-    def _check_numbers(self) -> None:
-        for name in ("motion_temperature", "position_temperature", "heading_temperature"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(
-                    f"rollout.{name} is {getattr(self, name)}; expected more than 0 "
-                    "(for the most likely alone, say rollout.motion_top_k=1)"
+        for name in ("reject_off_road", "max_stall_s"):
+            if getattr(self, name) and self.max_motion_samples < 2:
+                raise ValueError(
+                    f"{name} needs motion tokens that are sampled again, but "
+                    f"max_motion_samples is {self.max_motion_samples}; set "
+                    "max_motion_samples=32"
                 )
-        for name in ("motion_top_p", "position_top_p"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ConfigError(
-                    f"rollout.{name} is {getattr(self, name)}; expected up to 1, above 0"
-                )
-        one_or_more = (
-            "count", "scenes_per_unit", "batch",
-            "max_motion_samples", "max_insertion_attempts", "max_agents",
-        )  # fmt: skip
-        bounds = {
-            **dict.fromkeys(one_or_more, (1, math.inf)),
-            **dict.fromkeys(("add_bias", "remove_bias"), (-math.inf, math.inf)),
-            "seed": (0, 2**63 - 1),
-        }
-        check_numbers(self, "rollout", bounds)
-        try:
-            CLOCK.tokens_in(self.duration_s)
-        except ValueError as error:
-            raise ConfigError(f"rollout.seconds: {error}") from error
+        CLOCK.tokens_in(self.duration_s)
+        return self
 
     @property
     def duration_s(self) -> float:
-        """Seconds that are played."""
+        """Seconds that are simulated."""
         return MODES[self.mode].seconds if self.seconds is None else self.seconds
 
     @property
     def simulates_all_agents(self) -> bool:
-        """Whether agents however far away are played."""
-        return MODES[self.mode].everyone if self.everyone is None else self.everyone
+        """Whether agents are simulated however far they are from the ego."""
+        return MODES[self.mode].all_agents if self.all_agents is None else self.all_agents
 
     @property
     def inserts(self) -> bool:
-        """Whether agents may enter."""
+        """Whether agents are inserted."""
         return MODES[self.mode].insert if self.insert is None else self.insert
 
     @property
     def removes(self) -> bool:
-        """Whether agents may leave."""
+        """Whether agents are removed."""
         return MODES[self.mode].remove if self.remove is None else self.remove

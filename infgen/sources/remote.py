@@ -3,7 +3,7 @@
 from importlib.util import find_spec
 from typing import Any
 
-from infgen.coerce import ConfigError
+from infgen.errors import ConfigError
 
 CLOUDS = ("gs", "gcs", "s3", "s3a", "az", "abfs", "abfss")
 """Protocols that the ``cloud`` extra serves."""

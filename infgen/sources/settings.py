@@ -1,27 +1,15 @@
-"""Settings of the stage ``ingest``."""
+"""Settings of stage ``ingest``: how records become scenes."""
 
-import math
-from dataclasses import dataclass
+from pydantic.dataclasses import dataclass
 
-from infgen.coerce import check_numbers
+from infgen.settings import RULES, AtLeastOne, Count
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=RULES)
 class IngestSettings:
-    """How records become scenes.
+    """How records become scenes."""
 
-    Attributes:
-        max_scenes_per_shard: Scenes in one Zarr group.
-        limit: Scenes to take from each file; 0 for all.
-    """
-
-    max_scenes_per_shard: int = 500
-    limit: int = 0
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be.
-
-        Raises:
-            ConfigError: naming the setting, its value and what is expected.
-        """
-        check_numbers(self, "ingest", {"max_scenes_per_shard": (1, math.inf)})
+    max_scenes_per_shard: AtLeastOne = 500
+    """Scenes in one Zarr group."""
+    max_scenes_per_file: Count = 0
+    """Scenes to take from each file; 0 for all."""

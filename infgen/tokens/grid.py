@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float32, Int16, Int64
 
-from infgen.coerce import ConfigError
+from infgen.errors import ConfigError
 from infgen.geometry import rotate, wrap_angle
 from infgen.tokens.scene_tokens import NO_CELL
 from infgen.tokens.settings import TokenSettings

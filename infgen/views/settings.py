@@ -1,27 +1,15 @@
-"""Settings of the stage ``report``."""
+"""Settings of stage ``report``: what it shows."""
 
-from dataclasses import dataclass
+from pydantic.dataclasses import dataclass
 
-from infgen.coerce import check_numbers
+from infgen.settings import RULES, Count
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=RULES)
 class ReportSettings:
-    """What the report shows.
-
-    Attributes:
-        title: Heading of the report.
-        players: Of so many of the rollouts with the lowest scores there is a page that
-            plays them.
-    """
+    """What the report shows."""
 
     title: str = "InfGen"
-    players: int = 3
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be written.
-
-        Raises:
-            ConfigError: naming the setting, its value and what is expected.
-        """
-        check_numbers(self, "report", {})
+    """Heading of the report."""
+    player_pages: Count = 3
+    """Number of player pages: one for each of the rollouts with the lowest scores."""

@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.exports import gpudrive, scenarionet
 from infgen.exports.rows import rows_of
 from infgen.rollout.rollout import Rollout

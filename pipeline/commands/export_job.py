@@ -11,7 +11,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from infgen.config import ConfigError, RolloutSettings
+from infgen.config import RolloutSettings
+from infgen.errors import ConfigError
 from infgen.exports.wosac import About
 from infgen.rollout.rollout import Rollout
 from pipeline.engine import signals

@@ -14,7 +14,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from infgen.config import ConfigError, settle
+from infgen.config import settle
+from infgen.errors import ConfigError
 from infgen.exports.wosac import HOW, About, complete, encode_about, encode_futures
 from infgen.metrics.wosac.rollouts import RolloutsError
 from infgen.metrics.wosac.submission import NUM_ROLLOUTS

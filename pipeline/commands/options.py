@@ -10,7 +10,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.comparison.runs import PRESET, REPORT, Comparison
 from pipeline.engine.layout import find_root
 from pipeline.engine.plan import Plan, PlanError

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.commands import tables
 from pipeline.commands.options import WORK, Json, RootFolder, gathers, split_names
 from pipeline.commands.screen import Screen

@@ -13,7 +13,7 @@ from typing import Any
 
 import typer
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.commands import tables
 from pipeline.commands.options import Asked, Comparing, Running
 from pipeline.commands.screen import LiveTable, Screen

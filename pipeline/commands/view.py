@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infgen.clock import CLOCK
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.commands.view_files import (
     STRIPS,
     VIDEOS,

@@ -16,7 +16,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine import signals
 from pipeline.engine.atomic import write_file
 from pipeline.engine.events import Event

@@ -5,7 +5,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.scene import Scene
 from infgen.sources.tfrecord import BadRecord, RecordError, iter_records
 from infgen.sources.womd import decode_scene, read_scenario_id

@@ -11,7 +11,7 @@ from pathlib import Path
 from socket import gethostname
 from typing import Any
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine.atomic import MANIFEST, PARTIAL, StoreError
 from pipeline.engine.layout import KEY_DIGITS, Root, read_json
 from pipeline.engine.locks import holder

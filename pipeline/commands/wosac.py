@@ -8,7 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.metrics.wosac import metric as wosac
 from infgen.metrics.wosac.rollouts import Rollouts
 from infgen.metrics.wosac.submission import NUM_ROLLOUTS, Refused, read_submission

@@ -53,10 +53,10 @@ class _Ahead:
 
     def look(self, leg: Leg, note: str) -> Outlook:
         """Tell what one run would make; it counts as made for those after it."""
-        start = self.weights.get((leg.arm.start or "", leg.seed))
+        start = self.weights.get((leg.arm.starts_from or "", leg.seed))
         plan = self._plan(leg, start)
         keys = {name: planned.key for name, planned in plan.stages.items()}
-        waits = leg.arm.start is not None and start is None and TRAIN in keys
+        waits = leg.arm.starts_from is not None and start is None and TRAIN in keys
         if waits:  # Its keys follow from weights that are not there; these stand for them.
             keys |= {name: f"{leg.arm.name} {keys[name]}" for name in plan.after([TRAIN])}
         root = self.comparison.root
@@ -68,7 +68,7 @@ class _Ahead:
         if TRAIN in keys and root.is_finished(TRAIN, keys[TRAIN]):
             self.weights[leg.arm.name, leg.seed] = keys[TRAIN]
         self.done.update(keys.items())
-        return Outlook(leg.words, makes, f"after {leg.arm.start}" if waits else note)
+        return Outlook(leg.words, makes, f"after {leg.arm.starts_from}" if waits else note)
 
     def _plan(self, leg: Leg, start: str | None) -> Plan:
         sketched, comparison = self.sketched, self.comparison

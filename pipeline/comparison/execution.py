@@ -109,10 +109,10 @@ class _Runs:
 
     def run(self, leg: Leg) -> Ran:
         start = None
-        if leg.arm.start is not None and TRAIN in self.comparison.stages:
-            start = self.weights.get((leg.arm.start, leg.seed))
+        if leg.arm.starts_from is not None and TRAIN in self.comparison.stages:
+            start = self.weights.get((leg.arm.starts_from, leg.seed))
             if start is None:
-                return Ran(leg, "skipped", f"there are no weights of {leg.arm.start}")
+                return Ran(leg, "skipped", f"there are no weights of {leg.arm.starts_from}")
         plan = self.comparison.plan(leg, start)
         for stage, planned in plan.stages.items():
             if (stage, planned.key) in self.failed:

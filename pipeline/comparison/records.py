@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.comparison.runs import Comparison
 from pipeline.engine.events import Event
 from pipeline.storage.source_files import find_urls

@@ -124,7 +124,7 @@ class Compared:
                 f"mean over {len(self.seeds)} seeds of training and playing; 95 % "
                 "interval of that mean by Student's t"
             )
-        times = {one.settings.resamples for one in self.scored}
+        times = {one.settings.bootstrap_resamples for one in self.scored}
         drawn = ", ".join(f"{each:,}" for each in sorted(times))
         return (
             "one seed; 95 % interval by drawing the scenes again with replacement "

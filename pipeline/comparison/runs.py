@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import Root
 from pipeline.engine.plan import SOURCES, Plan, make_plan, stages_in_order
@@ -164,8 +164,8 @@ class Comparison:
             for section in _SEEDED
         }
         if start is not None:
-            own[TRAIN]["start"] = SettingValue(
-                start, f"weights of arm {leg.arm.start}: {TRAIN}"
+            own[TRAIN]["initial_weights"] = SettingValue(
+                start, f"weights of arm {leg.arm.starts_from}: {TRAIN}"
             )
         words = read_overrides(self.overrides, self.file.sections)
         for section in _SEEDED:

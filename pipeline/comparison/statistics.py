@@ -91,7 +91,7 @@ def _ratio(ours: Scored, theirs: Scored, name: str) -> Measured:
         return np.where(below != 0, above / np.where(below != 0, below, 1), np.nan)[:, None]
 
     settings = ours.settings
-    found = bootstrap(values, divide, settings.resamples, settings.seed)
+    found = bootstrap(values, divide, settings.bootstrap_resamples, settings.seed)
     return Measured(*[_known(float(part[0])) for part in found])
 
 

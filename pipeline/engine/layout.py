@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine.atomic import MANIFEST, PARTIAL, StoreError, sync_folder
 
 RUN = "run.json"

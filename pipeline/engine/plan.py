@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, Protocol, runtime_checkable
 
-from infgen.config import key_values
+from infgen.settings import key_values
 from pipeline.engine.layout import Root
 from pipeline.engine.registry import load_stage
 from pipeline.engine.stage import Source, Stage, Unit

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Any
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine.registry import load_stage
 from pipeline.settings.lined_yaml import did_you_mean
 from pipeline.settings.stages_file import StagesFile

@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 
 MAPPING = yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG
 SEQUENCE = yaml.resolver.BaseResolver.DEFAULT_SEQUENCE_TAG

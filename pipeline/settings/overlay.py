@@ -8,7 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from infgen.config import ConfigError, settle
+from infgen.config import settle
+from infgen.errors import ConfigError
 from pipeline.engine.layout import Root
 from pipeline.engine.stage import Source
 from pipeline.settings.lined_yaml import LinedMapping, did_you_mean, inner, known

@@ -4,8 +4,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from infgen.coerce import build
-from infgen.config import ConfigError
+from infgen.settings import build
+from infgen.errors import ConfigError
 from infgen.views.published import ABLATIONS, PAPER
 from pipeline.settings.lined_yaml import LinedMapping, did_you_mean, inner, known, words
 from pipeline.settings.overlay import Overlay, merge_overlays, read_sections
@@ -14,7 +14,7 @@ from pipeline.settings.presets import Arm, Preset, TownSet
 COUNT_ERRORS = ("own", "split", "truth")
 """See ``infgen.metrics.long_term.table``: own log, mean of the split, same step."""
 _PRESET = ("profile", "seeds", "count_error", "towns", "rollout_sets", "arms")
-_ARM = ("profile", "published", "label", "start", "ablates", "rollout_sets")
+_ARM = ("profile", "published", "label", "starts_from", "ablates", "rollout_sets")
 _METHODS = tuple(each.method for each in PAPER)
 
 
@@ -90,7 +90,7 @@ def _arm(arms: LinedMapping, name: str, context: _Context) -> Arm:
             play: merge_overlays([settings, context.rollout_sets[play], over])
             for play, over in own.items()
         },
-        start=_word(entry, "start", tuple(arms)),
+        starts_from=_word(entry, "starts_from", tuple(arms)),
         ablates=_word(entry, "ablates", tuple(arms)),
         published=published,
         where=arms.where(name),
@@ -186,7 +186,7 @@ def _places(towns: LinedMapping) -> list[tuple[str, str]]:
 
 def _check_arms(arms: Mapping[str, Arm]) -> None:
     for arm in arms.values():
-        if arm.name in (arm.start, arm.ablates):
+        if arm.name in (arm.starts_from, arm.ablates):
             raise ConfigError(f"{arm.where}: arm {arm.name!r} names itself")
 
 
@@ -195,7 +195,7 @@ def _ordered(arms: Mapping[str, Arm]) -> list[str]:
     order: list[str] = []
     for name in arms:
         chain = [name]
-        while (start := arms[chain[-1]].start) is not None:
+        while (start := arms[chain[-1]].starts_from) is not None:
             if start in chain:
                 circle = " -> ".join([*chain, start])
                 raise ConfigError(f"{arms[name].where}: arms start each other: {circle}")

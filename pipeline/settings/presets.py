@@ -17,7 +17,7 @@
           smart:
             profile: smart              # over the preset's profile
             rollout_sets: {long: {score: {presence_radius_m: 75}}, wosac: {}}
-          catk: {profile: "smart,closed-loop", start: smart, rollout_sets: [long]}
+          catk: {profile: "smart,closed-loop", starts_from: smart, rollout_sets: [long]}
           no-cell: {profile: no-position-token, ablates: infgen, rollout_sets: [long]}
 
 Sections of settings may stand in the preset itself, in an arm, in a play, and in a play of
@@ -27,7 +27,7 @@ an arm; each is laid over those before it, and all of them over the profiles.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.settings.lined_yaml import did_you_mean
 from pipeline.settings.overlay import Overlay
 
@@ -60,7 +60,7 @@ class Arm:
         settings: Laid over all profiles, those of the preset among them.
         rollout_sets: The same of each of its rollout_sets, with what the play sets, by the
             play's name.
-        start: Arm whose weights it goes on from.
+        starts_from: Arm whose weights it goes on from.
         ablates: Arm of which it leaves something out; it then stands in the table of
             ablations.
         published: Row of the paper that it stands beside.
@@ -72,7 +72,7 @@ class Arm:
     profile: tuple[str, ...]
     settings: Overlay
     rollout_sets: Mapping[str, Overlay]
-    start: str | None
+    starts_from: str | None
     ablates: str | None
     published: str | None
     where: str
@@ -115,8 +115,8 @@ class Preset:
         have = {arm.name for arm in arms}
         needed: set[str] = set()
         for arm in arms:
-            start = arm.start
+            start = arm.starts_from
             while start is not None:
                 needed.add(start)
-                start = self.arms[start].start
+                start = self.arms[start].starts_from
         return [arm for name, arm in self.arms.items() if name in needed - have]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine.atomic import StoreError, write_file, write_json
 from pipeline.engine.layout import Root, link, read_json
 from pipeline.engine.plan import Plan, PlanError, make_plan

@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine.plan import SOURCES, StageEntry
 from pipeline.engine.registry import MODULES
 from pipeline.settings.lined_yaml import (

@@ -30,12 +30,12 @@ def normalize(settings: Settings) -> Settings:
     """Leave only what decides: rollouts that differ in the rest share a calibration."""
     how: CalibrateSettings = settings["calibrate"]
     played: RolloutSettings = settings["rollout"]
-    if how.by != "play" or not (played.inserts and played.removes):
-        by = "none" if how.by == "none" else "odds"
+    if how.method != "simulate" or not (played.inserts and played.removes):
+        by = "none" if how.method == "none" else "odds"
         return {
             "tokenize": TokenSettings(),
             "rollout": RolloutSettings(),
-            "calibrate": CalibrateSettings(by=by),
+            "calibrate": CalibrateSettings(method=by),
         }
     usual = RolloutSettings()
     same = (
@@ -54,7 +54,7 @@ def normalize(settings: Settings) -> Settings:
 def plan(inputs: Inputs, settings: Settings) -> list[Unit]:
     """One unit per pair of biases and some scenes; none if nothing is played."""
     how: CalibrateSettings = settings["calibrate"]
-    if how.by != "play":
+    if how.method != "simulate":
         return []
     from pipeline.stages.flow_response import DESIGN  # noqa: PLC0415
 
@@ -102,9 +102,9 @@ def _parts(
     """
     files = files_of_split(
         inputs.units("ingest"), how.split,
-        to="play and calibrate by", setting="calibrate.split or calibrate.by",
+        to="play and calibrate by", setting="calibrate.split or calibrate.method",
     )  # fmt: skip
-    chosen = zip(files, spread_evenly(files, how.scenes), strict=True)
+    chosen = zip(files, spread_evenly(files, how.max_scenes), strict=True)
     scenes = [(done, row) for done, rows in chosen for row in rows]
     most = how.scenes_per_unit
     parts = [scenes[at : at + most] for at in range(0, len(scenes), most)]
@@ -171,8 +171,8 @@ def finish(
     """Find the biases, and write them and what was played for them."""
     target.mkdir(parents=True, exist_ok=True)
     how: CalibrateSettings = settings["calibrate"]
-    odds = Biases() if how.by == "none" else read_biases(inputs.folder("train"))
-    found, about = odds, {"by": how.by}
+    odds = Biases() if how.method == "none" else read_biases(inputs.folder("train"))
+    found, about = odds, {"by": how.method}
     if units:
         found, about = _find(inputs, units, target, how)
     write_found(target, found)

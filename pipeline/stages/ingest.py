@@ -62,7 +62,10 @@ def work(unit: Unit, target: Path, settings: IngestSettings, progress: Progress)
     shard = _Shard(target, unit.name, settings.max_scenes_per_shard)
     for record in iter_records(unit.task["url"]):
         shard.take(record)
-        if settings.limit and len(shard.index) >= settings.limit:
+        if (
+            settings.max_scenes_per_file
+            and len(shard.index) >= settings.max_scenes_per_file
+        ):
             break
     shard.close()
     return shard.report()

@@ -77,7 +77,7 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
     every = inputs.units("ingest")
     shards = files_of_split(every, settings.split, to="play", setting="rollout.split")
     units = []
-    for done, rows in zip(shards, spread_evenly(shards, settings.scenes), strict=True):
+    for done, rows in zip(shards, spread_evenly(shards, settings.max_scenes), strict=True):
         for first, after in pairwise(_edges(len(rows), settings.scenes_per_unit)):
             units.append(
                 Unit(

@@ -10,7 +10,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from infgen.config import ConfigError, ReferenceSettings, ScoreSettings
+from infgen.config import ReferenceSettings, ScoreSettings
+from infgen.errors import ConfigError
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
 from pipeline.storage.splits import in_split, split_of
 
@@ -31,9 +32,9 @@ def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
     """
     from infgen.metrics.wosac.versions import VERSIONS  # noqa: PLC0415
 
-    if (version := settings["score"].wosac) not in VERSIONS:
+    if (version := settings["score"].wosac_version) not in VERSIONS:
         raise ConfigError(
-            f"score.wosac is {version!r}; expected one of {', '.join(VERSIONS)}"
+            f"score.wosac_version is {version!r}; expected one of {', '.join(VERSIONS)}"
         )
     _check_split(inputs.units("rollout"), settings["reference"].split)
     scenes = {done.name: done for done in inputs.units("ingest")}
@@ -131,7 +132,7 @@ class _Scorer:
         from pipeline.stages.score_write import rows_of  # noqa: PLC0415
 
         edges, radius_m = edges_of(scene), self._settings.presence_radius_m
-        self.official.append(_score_wosac(scene, rollouts, self._settings.wosac))
+        self.official.append(_score_wosac(scene, rollouts, self._settings.wosac_version))
         for rollout in rollouts:
             lived = live_within(rollout, radius_m) if radius_m else rollout
             near_m = self._reference.count_radius_m
@@ -148,7 +149,7 @@ class _Scorer:
 
         found = list(self._rows)
         for one in self.official:
-            prefix = f"{self._settings.wosac}/"
+            prefix = f"{self._settings.wosac_version}/"
             found += rows_of(one["scenario_id"], None, one.get("scores", {}), prefix)
         return found
 

@@ -195,9 +195,11 @@ class Summary:
         names = list(scored[0]) if scored else []
         values = np.array([[s[name] for name in names] for s in scored], dtype=np.float64)
         values = values.reshape(len(scored), len(names))
-        interval = bootstrap(values, _same, self.settings.resamples, self.settings.seed)
+        interval = bootstrap(
+            values, _same, self.settings.bootstrap_resamples, self.settings.seed
+        )
         return {
-            "version": self.settings.wosac,
+            "version": self.settings.wosac_version,
             "scenes": len(scored),
             "skipped": _some(skipped),
             "scores": _entries(names, interval, None),
@@ -209,7 +211,9 @@ class Summary:
     def _bootstrap(self, tally: Tally, names: Sequence[str], follow: Any) -> Interval:
         known = names if tally.means else []
         values = tally.matrix(known) if known else np.full((1, len(names)), np.nan)
-        return bootstrap(values, follow, self.settings.resamples, self.settings.seed)
+        return bootstrap(
+            values, follow, self.settings.bootstrap_resamples, self.settings.seed
+        )
 
 
 _PROTOCOL_NAMES = tuple(protocol.name for protocol in PROTOCOLS)

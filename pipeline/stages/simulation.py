@@ -71,7 +71,7 @@ def begin(player: "Player", scene: "Scene") -> "list[Start]":
     if settings.simulates_all_agents:
         tokens = replace(tokens, max_ego_distance_m=math.inf)
     history = tokenize_scene(scene, player.codebook, player.roads, tokens, until=scene.now)
-    lights = read_lights(scene) if settings.lights == "log" else None
+    lights = read_lights(scene) if settings.signals == "log" else None
     return [
         Start(scene, history, at, settings.seed, lights) for at in range(settings.count)
     ]
@@ -96,7 +96,7 @@ def play_all(
 
     duration_s, done = player.settings.duration_s, 0
     few = max(1, int(TOGETHER_S / duration_s))
-    for batch in _batches(starts, player.settings.batch):
+    for batch in _batches(starts, player.settings.batch_rollouts):
         frames: list[Frame] = []
         for frame in simulate(player, batch):
             frames.append(frame)

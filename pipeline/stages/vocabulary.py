@@ -117,7 +117,9 @@ def reads(root: Path, settings: VocabSettings) -> list[Source]:
     Raises:
         ConfigError: if there are none, or a key is of several.
     """
-    return find_initial_weights(root, "build-vocab.start", settings.start)
+    return find_initial_weights(
+        root, "build-vocab.initial_weights", settings.initial_weights
+    )
 
 
 def plan(inputs: Inputs, settings: VocabSettings) -> list[Unit]:
@@ -133,7 +135,7 @@ def plan(inputs: Inputs, settings: VocabSettings) -> list[Unit]:
     validation_split = [
         done for done in files if in_split(done.name, settings.validation_split)
     ]
-    if not learn and not (settings.start and validation_split):
+    if not learn and not (settings.initial_weights and validation_split):
         found = ", ".join(sorted({split_of(done.name) for done in files})) or "none"
         raise PlanError(
             f"no file of split {settings.split!r} to build vocabularies from (there is: "
@@ -272,7 +274,7 @@ class _Sample:
             del self._paths[max(self._paths)]
 
     def _merge(self) -> None:
-        most = self._settings.segments_per_shard
+        most = self._settings.samples_per_shard
         if self._segments:
             self._segments = [sample_segments(self._segments, most)]
         self._curves = [sample_curves(self._curves, most)]
@@ -281,7 +283,7 @@ class _Sample:
 def _gather(units: Sequence[FinishedUnit], side: str, settings: VocabSettings) -> _Gathered:
     """Merge one side's samples of all files, one file in memory at a time."""
     segments, curves, paths = NO_SEGMENTS, NO_CURVES, dict[int, Paths]()
-    most = settings.segments_per_kind
+    most = settings.samples_per_type
     for done in units:
         folder = done.path / side
         if not folder.is_dir():

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.pretrained import builtin_weights
 from pipeline.engine.layout import KEY_DIGITS, Root, read_json
 from pipeline.engine.stage import Source

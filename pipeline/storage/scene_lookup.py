@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.scene import Scene
 from infgen.sources.tfrecord import BadRecord, RecordError, iter_records, read_record
 from infgen.sources.womd import decode_scene, read_scenario_id

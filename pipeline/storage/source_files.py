@@ -23,7 +23,7 @@ from typing import Any
 
 import google_crc32c
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.sources.remote import file_system
 from infgen.sources.tfrecord import Record, read_record
 from pipeline.engine.atomic import MANIFEST, StoreError, write_json

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine import signals
 from pipeline.engine.atomic import PARTIAL, write_file, write_json
 from pipeline.engine.events import Event

@@ -13,7 +13,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from infgen.config import ModelSettings, TokenSettings, build
+from infgen.config import ModelSettings, TokenSettings
+from infgen.settings import build
 from infgen.model.network import Network
 from infgen.pretrained import builtin_weights
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary

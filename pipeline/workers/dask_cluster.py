@@ -17,7 +17,7 @@ from importlib import import_module
 from queue import SimpleQueue
 from typing import Any
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine.stage import Progress
 from pipeline.engine.units import (
     DriverWorkers,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.exports.wosac import About, complete, encode_about, encode_futures, in_words
 from infgen.metrics.wosac.rollouts import Rollouts, RolloutsError
 from infgen.metrics.wosac.submission import read_submission

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from infgen.config import ConfigError, ModelSettings
+from infgen.config import ModelSettings
+from infgen.errors import ConfigError
 from infgen.model.batching.batch import Roads
 from infgen.model.signal_features import CLASSES, LONG_SINCE, StopLines, features
 from infgen.tokens.scene_tokens import SignalClass

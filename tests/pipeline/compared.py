@@ -49,7 +49,7 @@ def scored(method, seed, means, *, mode="long", numbers=None, curves=None) -> Sc
             name: Measured(*_spread(value)) for name, value in (numbers or {}).items()
         },
         tally=Tally(means=dict(means), rollouts=len(means), sums=sums),
-        settings=ScoreSettings(resamples=200),
+        settings=ScoreSettings(bootstrap_resamples=200),
         measures=ReferenceSettings(),
     )
 

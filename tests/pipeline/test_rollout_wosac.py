@@ -47,7 +47,9 @@ def played(record, metre_moves, bent_roads, tmp_path_factory, quiet):
     save_network(weights, network, state_dict_of(network), step=0)
     paths = {"scenes": str(scenes), "weights": str(weights)}
     unit = Unit("v-00000", {"weights": "random"}, {**paths, "biases": {}, "rows": [0]})
-    report = STAGE.work(unit, target, RolloutSettings(mode="wosac", batch=16), quiet)
+    report = STAGE.work(
+        unit, target, RolloutSettings(mode="wosac", batch_rollouts=16), quiet
+    )
     assert (report["rollouts"], report["inserted"], report["left"]) == (32, 0, 0)
     return target
 

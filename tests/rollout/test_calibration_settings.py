@@ -1,6 +1,7 @@
 import pytest
 
-from infgen.config import CalibrateSettings, ConfigError
+from infgen.config import CalibrateSettings
+from infgen.errors import ConfigError
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from infgen.config import ConfigError, RolloutSettings
+from infgen.config import RolloutSettings
+from infgen.errors import ConfigError
 from infgen.rollout.session import Session
 from infgen.scene import SignalState
 from infgen.tokens.scene_tokens import SignalClass
@@ -115,4 +116,4 @@ def test_lights_of_scenes_side_by_side_last_as_long_as_each_has_them(lit, play):
 )
 def test_lights_are_of_now_or_of_the_log_and_never_foreseen_by_waymos_rules(settings, said):
     with pytest.raises(ConfigError, match=said):
-        RolloutSettings(**{"lights": "log", **settings})
+        RolloutSettings(**{"signals": "log", **settings})

@@ -1,6 +1,8 @@
 import pytest
 
-from infgen.config import ConfigError, RolloutSettings, build
+from infgen.config import RolloutSettings
+from infgen.errors import ConfigError
+from infgen.settings import build
 from infgen.rollout.settings import MODES
 
 

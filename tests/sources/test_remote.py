@@ -2,7 +2,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.sources.remote import file_system
 from infgen.sources.tfrecord import frame, iter_records
 

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from infgen.config import ConfigError, TokenSettings
+from infgen.config import TokenSettings
+from infgen.errors import ConfigError
 from infgen.tokens.grid import (
     decode_cell,
     decode_heading,

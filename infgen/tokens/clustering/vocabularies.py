@@ -181,7 +181,7 @@ def cluster_roads(
     """
     logged, space = _distinct(curve_m), RoadSpace()
     order = np.random.default_rng(settings.seed).permutation(len(logged))
-    tolerance_m = settings.road_tolerance_m
+    tolerance_m = settings.map_tolerance_m
     if tolerance_m == 0:
         tolerance_m = _road_tolerance(space, logged, order, settings.num_map_tokens)
     shelf = _Shelf(space, settings.num_map_tokens, logged[:0])

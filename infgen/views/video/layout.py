@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from infgen.clock import CLOCK
-from infgen.coerce import ConfigError
+from infgen.errors import ConfigError
 from infgen.views.scene.agent_marks import Crowd
 from infgen.views.scene.marks import Mark
 from infgen.views.scene.shapes import shape_of

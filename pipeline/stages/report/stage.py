@@ -68,7 +68,7 @@ def finish(
     summary = json.loads((inputs.folder("score") / "summary.json").read_text())
     manifests = {stage: read_manifest(inputs.folder(stage)) for stage in STAGES}
     lowest = find_lowest(inputs.folder("score") / "scores.parquet", LOWEST)
-    pages = write_players(inputs, target, lowest, settings.players)
+    pages = write_players(inputs, target, lowest, settings.player_pages)
     scores, *more = [
         *_score_tables(summary, manifests),
         worst_table(lowest, pages),

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.views.charts.calibration import Bins
 from infgen.views.charts.figures import Series
 from infgen.views.charts.training import Run, training_charts

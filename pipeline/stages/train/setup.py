@@ -59,16 +59,16 @@ class Course:
         how = self.train
         if how.steps and not len(self.scenes):
             raise TrainingError(f"no scenes of split {how.split!r} to train on")
-        parts = how.accumulate * team.size
+        parts = how.gradient_accumulation * team.size
         if parts > how.batch_scenes:
             raise TrainingError(
                 f"train.batch_scenes is {how.batch_scenes}, too few for {team.size} "
-                f"processes with {how.accumulate} parts each; expected {parts} or more"
+                f"processes with {how.gradient_accumulation} parts each; expected {parts} or more"
             )
         sizes = self.scenes.sizes(self.limits)
         order = Order(sizes, how.batch_scenes, how.bucket_batches, how.seed)
-        first = team.rank * how.accumulate
-        own = range(first, first + how.accumulate)
+        first = team.rank * how.gradient_accumulation
+        own = range(first, first + how.gradient_accumulation)
         return Recipe(self.scenes, self.limits, order, parts, own)
 
 

@@ -11,7 +11,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from infgen.config import ModelSettings, TokenSettings, TrainSettings, build
+from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.settings import build
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import RUN_FOLDER, read_json
 from pipeline.engine.stage import (
@@ -60,7 +61,9 @@ def reads(root: Path, settings: Mapping[str, Any]) -> list[Source]:
     Raises:
         ConfigError: if there are none, or the key is of several.
     """
-    return find_initial_weights(root, "train.start", settings["train"].start)
+    return find_initial_weights(
+        root, "train.initial_weights", settings["train"].initial_weights
+    )
 
 
 def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:

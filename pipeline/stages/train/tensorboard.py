@@ -5,7 +5,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 
 
 class EventFiles:

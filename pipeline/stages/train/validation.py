@@ -35,7 +35,7 @@ def validate(course: Course, training: TrainingState, forward: Pass) -> Found:
     for batch in held_out_batches(
         course.validation_split,
         course.limits,
-        max(1, settings.batch_scenes // settings.accumulate),
+        max(1, settings.batch_scenes // settings.gradient_accumulation),
         settings.seed,
         settings.validation_scenes,
     ):

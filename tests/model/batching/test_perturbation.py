@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from infgen.config import ConfigError, TrainSettings
+from infgen.config import TrainSettings
+from infgen.errors import ConfigError
 from infgen.model.batching.perturbation import (
     Noise,
     exchange_roads,

@@ -14,7 +14,8 @@ import polars as pl
 import pytest
 
 from cli import main
-from infgen.config import ConfigError, IngestSettings
+from infgen.config import IngestSettings
+from infgen.errors import ConfigError
 from infgen.exports.scenarionet import with_arrays
 from infgen.metrics.wosac.rollouts import RolloutsError
 from infgen.metrics.wosac.submission import read_submission

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from cli import main
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.rollout.rollout import Rollout
 from infgen.views.player.payload import unpack
 from pipeline.commands.view import Wanted, find_film, view

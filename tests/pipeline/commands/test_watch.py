@@ -6,7 +6,7 @@ from socket import gethostname
 
 import pytest
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.commands import watch
 from pipeline.commands.watch import NOTHING_YET, Watcher
 from pipeline.engine.events import Events

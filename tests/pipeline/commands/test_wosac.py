@@ -9,7 +9,8 @@ import polars as pl
 import pytest
 
 from cli import main
-from infgen.config import ConfigError, IngestSettings
+from infgen.config import IngestSettings
+from infgen.errors import ConfigError
 from infgen.metrics.wosac import metric
 from infgen.metrics.wosac.submission import Refused
 from infgen.rollout.rollout import Rollout

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.comparison.dry_run import look_ahead
 from pipeline.comparison.execution import Ran, run_legs
 from pipeline.comparison.records import find_records
@@ -37,7 +37,7 @@ presets:
     seeds: 2
     rollout_sets: {long: {}, brief: {rollout: {mode: brief}}}
     arms:
-      tuned: {start: plain, train: {steps: 1}, rollout_sets: [brief]}
+      tuned: {starts_from: plain, train: {steps: 1}, rollout_sets: [brief]}
       plain: {rollout_sets: {long: {score: {presence_radius_m: 75}}, brief: {}}}
       other: {train: {steps: 7}, rollout_sets: [long]}
 """

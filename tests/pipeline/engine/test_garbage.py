@@ -123,7 +123,7 @@ def trainer(workshop):
 
 def test_weights_that_a_request_starts_from_are_kept(trainer):
     first = trainer.run()["train"].key
-    start = f"train.start={first[:16]}"
+    start = f"train.initial_weights={first[:16]}"
     trainer.run(start)
 
     assert remove_garbage(trainer.root, named_weights(trainer.root)) == []
@@ -150,14 +150,14 @@ def test_weights_are_kept_by_their_folder_and_for_a_stage_not_made_yet(trainer):
     folder = trainer.root.stage("train") / first
     trainer.run("train.seed=3")
     plan = trainer.plan("train.seed=3")
-    trainer.request(f"build-vocab.start={folder}").remember(plan)
+    trainer.request(f"build-vocab.initial_weights={folder}").remember(plan)
 
     assert remove_garbage(trainer.root, named_weights(trainer.root)) == []
 
 
 def test_weights_that_nothing_starts_from_any_more_are_garbage(trainer):
     first = trainer.run()["train"].key[:16]
-    trainer.run(f"train.start={first}")
+    trainer.run(f"train.initial_weights={first}")
     trainer.run("train.seed=3")
 
     found = {

@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine.plan import (
     PlanError,
     StageEntry,

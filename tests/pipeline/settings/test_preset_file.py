@@ -2,7 +2,7 @@
 
 import pytest
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.views.published import ABLATIONS, PAPER
 from pipeline.settings.presets import TownSet
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
@@ -27,7 +27,7 @@ presets:
       long: {rollout: {mode: long, count: 2}}
       brief: {rollout: {mode: wosac}}
     arms:
-      fine: {profile: motion, start: plain, train: {steps: 1}, rollout_sets: [long]}
+      fine: {profile: motion, starts_from: plain, train: {steps: 1}, rollout_sets: [long]}
       plain:
         label: Plain
         profile: motion
@@ -106,8 +106,16 @@ def test_arms_are_picked_by_name_and_bring_those_that_they_start_from(load):
         ("count: 2}", "count: null}", "stages.yaml:17: rollout.count is None"),
         ("long: {rollout", "long: {roll", "stages.yaml:17: long: no entry 'roll'"),
         ("brief: {rollout", "a b: {rollout", "stages.yaml:18: play 'a b'; expected"),
-        ("start: plain", "start: plan", "stages.yaml:20: no start 'plan'; did you mean"),
-        ("start: plain", "start: fine", "stages.yaml:20: arm 'fine' names itself"),
+        (
+            "starts_from: plain",
+            "starts_from: plan",
+            "stages.yaml:20: no starts_from 'plan'; did you mean",
+        ),
+        (
+            "starts_from: plain",
+            "starts_from: fine",
+            "stages.yaml:20: arm 'fine' names itself",
+        ),
         ("train: {steps: 1}", "trian: {steps: 1}", "stages.yaml:20: fine: no entry"),
         (
             "rollout_sets: [long]",
@@ -120,7 +128,11 @@ def test_arms_are_picked_by_name_and_bring_those_that_they_start_from(load):
             "stages.yaml:20: rollout_sets is 'long'",
         ),
         ("label: Plain", "label: 3", "stages.yaml:22: label is 3; expected a word"),
-        ("label: Plain", "start: fine", "arms start each other: fine -> plain -> fine"),
+        (
+            "label: Plain",
+            "starts_from: fine",
+            "arms start each other: fine -> plain -> fine",
+        ),
         (", brief: {}", ", brif: {}", "stages.yaml:24: rollout_sets: no entry 'brif'"),
         ("      whole:", "      who le:", "stages.yaml:25: arm 'who le'; expected"),
         ("published: InfGen", "published: Infgen", "stages.yaml:25: no published 'Infg"),
@@ -153,7 +165,7 @@ def test_the_packaged_presets_compare_all_methods_of_the_paper_and_all_ablations
             assert set(arm.rollout_sets) == {"long", "motion-only", "wosac"}
             radius = "score.presence_radius_m=75" in arm.rollout_sets["long"].words
             assert radius == (arm.published != "InfGen")
-        assert preset.arms["catk"].start == "smart"
+        assert preset.arms["catk"].starts_from == "smart"
     assert file.preset("womd-mini").towns == {}
     towns = file.preset("towns-benchmark").towns
     assert {split: each.seconds for split, each in towns.items()} == {

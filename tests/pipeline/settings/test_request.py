@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine.plan import PlanError
 from pipeline.settings.request import complete_request
 from pipeline.settings.stages_file import DEFAULT_FILE

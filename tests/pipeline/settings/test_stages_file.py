@@ -2,14 +2,9 @@ from pathlib import Path
 
 import pytest
 
-from infgen.config import (
-    ConfigError,
-    ModelSettings,
-    TokenSettings,
-    TrainSettings,
-    build,
-    key_values,
-)
+from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.errors import ConfigError
+from infgen.settings import build, key_values
 from infgen.model.network import Network
 from pipeline.engine.plan import SOURCES, stages_in_order
 from pipeline.engine.registry import MODULES, load_stage
@@ -200,7 +195,9 @@ def test_wrong_words_are_named(load, profile, words, message):
 
 def test_settings_that_decide_nothing_are_left_out_of_keys():
     how = TrainSettings()
-    other = TrainSettings(loader_workers=3, checkpoint_minutes=1.0, start="work/train")
+    other = TrainSettings(
+        loader_workers=3, checkpoint_minutes=1.0, initial_weights="work/train"
+    )
 
     assert key_values(other) == key_values(how)
     assert key_values(TrainSettings(steps=1)) != key_values(how)

@@ -22,7 +22,7 @@ PLAYED = RolloutSettings(seconds=3.0, max_agents=16, count=7, seed=3)
 SETTINGS = {
     "tokenize": TokenSettings(),
     "rollout": PLAYED,
-    "calibrate": CalibrateSettings(by="play", scenes=3, scenes_per_unit=2),
+    "calibrate": CalibrateSettings(method="simulate", max_scenes=3, scenes_per_unit=2),
 }
 
 
@@ -118,15 +118,15 @@ def test_rollouts_that_differ_in_number_alone_share_a_calibration():
         assert stage.normalize(with_settings("rollout", **values)) == NARROW
     for values in ({"motion_top_p": 0.5}, {"seconds": 9.0}, {"lights": "log"}):
         assert stage.normalize(with_settings("rollout", **values)) != NARROW
-    plain = stage.normalize(with_settings("calibrate", by="odds"))
-    other = {**with_settings("calibrate", by="odds"), "rollout": RolloutSettings()}
+    plain = stage.normalize(with_settings("calibrate", method="odds"))
+    other = {**with_settings("calibrate", method="odds"), "rollout": RolloutSettings()}
     assert stage.normalize(other) == plain
 
 
 def test_a_unit_counts_rollouts_and_logs_and_names_what_cannot_be_played(
     inputs, tmp_path, quiet
 ):
-    every = stage.normalize(with_settings("calibrate", scenes=0, scenes_per_unit=99))
+    every = stage.normalize(with_settings("calibrate", max_scenes=0, scenes_per_unit=99))
     unit = stage.plan(inputs, every)[0]
 
     report = stage.work(unit, tmp_path / "out", every, quiet)
@@ -148,7 +148,7 @@ def test_a_rollout_counts_until_its_ego_leaves_the_map(inputs, drive, tmp_path, 
     path = folder / "scenes-000.zarr"
     write_records(path, [scene], Scene, SCENES_SCHEMA, compress=True)
     short = FinishedUnit("training.tfrecord-9", "key", folder, {"scenes": 1})
-    every = stage.normalize(with_settings("calibrate", scenes=0, scenes_per_unit=99))
+    every = stage.normalize(with_settings("calibrate", max_scenes=0, scenes_per_unit=99))
     unit = stage.plan(Finished([short], inputs.weights), every)[0]
 
     report = stage.work(unit, tmp_path / "out", every, quiet)
@@ -174,7 +174,7 @@ def with_reach(reach):
             "calibrate",
             add_bias_range=reach,
             remove_bias_range=reach,
-            scenes=0,
+            max_scenes=0,
             scenes_per_unit=99,
         )
     )
@@ -223,7 +223,7 @@ def test_without_plays_the_last_validation_decides_or_nothing(
         inputs.weights,
         add_bins={"count": [400], "predicted": [200], "happened": [300]},
     )
-    settings = stage.normalize(with_settings("calibrate", by=by))
+    settings = stage.normalize(with_settings("calibrate", method=by))
 
     report = stage.finish(inputs, [], tmp_path / "out", settings, quiet)
 

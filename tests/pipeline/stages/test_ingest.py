@@ -181,7 +181,7 @@ def test_a_clean_file_has_an_empty_quarantine_with_its_columns(tmp_path, three):
 
 
 def test_a_limit_takes_the_first_scenes_of_each_file(tmp_path, three):
-    done = run_unit(three, tmp_path / "unit", limit=2)
+    done = run_unit(three, tmp_path / "unit", max_scenes_per_file=2)
 
     assert [scene.scenario_id for scene in read_scenes(done.path)] == ["a", "b"]
 

@@ -17,7 +17,9 @@ from pipeline.storage.weights import save_network, state_dict_of
 from pipeline.storage.zarr_store import write_records
 from tests.pipeline.finished import TINY, Finished
 
-SETTINGS = RolloutSettings(seconds=2.0, count=2, scenes_per_unit=2, batch=3, max_agents=16)
+SETTINGS = RolloutSettings(
+    seconds=2.0, count=2, scenes_per_unit=2, batch_rollouts=3, max_agents=16
+)
 
 
 def no_progress(done, total, note=""):
@@ -81,7 +83,7 @@ def test_units_are_of_about_equal_work(inputs, scenes, most, parts):
 
 
 def test_the_pace_is_told_and_kept_apart_from_what_is_reproducible(inputs, tmp_path):
-    (unit,) = stage.STAGE.plan(inputs, dataclasses.replace(SETTINGS, scenes=1))
+    (unit,) = stage.STAGE.plan(inputs, dataclasses.replace(SETTINGS, max_scenes=1))
     told, target = [], tmp_path / "out"
     target.mkdir()
 
@@ -95,7 +97,7 @@ def test_the_pace_is_told_and_kept_apart_from_what_is_reproducible(inputs, tmp_p
 
 def test_the_calibrated_biases_are_added_to_those_of_the_settings(inputs, tmp_path):
     write_found(inputs.calibrated, Biases(add=0.75, leave=-0.5))
-    settings = dataclasses.replace(SETTINGS, scenes=1, add_bias=1.0)
+    settings = dataclasses.replace(SETTINGS, max_scenes=1, add_bias=1.0)
 
     (unit,) = stage.STAGE.plan(inputs, settings)
     report, _ = play(unit, tmp_path / "calibrated", settings)
@@ -105,7 +107,7 @@ def test_the_calibrated_biases_are_added_to_those_of_the_settings(inputs, tmp_pa
 
 
 def test_of_limited_scenes_those_far_apart_are_played(inputs, tmp_path):
-    units = stage.STAGE.plan(inputs, dataclasses.replace(SETTINGS, scenes=3))
+    units = stage.STAGE.plan(inputs, dataclasses.replace(SETTINGS, max_scenes=3))
 
     assert [unit.name[-5:] for unit in units] == ["00000", "00003"]
     assert [unit.task["rows"] for unit in units] == [[0, 1], [3]]
@@ -129,7 +131,7 @@ def test_what_is_about_who_enters_or_leaves_decides_nothing_where_nobody_does(
 ):
     normalize = stage.STAGE.normalize
     plain, other = (
-        dataclasses.replace(SETTINGS, scenes=1, **nobody, **more) for more in ({}, idle)
+        dataclasses.replace(SETTINGS, max_scenes=1, **nobody, **more) for more in ({}, idle)
     )
     write_found(inputs.calibrated, Biases(add=0.75, leave=-0.5))
 
@@ -210,7 +212,9 @@ def test_agents_far_away_are_played_where_everyone_is_asked_for(
     scene = build_scene(path, [0, 0])
     write_records(folder / "scenes-000.zarr", [scene], Scene, SCENES_SCHEMA, compress=True)
     inputs = Finished([FinishedUnit(folder.name, "key", folder, {"scenes": 1})], weights)
-    settings = dataclasses.replace(SETTINGS, everyone=everyone, insert=False, remove=False)
+    settings = dataclasses.replace(
+        SETTINGS, all_agents=everyone, insert=False, remove=False
+    )
 
     _, rollouts = play(stage.STAGE.plan(inputs, settings)[0], tmp_path / "out", settings)
 
@@ -227,7 +231,7 @@ def test_the_report_says_what_the_weights_play(
     sizes = dataclasses.replace(TINY, **model)
     network = Network(sizes, metre_moves, bent_roads, TokenSettings())
     save_network(inputs.folder("train"), network, state_dict_of(network), step=7)
-    settings = dataclasses.replace(SETTINGS, scenes=1, seconds=1.0)
+    settings = dataclasses.replace(SETTINGS, max_scenes=1, seconds=1.0)
     (unit,) = stage.STAGE.plan(inputs, settings)
 
     report, rollouts = play(unit, tmp_path / "out", settings)

@@ -6,7 +6,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from infgen.config import ConfigError, ReferenceSettings, ScoreSettings, TokenSettings
+from infgen.config import ReferenceSettings, ScoreSettings, TokenSettings
+from infgen.errors import ConfigError
 from infgen.metrics.long_term.protocols import FEATURES, PROTOCOLS
 from infgen.rollout.rollout import NEVER, Rollout
 from infgen.scene import Scene
@@ -17,7 +18,10 @@ from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.zarr_store import write_records
 
 STEPS = 91
-SETTINGS = {"reference": ReferenceSettings(), "score": ScoreSettings(resamples=50)}
+SETTINGS = {
+    "reference": ReferenceSettings(),
+    "score": ScoreSettings(bootstrap_resamples=50),
+}
 REFERENCE = {"tokenize": TokenSettings(), "reference": ReferenceSettings()}
 SOURCE = "validation.tfrecord-00000-of-00001"
 
@@ -170,7 +174,7 @@ def test_rollouts_of_another_split_than_the_reference_are_a_wrong_setting(tmp_pa
 
 
 def test_a_metric_that_does_not_exist_is_refused_before_anything_is_scored(inputs):
-    settings = {**SETTINGS, "score": ScoreSettings(wosac="wosac-2099")}
+    settings = {**SETTINGS, "score": ScoreSettings(wosac_version="wosac-2099")}
 
     with pytest.raises(ConfigError, match="'wosac-2099'; expected one of wosac-2023"):
         score.plan(inputs, settings)
@@ -342,7 +346,10 @@ def test_without_rollouts_there_is_an_empty_table(tmp_path, scenes):
 def test_the_radius_setting_makes_agents_enter_and_leave(tmp_path, scenes):
     # The ego drives away from the parked cars: with a circle of 20 m they are left behind.
     leaving = replace(scenes[0], scenario_id="crossing")
-    settings = {**SETTINGS, "score": ScoreSettings(resamples=0, presence_radius_m=20.0)}
+    settings = {
+        **SETTINGS,
+        "score": ScoreSettings(bootstrap_bootstrap_resamples=0, presence_radius_m=20.0),
+    }
     inputs = Inputs(
         [ingested(tmp_path / "l", scenes)], [played(tmp_path / "p", [as_rollout(leaving)])]
     )

@@ -125,7 +125,7 @@ def test_without_a_split_to_learn_from_the_error_names_those_there_are(two_split
 
 
 def test_codebooks_that_are_taken_need_nothing_to_learn_from(two_splits):
-    settings = dataclasses.replace(SETTINGS, split="trainig", start="builtin")
+    settings = dataclasses.replace(SETTINGS, split="trainig", initial_weights="builtin")
 
     (unit,) = vocabulary.plan(two_splits, settings)
 
@@ -229,7 +229,7 @@ def test_scenes_that_cannot_be_tokenized_still_give_moves(tmp_path, drive):
 
 
 def test_samples_of_a_file_are_bounded(tmp_path, traffic):
-    settings = dataclasses.replace(SETTINGS, segments_per_shard=10)
+    settings = dataclasses.replace(SETTINGS, samples_per_shard=10)
     inputs = ingested(tmp_path / "ingest", {"training.tfrecord-0": traffic(40)})
     (unit,) = vocabulary.plan(inputs, settings)
     report = vocabulary.work(unit, tmp_path, settings, no_progress)
@@ -259,11 +259,11 @@ def test_codebooks_from_a_few_real_files_write_held_out_scenes_closely(tmp_path)
     for file in files:
         target = tmp_path / "ingest" / file.name
         unit = Unit(file.name, {}, {"url": str(file)})
-        report = ingest.work(unit, target, IngestSettings(limit=10), no_progress)
+        report = ingest.work(
+            unit, target, IngestSettings(max_scenes_per_file=10), no_progress
+        )
         done.append(FinishedUnit(file.name, file.name, target, report))
-    folder, figures = build(
-        Ingested(done), tmp_path, VocabSettings(segments_per_shard=4096)
-    )
+    folder, figures = build(Ingested(done), tmp_path, VocabSettings(samples_per_shard=4096))
     motion, _ = load_vocabularies(folder)
     report = json.loads((folder / "report.json").read_text())
 

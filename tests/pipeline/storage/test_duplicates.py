@@ -82,7 +82,7 @@ def made(folder: Path, *names: str) -> tuple[Root, dict[str, FinishedInputs]]:
     root = Root(folder / "root")
     root.path.mkdir(parents=True)
     records = [str(folder.parent / "records" / name) for name in names]
-    taken = ("build-vocab.start=builtin",)
+    taken = ("build-vocab.initial_weights=builtin",)
     request = Request(root, DEFAULT_FILE, None, tuple(records), taken)
     plan = request.plan(["tokenize", "reference"], {})
     results = run(plan, RunOptions(), Events(root))

@@ -6,7 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from infgen.config import ConfigError, ModelSettings, TokenSettings, VocabSettings
+from infgen.config import ModelSettings, TokenSettings, VocabSettings
+from infgen.errors import ConfigError
 from infgen.model.network import Network
 from infgen.pretrained import builtin_weights
 from infgen.scene import Scene
@@ -52,11 +53,11 @@ class Files:
 
 
 def test_nothing_is_found_where_nothing_is_named(tmp_path):
-    assert find_initial_weights(tmp_path, "train.start", "") == []
+    assert find_initial_weights(tmp_path, "train.initial_weights", "") == []
 
 
 def test_the_packages_own_weights_go_by_a_word(tmp_path):
-    (source,) = find_initial_weights(tmp_path, "train.start", "builtin")
+    (source,) = find_initial_weights(tmp_path, "train.initial_weights", "builtin")
 
     assert source.url == str(builtin_weights())
     assert source.fingerprint == read_description(builtin_weights())["weights"]
@@ -78,20 +79,24 @@ def test_the_start_of_a_key_is_enough_if_it_is_of_one_run_only(tmp_path):
         folder.mkdir(parents=True)
         write_json(folder / DESCRIPTION, {"weights": folder.name * 8})
 
-    (source,) = find_initial_weights(tmp_path, "train.start", "abcd02")
+    (source,) = find_initial_weights(tmp_path, "train.initial_weights", "abcd02")
     assert source.url == str(made[1])
-    with pytest.raises(ConfigError, match=r"x.start is 'abcd', but several have it"):
-        find_initial_weights(tmp_path, "x.start", "abcd")
+    with pytest.raises(
+        ConfigError, match=r"x.initial_weights is 'abcd', but several have it"
+    ):
+        find_initial_weights(tmp_path, "x.initial_weights", "abcd")
     with pytest.raises(ConfigError, match=r"expected 'builtin', a folder with"):
-        find_initial_weights(tmp_path, "x.start", "ef")
+        find_initial_weights(tmp_path, "x.initial_weights", "ef")
 
 
 @pytest.mark.parametrize("about", [{}, [], {"schema": "infgen.model/1"}])
 def test_a_page_that_does_not_tell_of_weights_is_refused(tmp_path, about):
     write_json(tmp_path / DESCRIPTION, about)
 
-    with pytest.raises(ConfigError, match=r"x.start: .*model.json lacks the entry 'weig"):
-        find_initial_weights(tmp_path, "x.start", str(tmp_path))
+    with pytest.raises(
+        ConfigError, match=r"x.initial_weights: .*model.json lacks the entry 'weig"
+    ):
+        find_initial_weights(tmp_path, "x.initial_weights", str(tmp_path))
 
 
 def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_it():
@@ -112,7 +117,7 @@ def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_i
 
 
 def test_codebooks_are_those_of_the_weights_and_measured_on_the_records(tmp_path, drive):
-    settings = VocabSettings(start="builtin")
+    settings = VocabSettings(initial_weights="builtin")
     files = []
     for split, speed_mps in (("training", 5.0), ("validation", 7.0)):
         path = tmp_path / f"{split}.tfrecord-0"

@@ -3,7 +3,8 @@ from dataclasses import replace
 
 import pytest
 
-from infgen.config import ConfigError, IngestSettings
+from infgen.config import IngestSettings
+from infgen.errors import ConfigError
 from infgen.scene import Scene
 from infgen.sources.tfrecord import RecordError, iter_records
 from infgen.sources.towns import builtin_records

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.sources.tfrecord import BadRecord, iter_records
 from infgen.sources.womd_write import encode_scenario
 from pipeline.engine.events import Events

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.scene import Scene
 from infgen.sources.towns import sumo
 from infgen.sources.towns.sumo import SumoError

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import Root, read_json
 from pipeline.engine.stage import Source, Stage, Unit
@@ -18,11 +18,13 @@ class TrainSettings:
 
 
 def reads(root, settings):
-    if not settings.start:
+    if not settings.initial_weights:
         return []
-    path = Root(root).folder("train", settings.start) / "weights.json"
+    path = Root(root).folder("train", settings.initial_weights) / "weights.json"
     if not path.is_file():
-        raise ConfigError(f"train.start is {settings.start!r}; there are no such weights")
+        raise ConfigError(
+            f"train.initial_weights is {settings.initial_weights!r}; there are no such weights"
+        )
     return [Source(str(path), "start", str(read_json(path)))]
 
 

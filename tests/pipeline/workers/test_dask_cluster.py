@@ -9,7 +9,7 @@ import dask
 import distributed
 import pytest
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine.locks import LockedError
 from pipeline.engine.runner import RunOptions
 from pipeline.engine.units import InProcess, WorkersLostError

@@ -3,7 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from infgen.config import ConfigError, VocabSettings
+from infgen.config import VocabSettings
+from infgen.errors import ConfigError
 from infgen.scene import AgentType
 from infgen.tokens.clustering.kdisks import gap_m
 from infgen.tokens.clustering.made_map_samples import line_arcs
@@ -160,7 +161,7 @@ def test_roads_fill_their_codebook_and_are_apart():
 
 
 def test_a_given_road_tolerance_is_taken():
-    settings = dataclasses.replace(SETTINGS, road_tolerance_m=0.4)
+    settings = dataclasses.replace(SETTINGS, map_tolerance_m=0.4)
     curves = logged_curves(np.random.default_rng(0))
     codebook, origin, tolerance_m = cluster_roads(curves, settings)
     assert tolerance_m == 0.4

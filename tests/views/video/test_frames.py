@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.views.scene.view_model import make_film
 from infgen.views.video.frames import num_frames, paint_frames
 from infgen.views.video.layout import Format, make_panes

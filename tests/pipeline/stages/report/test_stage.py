@@ -11,13 +11,13 @@ import polars as pl
 import pytest
 
 from infgen.config import (
-    ConfigError,
     ReferenceSettings,
     ReportSettings,
     RolloutSettings,
     ScoreSettings,
     TokenSettings,
 )
+from infgen.errors import ConfigError
 from infgen.rollout.rollout import NEVER, Rollout
 from infgen.scene import Scene
 from infgen.sources.towns import builtin_records
@@ -39,7 +39,10 @@ RUN = {
     "started": "2026-01-01T00:00:00+00:00",
     "machine": {"processor": "A CPU", "cores": 8, "memory_gib": 31.4, "gpus": ["A GPU"]},
 }
-SETTINGS = {"reference": ReferenceSettings(), "score": ScoreSettings(resamples=20)}
+SETTINGS = {
+    "reference": ReferenceSettings(),
+    "score": ScoreSettings(bootstrap_resamples=20),
+}
 
 
 def silent(done, total, note=""):
@@ -392,12 +395,12 @@ def test_the_lowest_rollouts_are_linked_to_pages_that_play_them(written):
 
 
 def test_without_players_nothing_is_linked(inputs, tmp_path):
-    _, files = write(inputs, tmp_path / "out", players=0)
+    _, files = write(inputs, tmp_path / "out", player_pages=0)
 
     assert not [name for name in files if name.startswith("players/")]
     assert '<a href="players/' not in files["report.html"]
-    with pytest.raises(ConfigError, match=r"report\.players is -1"):
-        ReportSettings(players=-1)
+    with pytest.raises(ConfigError, match=r"report\.player_pages is -1"):
+        ReportSettings(player_pages=-1)
 
 
 def test_times_that_are_lost_are_left_out(inputs, tmp_path):

@@ -4,7 +4,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.stages.report.training import (
     compare,
     find_log,

@@ -98,7 +98,7 @@ def test_an_error_while_a_batch_is_made_comes_through(course):
 
 
 def test_parts_of_a_batch_are_together_the_batch(course):
-    how = replace(course.train, batch_scenes=3, accumulate=1)
+    how = replace(course.train, batch_scenes=3, gradient_accumulation=1)
     wide = replace(course, train=how).recipe(Team())
     parts = [
         replace(course, train=how).recipe(Team(rank, 3))[7][0].scenario_ids
@@ -106,7 +106,7 @@ def test_parts_of_a_batch_are_together_the_batch(course):
     ]
 
     assert sum(parts, ()) == wide[7][0].scenario_ids
-    own = replace(course, train=replace(how, accumulate=3)).recipe(Team())
+    own = replace(course, train=replace(how, gradient_accumulation=3)).recipe(Team())
     assert [part.scenario_ids for part in own[7]] == parts
 
 

@@ -51,7 +51,7 @@ def test_a_loss_that_is_not_finite_names_its_terms_and_scenes_and_keeps_the_weig
 def test_only_the_scenes_of_the_part_that_is_not_finite_are_named(
     course, books, quiet, spoilt
 ):
-    course = replace(course, train=replace(course.train, accumulate=2, steps=1))
+    course = replace(course, train=replace(course.train, gradient_accumulation=2, steps=1))
     spoilt(step=0, part=1)
 
     with pytest.raises(TrainingError, match=r"its scenes: training-\d$"):

@@ -76,7 +76,10 @@ def descend(course, books):
 
     def go_down(accumulate, steps=2):
         how = replace(
-            course.train, batch_scenes=4, accumulate=accumulate, learning_rate=2e-4
+            course.train,
+            batch_scenes=4,
+            gradient_accumulation=accumulate,
+            learning_rate=2e-4,
         )
         model = replace(course.model, dropout=0.0)
         cut = replace(course, train=how, model=model)
@@ -111,7 +114,7 @@ def test_parts_of_a_batch_give_the_gradient_of_the_whole(descend):
 def test_means_of_parts_would_not_be_the_same(course, books):
     # Without newcomers in one part, its mean of their kinds is not half of the batch's.
     recipe = replace(
-        course, train=replace(course.train, batch_scenes=2, accumulate=2)
+        course, train=replace(course.train, batch_scenes=2, gradient_accumulation=2)
     ).recipe(Team())
     one, other = recipe[0]
     counts = [float((part.entries.agent >= 0).sum()) for part in (one, other)]

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from infgen.config import ConfigError, TrainSettings
+from infgen.config import TrainSettings
+from infgen.errors import ConfigError
 from infgen.model.training.losses import figures, losses
 from pipeline.stages.train.loop import train
 from pipeline.stages.train.precision import Pass

@@ -26,7 +26,7 @@ LONGEST_S = 240
 SCRIPT = """
 import json, os, sys
 from pathlib import Path
-from infgen.config import build
+from infgen.settings import build
 from pipeline.engine import signals
 from pipeline.stages.train.launch import joined
 from pipeline.engine.stage import Unit

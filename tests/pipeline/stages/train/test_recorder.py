@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from infgen.model.training.losses import Term
 from pipeline.stages.train.optimizer_step import Stepped
 from pipeline.stages.train.recorder import Journal

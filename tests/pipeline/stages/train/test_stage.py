@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from infgen.config import ConfigError
+from infgen.errors import ConfigError
 from pipeline.engine import signals
 from pipeline.engine.atomic import MANIFEST, StoreError
 from pipeline.engine.layout import RUN_FOLDER
@@ -257,7 +257,7 @@ import json, sys
 from pathlib import Path
 from pipeline.engine.stage import Unit
 from pipeline.stages.train.stage import STAGE, work
-from infgen.config import build
+from infgen.settings import build
 settings = json.loads(sys.argv[3])
 settings = {k: build(STAGE.settings[k], v, k) for k, v in settings.items()}
 work(Unit("weights", {}, json.loads(sys.argv[1])), Path(sys.argv[2]), settings, print)
@@ -415,7 +415,10 @@ def test_weights_to_begin_with_are_part_of_the_unit(train_settings):
 @pytest.fixture
 def asking(train_settings):
     def ask(start):
-        return {**train_settings, "train": replace(train_settings["train"], start=start)}
+        return {
+            **train_settings,
+            "train": replace(train_settings["train"], initial_weights=start),
+        }
 
     return ask
 
@@ -432,7 +435,9 @@ def test_weights_to_begin_with_are_named_by_folder_or_key(whole, asking, tmp_pat
             Source(str(made), "start", whole[1]["weights"])
         ]
     assert reads(tmp_path, asking("")) == []
-    with pytest.raises(ConfigError, match=r"train.start is 'beef', but there is no such"):
+    with pytest.raises(
+        ConfigError, match=r"train.initial_weights is 'beef', but there is no such"
+    ):
         reads(tmp_path, asking("beef"))
 
 

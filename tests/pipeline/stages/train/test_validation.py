@@ -35,7 +35,7 @@ def test_fresh_weights_are_about_as_perplexed_as_there_are_moves(found, metre_mo
 
 
 def test_smaller_parts_find_the_same(course, books, found):
-    alone = replace(course, train=replace(course.train, accumulate=2))
+    alone = replace(course, train=replace(course.train, gradient_accumulation=2))
     training = begin(alone, *books)
 
     again = validate(alone, training, Pass(training.network, alone.train))

@@ -1,0 +1,5 @@
+"""Errors that name what the user gave, what was expected, and the way out."""
+
+
+class ConfigError(ValueError):
+    """A setting, word or path that does not exist or cannot have that value."""
