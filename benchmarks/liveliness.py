@@ -31,7 +31,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from infgen.clock import CLOCK
 from infgen.config import TokenSettings
-from infgen.settings import build
 from infgen.metrics.intervals import Interval, bootstrap
 from infgen.metrics.kinematics import speed, speed_valid
 from infgen.metrics.placement import count_per_token
@@ -39,6 +38,7 @@ from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic, from_log, from_rollout, on_map
 from infgen.rollout.rules.off_road import Lanes, lane_pieces
 from infgen.scene import AgentType
+from infgen.settings import build
 from infgen.spatial.road_edges import RoadEdges, edges_of
 from infgen.tokens.tracks import TokensError
 from pipeline.commands.screen import show_table

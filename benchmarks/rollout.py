@@ -22,7 +22,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -88,7 +88,7 @@ class Case:
 
     size: str
     batch: int
-    mode: str
+    mode: Literal["long", "motion-only"]
     played: str
     seconds: float
     agents: int

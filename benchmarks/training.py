@@ -24,6 +24,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -76,7 +77,7 @@ class Case:
     neighbours: int
     device: str
     threads: int
-    precision: str
+    precision: Literal["auto", "float32", "bf16"]
     team: int = 1
     rank: int = 0
     meeting: str = ""

@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from infgen.config import ReferenceSettings
-from infgen.settings import build
 from infgen.metrics.long_term.protocols import PROTOCOLS
 from infgen.metrics.long_term.tune_radius import best_radius_m, placement_by_radius
+from infgen.settings import build
 from pipeline.engine.manifest import read_manifest
 from pipeline.stages.reference_files import read_against
 from pipeline.storage.rollouts import read_rollouts

@@ -17,10 +17,12 @@ from typing import Any, get_type_hints
 import typer
 
 import cli
-from pipeline.settings.described import docstring_parts, one_line, sections
+from pipeline.settings.described import one_line, sections
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
 
 _DIRECTIVE = re.compile(r"^<!-- (commands|settings|fields: \S+) -->$", re.MULTILINE)
+_ATTRIBUTE = re.compile(r"^    (\w+(?:,\s+\w+)*): ((?:.|\n     )*)", re.MULTILINE)
+"""One attribute of a docstring, or several that are described together."""
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
@@ -86,12 +88,22 @@ def settings() -> Iterator[str]:
 
 def record(kind: type) -> Iterator[str]:
     """Write the fields of a record: type, shape, meaning."""
-    hints, (_, described) = get_type_hints(kind, include_extras=True), docstring_parts(kind)
+    hints, described = get_type_hints(kind, include_extras=True), attributes(kind)
     rows = [
         [f"`{field.name}`", *_shape(hints[field.name]), described.get(field.name, "")]
         for field in fields(kind)
     ]
     yield from _table(["field", "type", "shape", "meaning"], rows)
+
+
+def attributes(kind: type) -> dict[str, str]:
+    """Read what a record's docstring says of each of its attributes."""
+    listed = inspect.cleandoc(kind.__doc__ or "").partition("\nAttributes:\n")[2]
+    return {
+        name: one_line(text)
+        for names, text in _ATTRIBUTE.findall(listed)
+        for name in re.split(r",\s+", names)
+    }
 
 
 def _shape(hint: Any) -> tuple[str, str]:

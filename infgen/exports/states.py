@@ -79,8 +79,8 @@ def lights_of(scene: Scene, num_steps: int, played: str) -> Lights:
     Args:
         scene: The log.
         num_steps: How many steps.
-        played: What lights showed after the history, as ``rollout.signals`` says: ``now`` or
-            ``log``. A log is looked at to the end of its last whole half second.
+        played: What lights showed after the history, as ``rollout.signals`` says: ``now``
+            or ``log``. A log is looked at to the end of its last whole half second.
     """
     signals, last = scene.signals, scene.now
     if played == "log":

@@ -17,6 +17,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Float32, Int64
+from pydantic.dataclasses import dataclass as settings_dataclass
 
 from infgen.clock import CLOCK
 from infgen.errors import ConfigError
@@ -25,6 +26,7 @@ from infgen.metrics.wosac.rollouts import Rollouts, RolloutsError, from_rollouts
 from infgen.metrics.wosac.submission import NUM_ROLLOUTS
 from infgen.rollout.rollout import Rollout
 from infgen.scene import AgentType, Scene
+from infgen.settings import RULES
 from infgen.sources.wire import BYTES, VARINT
 from infgen.sources.wire_write import integer, key, message, text, varint
 
@@ -48,7 +50,7 @@ _NUMBERS = {
 _COUNT = re.compile(r"[0-9]+[KMBT]?")
 
 
-@dataclass(frozen=True, slots=True)
+@settings_dataclass(frozen=True, slots=True, config=RULES)
 class About:
     """Who submits what, under the names that Waymo gives the fields.
 

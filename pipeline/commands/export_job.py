@@ -186,9 +186,9 @@ def find_units(rollouts: Path) -> list[Unit]:
 def _lights_of(folder: Path) -> str:
     """Tell what lights showed in a unit's rollouts: as it was then usual, if it is old."""
     if not (folder / MANIFEST).is_file():
-        return RolloutSettings().lights
+        return RolloutSettings().signals
     played = read_manifest(folder).get("settings", {}).get("rollout", {})
-    return str(played.get("lights", RolloutSettings().lights))
+    return str(played.get("signals", RolloutSettings().signals))
 
 
 def parts_of(unit: Unit) -> Iterator[Part]:

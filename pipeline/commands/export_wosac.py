@@ -12,13 +12,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
-from infgen.config import settle
 from infgen.errors import ConfigError
 from infgen.exports.wosac import HOW, About, complete, encode_about, encode_futures
 from infgen.metrics.wosac.rollouts import RolloutsError
 from infgen.metrics.wosac.submission import NUM_ROLLOUTS
+from infgen.settings import build
 from pipeline.commands.export_job import (
     Exported,
     Order,
@@ -38,7 +37,6 @@ from pipeline.settings.lined_yaml import load
 ARCHIVE = "submission.tar.gz"
 COMPRESSION = 1
 """Of the archive. Level 6 takes twice as long and saves a thousandth."""
-_LISTS = ("authors", "public_model_names")
 _ENDINGS = (".tar.gz", ".tgz")
 
 
@@ -51,18 +49,8 @@ def read_description(path: Path, root: Root) -> About:
     if not path.is_file():
         raise ConfigError(f"{path}: no such file; expected {_asked()}")
     values = load(path)
-    given: dict[str, Any] = {}
-    for name, value in values.items():
-        if name in _LISTS and isinstance(value, list):
-            given[name] = tuple(map(str, value))
-        elif name in _LISTS:
-            raise ConfigError(f"{values.where(name)}: {name} is {value!r}; expected a list")
-        else:
-            given[name] = settle(About, name, value, values.where(name))
-    needed = [name for name in _needed() if name not in given]
-    if needed:
-        raise ConfigError(f"{path}: {', '.join(needed)} missing; expected {_asked()}")
-    about, trained = About(**given), root.latest_folder("train")
+    about = build(About, values, {name: values.where(name) for name in values})
+    trained = root.latest_folder("train")
     count = read_manifest(trained)["report"].get("parameters") if trained else None
     return about.with_parameters(count) if count else about
 

@@ -1,21 +1,15 @@
-"""What the code says of its settings: name, default and meaning of each.
+"""Every setting with its default and its help text, read from the settings classes."""
 
-Read from the dataclasses and their docstrings, so that it cannot go out of date.
-"""
-
-import inspect
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, Field, dataclass, fields
+from collections.abc import Iterator
+from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
 from infgen.errors import ConfigError
+from infgen.settings import help_texts
 from pipeline.engine.registry import load_stage
 from pipeline.settings.lined_yaml import did_you_mean
 from pipeline.settings.stages_file import StagesFile
-
-_ATTRIBUTE = re.compile(r"^    (\w+(?:,\s+\w+)*): ((?:.|\n     )*)", re.MULTILINE)
-"""One attribute of a docstring, or several that are told together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +44,11 @@ class Section:
 
 def sections(file: StagesFile) -> Iterator[Section]:
     """Describe every section of a ``stages.yaml``, in the order of its stages."""
-    told = set()
+    listed = set()
     for entry in file.stages.values():
         for name, kind in load_stage(entry.module).settings.items():
-            if name not in told:
-                told.add(name)
+            if name not in listed:
+                listed.add(name)
                 yield _section(name, kind)
 
 
@@ -89,32 +83,19 @@ def find_sections(file: StagesFile, named: str | None) -> list[Section]:
 
 
 def _section(name: str, kind: Any) -> Section:
-    about, meanings = docstring_parts(kind)
+    texts = help_texts(kind)
     settings = [
-        Setting(f"{name}.{field.name}", _default(field), meanings.get(field.name, ""))
+        Setting(
+            f"{name}.{field.name}",
+            "" if field.default is MISSING else field.default,
+            one_line(texts.get(field.name, "")),
+        )
         for field in fields(kind)
     ]
-    return Section(name, about, tuple(settings))
-
-
-def _default(field: "Field[Any]") -> Any:
-    if field.default_factory is not MISSING:
-        return field.default_factory()
-    return "" if field.default is MISSING else field.default
-
-
-def docstring_parts(kind: type) -> tuple[str, Mapping[str, str]]:
-    """What a dataclass's docstring says of it, and of each of its attributes."""
-    about, _, listed = inspect.cleandoc(kind.__doc__ or "").partition("\nAttributes:\n")
-    texts = {
-        name: one_line(text)
-        for names, text in _ATTRIBUTE.findall(listed)
-        for name in re.split(r",\s+", names)
-    }
-    return one_line(about), texts
+    return Section(name, one_line(kind.__doc__ or ""), tuple(settings))
 
 
 def one_line(text: str) -> str:
-    """Write a text of the code for readers who have neither it nor its specification."""
+    """Write a docstring in one line, without references to the specification."""
     plain = re.sub(r"\s*\(SPEC [^)]*\)", "", text)
     return " ".join(plain.replace("``", "`").split())

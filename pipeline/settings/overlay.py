@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from infgen.config import settle
 from infgen.errors import ConfigError
+from infgen.settings import build
 from pipeline.engine.layout import Root
 from pipeline.engine.stage import Source
 from pipeline.settings.lined_yaml import LinedMapping, did_you_mean, inner, known
@@ -42,12 +42,8 @@ class Overlay:
             ConfigError: for a setting that does not exist or cannot have its value.
         """
         given = self.values.get(section, {})
-        return kind(
-            **{
-                name: settle(kind, name, each.value, each.where)
-                for name, each in given.items()
-            }
-        )
+        values = {name: each.value for name, each in given.items()}
+        return build(kind, values, {name: each.where for name, each in given.items()})
 
     def find_sources(self, root: Root) -> tuple[Source, ...]:
         """Find the source files and their identities.

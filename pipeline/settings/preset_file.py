@@ -4,8 +4,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from infgen.settings import build
 from infgen.errors import ConfigError
+from infgen.settings import build
 from infgen.views.published import ABLATIONS, PAPER
 from pipeline.settings.lined_yaml import LinedMapping, did_you_mean, inner, known, words
 from pipeline.settings.overlay import Overlay, merge_overlays, read_sections
@@ -57,8 +57,8 @@ def read_preset(
         seeds=_seeds(entry),
         count_error=_word(entry, "count_error", COUNT_ERRORS) or COUNT_ERRORS[0],
         towns={
-            split: build(TownSet, inner(inner(entry, "towns"), split), where)
-            for split, where in _places(inner(entry, "towns"))
+            split: _town_set(inner(entry, "towns"), split)
+            for split in inner(entry, "towns")
         },
         arms={name: arms[name] for name in _ordered(arms)},
     )
@@ -176,12 +176,8 @@ def _check_name(mapping: LinedMapping, name: str, what: str) -> None:
         )
 
 
-def _places(towns: LinedMapping) -> list[tuple[str, str]]:
-    for split in towns:
-        for key in ("scenes", "seconds"):
-            if key not in inner(towns, split):
-                raise ConfigError(f"{towns.where(split)}: {split} needs {key}")
-    return [(split, f"{towns.where(split)}: {split}") for split in towns]
+def _town_set(towns: LinedMapping, split: str) -> TownSet:
+    return build(TownSet, inner(towns, split), f"{towns.where(split)}: {split}")
 
 
 def _check_arms(arms: Mapping[str, Arm]) -> None:

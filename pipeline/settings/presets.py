@@ -27,26 +27,26 @@ an arm; each is laid over those before it, and all of them over the profiles.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from pydantic.dataclasses import dataclass as settings_dataclass
+
 from infgen.errors import ConfigError
+from infgen.settings import RULES, AtLeastOne, Positive, Seed
 from pipeline.settings.lined_yaml import did_you_mean
 from pipeline.settings.overlay import Overlay
 
 
-@dataclass(frozen=True, slots=True)
+@settings_dataclass(frozen=True, slots=True, config=RULES)
 class TownSet:
-    """Towns of one split that a preset reads.
+    """Synthetic towns of one split that a preset reads."""
 
-    Attributes:
-        scenes: How many.
-        seconds: Length of each.
-        seed: Other towns for another seed.
-        scenes_per_file: Most scenes of a file.
-    """
-
-    scenes: int
-    seconds: float
-    seed: int = 0
-    scenes_per_file: int = 20
+    scenes: AtLeastOne
+    """Number of scenes."""
+    seconds: Positive
+    """Length of each."""
+    seed: Seed = 0
+    """Another seed gives other towns."""
+    scenes_per_file: AtLeastOne = 20
+    """Most scenes of a file."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,18 +31,19 @@ def normalize(settings: Settings) -> Settings:
     how: CalibrateSettings = settings["calibrate"]
     played: RolloutSettings = settings["rollout"]
     if how.method != "simulate" or not (played.inserts and played.removes):
-        by = "none" if how.method == "none" else "odds"
         return {
             "tokenize": TokenSettings(),
             "rollout": RolloutSettings(),
-            "calibrate": CalibrateSettings(method=by),
+            "calibrate": CalibrateSettings(
+                method="none" if how.method == "none" else "odds"
+            ),
         }
     usual = RolloutSettings()
     same = (
         "split",
-        "scenes",
+        "max_scenes",
         "scenes_per_unit",
-        "batch",
+        "batch_rollouts",
         "add_bias",
         "remove_bias",
         "seed",

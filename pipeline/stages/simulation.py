@@ -1,6 +1,5 @@
 """Scenes on disk to rollouts in memory, for every stage that plays."""
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -69,7 +68,7 @@ def begin(player: "Player", scene: "Scene") -> "list[Start]":
 
     tokens, settings = player.tokens, player.settings
     if settings.simulates_all_agents:
-        tokens = replace(tokens, max_ego_distance_m=math.inf)
+        tokens = replace(tokens, max_ego_distance_m=1e9)  # All agents.
     history = tokenize_scene(scene, player.codebook, player.roads, tokens, until=scene.now)
     lights = read_lights(scene) if settings.signals == "log" else None
     return [

@@ -10,7 +10,7 @@ from pipeline.engine.stage import Source
 WEIGHTS, DESCRIPTION = "model.safetensors", "model.json"
 BUILTIN = "builtin"
 """The word for the weights that come with the package."""
-INITIAL_WEIGHTS = "start"
+INITIAL_WEIGHTS = "initial_weights"
 """Name of the weights to begin with, among a stage's sources."""
 
 

@@ -14,9 +14,9 @@ from safetensors.torch import save
 from torch import Tensor
 
 from infgen.config import ModelSettings, TokenSettings
-from infgen.settings import build
 from infgen.model.network import Network
 from infgen.pretrained import builtin_weights
+from infgen.settings import build
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from pipeline.engine.atomic import StoreError, write_file, write_json
 from pipeline.engine.layout import read_json

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
-from infgen.errors import ConfigError
 from infgen.exports.wosac import About, complete, encode_about, encode_futures, in_words
 from infgen.metrics.wosac.rollouts import Rollouts, RolloutsError
 from infgen.metrics.wosac.submission import read_submission
@@ -224,7 +224,7 @@ def test_an_agent_that_leaves_is_refused_with_the_way_out(scene, rollouts):
     ],
 )
 def test_what_waymo_would_not_take_is_refused(change, reason):
-    with pytest.raises(ConfigError) as refused:
+    with pytest.raises(ValidationError) as refused:
         replace(ABOUT, **change)
 
     assert reason in str(refused.value)

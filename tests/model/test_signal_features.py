@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
+from pydantic import ValidationError
 
 from infgen.config import ModelSettings
-from infgen.errors import ConfigError
 from infgen.model.batching.batch import Roads
 from infgen.model.signal_features import CLASSES, LONG_SINCE, StopLines, features
 from infgen.tokens.scene_tokens import SignalClass
@@ -163,5 +163,7 @@ def test_turning_and_shifting_the_world_changes_nothing(turn_rad):
 
 
 def test_the_light_ahead_needs_lights_that_change():
-    with pytest.raises(ConfigError, match=r"signal_ahead_m is 40.*signals_each_step=true"):
+    with pytest.raises(
+        ValidationError, match=r"signal_ahead_m is 40.*signals_each_step=true"
+    ):
         ModelSettings(signal_ahead_m=40.0)

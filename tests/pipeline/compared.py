@@ -22,7 +22,7 @@ def arm(name, **changes) -> Arm:
         "profile": (),
         "settings": NOTHING,
         "rollout_sets": {"long": NOTHING, "motion-only": NOTHING, "wosac": NOTHING},
-        "start": None,
+        "starts_from": None,
         "ablates": None,
         "published": None,
         "where": "stages.yaml:1",

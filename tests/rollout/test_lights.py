@@ -10,6 +10,7 @@ from infgen.config import RolloutSettings
 from infgen.errors import ConfigError
 from infgen.rollout.session import Session
 from infgen.scene import SignalState
+from infgen.settings import build
 from infgen.tokens.scene_tokens import SignalClass
 from infgen.tokens.signals import Lights
 from infgen.tokens.tokenizer import read_lights
@@ -112,8 +113,11 @@ def test_lights_of_scenes_side_by_side_last_as_long_as_each_has_them(lit, play):
 
 @pytest.mark.parametrize(
     ("settings", "said"),
-    [({"lights": "off"}, "expected now or log"), ({"mode": "wosac"}, "into the future")],
+    [
+        ({"signals": "off"}, "expected 'now' or 'log'"),
+        ({"mode": "wosac"}, "shows the future"),
+    ],
 )
 def test_lights_are_of_now_or_of_the_log_and_never_foreseen_by_waymos_rules(settings, said):
     with pytest.raises(ConfigError, match=said):
-        RolloutSettings(**{"signals": "log", **settings})
+        build(RolloutSettings, {"signals": "log", **settings}, "rollout")

@@ -2,29 +2,33 @@ import pytest
 
 from infgen.config import RolloutSettings
 from infgen.errors import ConfigError
-from infgen.settings import build
 from infgen.rollout.settings import MODES
+from infgen.settings import build
 
 
 @pytest.mark.parametrize(
-    ("mode", "duration_s", "everyone", "comes_and_goes"),
+    ("mode", "duration_s", "all_agents", "inserts"),
     [
         ("long", 30.0, False, True),
         ("motion-only", 30.0, False, False),
         ("wosac", 8.0, True, False),
     ],
 )
-def test_one_word_says_what_is_played(mode, duration_s, everyone, comes_and_goes):
+def test_the_mode_decides_duration_agents_insertion_and_removal(
+    mode, duration_s, all_agents, inserts
+):
     settings = RolloutSettings(mode=mode)
 
     assert settings.duration_s == duration_s
-    assert settings.simulates_all_agents == everyone
-    assert settings.inserts == settings.removes == comes_and_goes
+    assert settings.simulates_all_agents == all_agents
+    assert settings.inserts == settings.removes == inserts
 
 
-def test_what_a_mode_leaves_open_may_be_said():
+def test_what_a_mode_leaves_open_may_be_set():
     settings = build(
-        RolloutSettings, {"mode": "motion-only", "seconds": "12", "everyone": "true"}, "-s"
+        RolloutSettings,
+        {"mode": "motion-only", "seconds": "12", "all_agents": "true"},
+        "-s",
     )
 
     assert settings.duration_s == 12
@@ -39,18 +43,18 @@ def test_what_a_mode_leaves_open_may_be_said():
     [
         {"mode": "wosac", "seconds": 30.0},
         {"mode": "wosac", "insert": True},
-        {"mode": "wosac", "everyone": False},
+        {"mode": "wosac", "all_agents": False},
         {"mode": "motion-only", "remove": True},
     ],
 )
-def test_what_contradicts_the_mode_is_refused_with_the_way_out(given):
+def test_what_contradicts_the_mode_is_refused(given):
     name = next(name for name in given if name != "mode")
 
-    with pytest.raises(ConfigError, match=rf"rollout.{name} is .*mode={given['mode']}"):
-        RolloutSettings(**given)
+    with pytest.raises(ConfigError, match=rf"rollout: {name} is .*mode={given['mode']}"):
+        build(RolloutSettings, given, "rollout")
 
 
-def test_saying_what_the_mode_says_is_no_contradiction():
+def test_setting_what_the_mode_fixes_to_the_same_is_allowed():
     mode = MODES["wosac"]
 
     settings = RolloutSettings(mode="wosac", seconds=mode.seconds, insert=mode.insert)
@@ -61,19 +65,19 @@ def test_saying_what_the_mode_says_is_no_contradiction():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"mode": "short"}, "expected long or motion-only or wosac"),
-        ({"motion_temperature": 0.0}, "more than 0"),
-        ({"heading_temperature": float("nan")}, "more than 0"),
-        ({"position_top_p": 1.5}, "up to 1"),
-        ({"motion_top_p": 0.0}, "above 0"),
-        ({"max_insertion_attempts": 0}, "1 or more"),
-        ({"removal_radius_m": -1.0}, "0 or more"),
-        ({"reject_off_road": True}, "say rollout.max_motion_samples=32"),
-        ({"max_stall_s": 20.0}, "say rollout.max_motion_samples=32"),
-        ({"max_stall_s": -1.0, "max_motion_samples": 2}, "0 or more"),
-        ({"density_control": -0.5}, "0 or more"),
+        ({"mode": "short"}, "expected 'long', 'motion-only' or 'wosac'"),
+        ({"motion_temperature": 0.0}, "expected greater than 0"),
+        ({"heading_temperature": float("nan")}, "expected a finite number"),
+        ({"position_top_p": 1.5}, "less than or equal to 1"),
+        ({"motion_top_p": 0.0}, "greater than 0"),
+        ({"max_insertion_attempts": 0}, "greater than or equal to 1"),
+        ({"removal_radius_m": -1.0}, "greater than or equal to 0"),
+        ({"reject_off_road": True}, "set max_motion_samples=32"),
+        ({"max_stall_s": 20.0}, "set max_motion_samples=32"),
+        ({"max_stall_s": -1.0, "max_motion_samples": 2}, "greater than or equal to 0"),
+        ({"density_control": -0.5}, "greater than or equal to 0"),
     ],
 )
-def test_nonsense_is_refused(given, said):
+def test_impossible_values_are_refused(given, said):
     with pytest.raises(ConfigError, match=said):
-        RolloutSettings(**given)
+        build(RolloutSettings, given, "rollout")

@@ -246,7 +246,7 @@ def test_with_a_mask_that_refuses_nobody_rollouts_are_as_without(crossing, start
 def test_patterns_make_agents_flicker_and_nothing_else(crossing, start, player, force):
     model = {"validity_pattern_tokens": True}
     seen, flickering = (
-        player(model, patterns=patterns, max_insertions=2, seconds=3.0)
+        player(model, validity_patterns=patterns, max_insertions=2, seconds=3.0)
         for patterns in (False, True)
     )
     for playing in (seen, flickering):

@@ -134,7 +134,7 @@ def test_nobody_is_too_far_for_a_simulation_that_asks_so(tokens_of, build_scene)
     x_m = np.arange(91.0)
     path = np.stack([np.column_stack([x_m, 0 * x_m + y, 0 * x_m]) for y in (0, 400)])
     scene = build_scene(path, [0, 0])
-    everywhere = dataclasses.replace(SETTINGS, max_ego_distance_m=np.inf)
+    everywhere = dataclasses.replace(SETTINGS, max_ego_distance_m=1e9)
 
     assert tokens_of(scene, until=10).num_agents == 1
     assert tokens_of(scene, everywhere, until=10).num_agents == 2

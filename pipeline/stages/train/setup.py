@@ -63,7 +63,8 @@ class Course:
         if parts > how.batch_scenes:
             raise TrainingError(
                 f"train.batch_scenes is {how.batch_scenes}, too few for {team.size} "
-                f"processes with {how.gradient_accumulation} parts each; expected {parts} or more"
+                f"processes with {how.gradient_accumulation} parts each; expected {parts} "
+                "or more"
             )
         sizes = self.scenes.sizes(self.limits)
         order = Order(sizes, how.batch_scenes, how.bucket_batches, how.seed)

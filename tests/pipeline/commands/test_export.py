@@ -382,7 +382,7 @@ def test_lights_are_those_that_were_played(scenes, tmp_path, played, later):
     scene = replace(scenes[0], signals=lights)
     write_tfrecord(tmp_path / "logs.tfrecord", [encode_scenario(scene)])
     rollouts = keep(tmp_path / "unit", [replay(scene)])
-    settings = {"rollout": {"lights": played} if played else {}}
+    settings = {"rollout": {"signals": played} if played else {}}
     write_json(rollouts / "manifest.json", {"files": {}, "settings": settings})
     logs = open_scene_lookup([str(tmp_path / "logs.tfrecord")])
 
@@ -509,10 +509,10 @@ def test_the_command_says_in_one_line_what_is_wrong(infgen, few, source, tmp_pat
         (YAML.replace("account_name", "acount_name"), "did you mean 'account_name'"),
         (
             YAML.replace("[Ada, Bo]", "Ada"),
-            "about.yaml:3: authors is 'Ada'; expected a list",
+            "about.yaml:3: authors is 'Ada'; expected a valid tuple",
         ),
         ("authors: [Ada]", "account_name, unique_method_name, acknowledge"),
-        (YAML.replace(": true", ": maybe"), "is 'maybe'; expected bool"),
+        (YAML.replace(": true", ": maybe"), "is 'maybe'; expected a valid boolean"),
         (YAML + "authors: [Cy]\n", "stands twice"),
     ],
 )

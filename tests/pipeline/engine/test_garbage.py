@@ -133,7 +133,7 @@ def test_weights_that_a_request_starts_from_are_kept(trainer):
 
 def test_weights_that_only_a_profile_starts_from_are_kept(trainer):
     first = trainer.run()["train"].key[:16]
-    profile = f"profiles:\n  tuned: {{train: {{start: '{first}', steps: 2}}}}\n"
+    profile = f"profiles:\n  tuned: {{train: {{initial_weights: '{first}', steps: 2}}}}\n"
     trainer.file.write_text(TRAINING + profile)
     request = trainer.request(profile="tuned")
     trainer.request("train.seed=3").remember(request.plan((), {}))

@@ -99,7 +99,7 @@ def test_arms_are_picked_by_name_and_bring_those_that_they_start_from(load):
         ("profile: small", "profile: smal", "stages.yaml:10: no profile 'smal'; did"),
         ("truth", "true", "stages.yaml:12: count_error is True; expected a word"),
         ("truth", "trut", "stages.yaml:12: no count_error 'trut'; did you mean"),
-        ("scenes: 40, ", "", "stages.yaml:15: training needs scenes"),
+        ("scenes: 40, ", "", "stages.yaml:15: training: scenes missing"),
         ("scenes: 40,", "scenes: 4.5,", "stages.yaml:15: training.scenes is 4.5"),
         ("scenes: 40,", "scenes: 40, sede: 1,", "stages.yaml:15: training: no setting"),
         ("count: 2}", "count: [2]}", r"stages.yaml:17: rollout.count is \[2\]"),

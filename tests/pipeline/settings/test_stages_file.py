@@ -4,8 +4,8 @@ import pytest
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
 from infgen.errors import ConfigError
-from infgen.settings import build, key_values
 from infgen.model.network import Network
+from infgen.settings import build, key_values
 from pipeline.engine.plan import SOURCES, stages_in_order
 from pipeline.engine.registry import MODULES, load_stage
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages

@@ -100,8 +100,8 @@ def test_a_split_of_which_there_is_no_file_is_named_with_those_that_there_are(in
 @pytest.mark.parametrize(
     ("section", "values"),
     [
-        ("calibrate", {"by": "odds"}),
-        ("calibrate", {"by": "none"}),
+        ("calibrate", {"method": "odds"}),
+        ("calibrate", {"method": "none"}),
         ("rollout", {"mode": "motion-only"}),
         ("rollout", {"mode": "wosac", "seconds": None}),
         ("rollout", {"remove": False}),
@@ -114,9 +114,9 @@ def test_nothing_is_played_where_it_is_not_asked_for_or_nobody_comes(
 
 
 def test_rollouts_that_differ_in_number_alone_share_a_calibration():
-    for values in ({"count": 32}, {"seed": 9}, {"scenes": 5}, {"split": "testing"}):
+    for values in ({"count": 32}, {"seed": 9}, {"max_scenes": 5}, {"split": "testing"}):
         assert stage.normalize(with_settings("rollout", **values)) == NARROW
-    for values in ({"motion_top_p": 0.5}, {"seconds": 9.0}, {"lights": "log"}):
+    for values in ({"motion_top_p": 0.5}, {"seconds": 9.0}, {"signals": "log"}):
         assert stage.normalize(with_settings("rollout", **values)) != NARROW
     plain = stage.normalize(with_settings("calibrate", method="odds"))
     other = {**with_settings("calibrate", method="odds"), "rollout": RolloutSettings()}

@@ -348,7 +348,7 @@ def test_the_radius_setting_makes_agents_enter_and_leave(tmp_path, scenes):
     leaving = replace(scenes[0], scenario_id="crossing")
     settings = {
         **SETTINGS,
-        "score": ScoreSettings(bootstrap_bootstrap_resamples=0, presence_radius_m=20.0),
+        "score": ScoreSettings(bootstrap_resamples=0, presence_radius_m=20.0),
     }
     inputs = Inputs(
         [ingested(tmp_path / "l", scenes)], [played(tmp_path / "p", [as_rollout(leaving)])]

@@ -1,15 +1,17 @@
 """Climbs step by step to the total, and goes on from where a killed try stood."""
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic.dataclasses import dataclass
+
+from infgen.settings import RULES
 from pipeline.engine.atomic import write_file
 from pipeline.engine.signals import Stopped
 from pipeline.engine.stage import Stage, Unit
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=RULES)
 class ClimbSettings:
     steps: int = 5
     sleep_s: float = 0.0

@@ -3,14 +3,16 @@ that says ``die`` ends its process, one that says ``hoard`` fills its memory."""
 
 import os
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic.dataclasses import dataclass
+
+from infgen.settings import RULES
 from pipeline.engine.atomic import write_json
 from pipeline.engine.stage import Stage, Unit
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=RULES)
 class CountSettings:
     longest: int = 100
     sleep_s: float = 0.0

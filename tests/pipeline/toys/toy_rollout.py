@@ -1,13 +1,14 @@
 """Stands for playing: multiplies the weights."""
 
-from dataclasses import dataclass
+from pydantic.dataclasses import dataclass
 
+from infgen.settings import RULES
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import read_json
 from pipeline.engine.stage import Stage, Unit
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=RULES)
 class RolloutSettings:
     mode: str = "long"
     seed: int = 0

@@ -1,12 +1,13 @@
 """Stands for scoring: says what was played."""
 
-from dataclasses import dataclass
+from pydantic.dataclasses import dataclass
 
+from infgen.settings import RULES
 from pipeline.engine.layout import read_json
 from pipeline.engine.stage import Stage
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=RULES)
 class ScoreSettings:
     presence_radius_m: float = 0.0
 

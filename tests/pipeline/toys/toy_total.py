@@ -1,13 +1,15 @@
 """Adds up the letters that ``count`` found, file by file."""
 
 import json
-from dataclasses import dataclass
 
+from pydantic.dataclasses import dataclass
+
+from infgen.settings import RULES
 from pipeline.engine.atomic import write_json
 from pipeline.engine.stage import Stage, Unit
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=RULES)
 class TotalSettings:
     times: float = 1.0
     refuse: bool = False

@@ -1,20 +1,23 @@
 """Stands for training: its weights are a number; others go on from it. Some fail."""
 
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
+
+from pydantic.dataclasses import dataclass
 
 from infgen.errors import ConfigError
+from infgen.settings import NOT_IN_KEY, RULES
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import Root, read_json
 from pipeline.engine.stage import Source, Stage, Unit
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=RULES)
 class TrainSettings:
     steps: int = 1
     seed: int = 0
     fail: bool = False
-    start: str = field(default="", metadata={"free": True})
+    initial_weights: Annotated[str, NOT_IN_KEY] = ""
 
 
 def reads(root, settings):
@@ -23,9 +26,10 @@ def reads(root, settings):
     path = Root(root).folder("train", settings.initial_weights) / "weights.json"
     if not path.is_file():
         raise ConfigError(
-            f"train.initial_weights is {settings.initial_weights!r}; there are no such weights"
+            f"train.initial_weights is {settings.initial_weights!r}; "
+            "there are no such weights"
         )
-    return [Source(str(path), "start", str(read_json(path)))]
+    return [Source(str(path), "initial_weights", str(read_json(path)))]
 
 
 def plan(inputs, settings):
@@ -37,7 +41,7 @@ def plan(inputs, settings):
 def work(unit, target, settings, progress):
     if settings.fail:
         raise ValueError("told to fail")
-    start = read_json(Path(unit.task["start"])) if "start" in unit.task else 0
+    start = read_json(Path(unit.task["initial_weights"])) if "initial_weights" in unit.task else 0
     weights = start + settings.steps + 100 * settings.seed
     write_json(target / "weights.json", weights)
     return {"weights": str(weights)}

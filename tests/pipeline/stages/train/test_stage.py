@@ -402,14 +402,14 @@ def test_the_plan_is_one_unit_of_the_two_splits(train_settings):
 class BegunInputs(MadeInputs):
     """The same, with weights to begin with."""
 
-    sources = (Source("/weights", "start", "f" * 64),)
+    sources = (Source("/weights", "initial_weights", "f" * 64),)
 
 
 def test_weights_to_begin_with_are_part_of_the_unit(train_settings):
     (unit,) = plan(BegunInputs(), train_settings)
 
-    assert unit.inputs["start"] == "f" * 64
-    assert unit.task["start"] == "/weights"
+    assert unit.inputs["initial_weights"] == "f" * 64
+    assert unit.task["initial_weights"] == "/weights"
 
 
 @pytest.fixture
@@ -432,7 +432,7 @@ def test_weights_to_begin_with_are_named_by_folder_or_key(whole, asking, tmp_pat
 
     for word in (str(made), str(latest), key, key + 48 * "0", key[:5]):
         assert reads(tmp_path, asking(word)) == [
-            Source(str(made), "start", whole[1]["weights"])
+            Source(str(made), "initial_weights", whole[1]["weights"])
         ]
     assert reads(tmp_path, asking("")) == []
     with pytest.raises(
@@ -444,7 +444,7 @@ def test_weights_to_begin_with_are_named_by_folder_or_key(whole, asking, tmp_pat
 def test_training_goes_on_from_the_weights_it_begins_with(
     whole, train_unit, train_settings, quiet, tmp_path
 ):
-    task = {**train_unit.task, "start": str(whole[0])}
+    task = {**train_unit.task, "initial_weights": str(whole[0])}
     how = replace(train_settings["train"], steps=0, seed=9)
 
     report = work(
