@@ -41,7 +41,11 @@ def plan(inputs, settings):
 def work(unit, target, settings, progress):
     if settings.fail:
         raise ValueError("told to fail")
-    start = read_json(Path(unit.task["initial_weights"])) if "initial_weights" in unit.task else 0
+    start = (
+        read_json(Path(unit.task["initial_weights"]))
+        if "initial_weights" in unit.task
+        else 0
+    )
     weights = start + settings.steps + 100 * settings.seed
     write_json(target / "weights.json", weights)
     return {"weights": str(weights)}

@@ -170,7 +170,14 @@ def finished(root: Path) -> Inputs:
         for line in [*lines, {"step": 3, "validation": validation_split}]
     )
     (root / "train" / "train.jsonl").write_text(text)
-    manifest(root, "ingest", {"ingest": {"max_scenes_per_file": 0}}, {"scenes": 2}, [logs], [SOURCE])
+    manifest(
+        root,
+        "ingest",
+        {"ingest": {"max_scenes_per_file": 0}},
+        {"scenes": 2},
+        [logs],
+        [SOURCE],
+    )
     manifest(root, "build-vocab", {"build-vocab": {"seed": 0}}, {})
     write_json(root / "build-vocab" / "report.json", {"motion": {"vehicle": {"real": 12}}})
     manifest(root, "tokenize", {"tokenize": asdict(TokenSettings())}, {"words": 5})
