@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, Protocol, runtime_checkable
 
-from infgen.settings import key_values
 from pipeline.engine.layout import Root
 from pipeline.engine.registry import load_stage
 from pipeline.engine.stage import Source, Stage, Unit
@@ -189,6 +188,8 @@ def _plan_stage(
     before: Mapping[str, PlannedStage],
     root: Root,
 ) -> PlannedStage:
+    from infgen.settings import key_values  # noqa: PLC0415  # Pydantic takes 0.1 s.
+
     stage = _load(entry)
     sections: Mapping[str, Any] = {
         section: chosen.build(section, kind) for section, kind in stage.settings.items()

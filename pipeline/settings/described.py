@@ -6,7 +6,6 @@ from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
 from infgen.errors import ConfigError
-from infgen.settings import help_texts
 from pipeline.engine.registry import load_stage
 from pipeline.settings.lined_yaml import did_you_mean
 from pipeline.settings.stages_file import StagesFile
@@ -83,6 +82,8 @@ def find_sections(file: StagesFile, named: str | None) -> list[Section]:
 
 
 def _section(name: str, kind: Any) -> Section:
+    from infgen.settings import help_texts  # noqa: PLC0415  # Pydantic takes 0.1 s.
+
     texts = help_texts(kind)
     settings = [
         Setting(

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from infgen.errors import ConfigError
-from infgen.settings import build
 from pipeline.engine.layout import Root
 from pipeline.engine.stage import Source
 from pipeline.settings.lined_yaml import LinedMapping, did_you_mean, inner, known
@@ -41,6 +40,8 @@ class Overlay:
         Raises:
             ConfigError: for a setting that does not exist or cannot have its value.
         """
+        from infgen.settings import build  # noqa: PLC0415  # Pydantic takes 0.1 s.
+
         given = self.values.get(section, {})
         values = {name: each.value for name, each in given.items()}
         return build(kind, values, {name: each.where for name, each in given.items()})

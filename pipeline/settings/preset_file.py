@@ -3,13 +3,16 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from infgen.errors import ConfigError
-from infgen.settings import build
 from infgen.views.published import ABLATIONS, PAPER
 from pipeline.settings.lined_yaml import LinedMapping, did_you_mean, inner, known, words
 from pipeline.settings.overlay import Overlay, merge_overlays, read_sections
-from pipeline.settings.presets import Arm, Preset, TownSet
+from pipeline.settings.presets import Arm, Preset
+
+if TYPE_CHECKING:
+    from pipeline.settings.town_set import TownSet
 
 COUNT_ERRORS = ("own", "split", "truth")
 """See ``infgen.metrics.long_term.table``: own log, mean of the split, same step."""
@@ -176,7 +179,10 @@ def _check_name(mapping: LinedMapping, name: str, what: str) -> None:
         )
 
 
-def _town_set(towns: LinedMapping, split: str) -> TownSet:
+def _town_set(towns: LinedMapping, split: str) -> "TownSet":
+    from infgen.settings import build  # noqa: PLC0415  # Pydantic takes 0.1 s.
+    from pipeline.settings.town_set import TownSet  # noqa: PLC0415
+
     return build(TownSet, inner(towns, split), f"{towns.where(split)}: {split}")
 
 

@@ -26,27 +26,14 @@ an arm; each is laid over those before it, and all of them over the profiles.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-
-from pydantic.dataclasses import dataclass as settings_dataclass
+from typing import TYPE_CHECKING
 
 from infgen.errors import ConfigError
-from infgen.settings import RULES, AtLeastOne, Positive, Seed
 from pipeline.settings.lined_yaml import did_you_mean
 from pipeline.settings.overlay import Overlay
 
-
-@settings_dataclass(frozen=True, slots=True, config=RULES)
-class TownSet:
-    """Synthetic towns of one split that a preset reads."""
-
-    scenes: AtLeastOne
-    """Number of scenes."""
-    seconds: Positive
-    """Length of each."""
-    seed: Seed = 0
-    """Another seed gives other towns."""
-    scenes_per_file: AtLeastOne = 20
-    """Most scenes of a file."""
+if TYPE_CHECKING:
+    from pipeline.settings.town_set import TownSet
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +82,7 @@ class Preset:
     profile: tuple[str, ...]
     seeds: int
     count_error: str
-    towns: Mapping[str, TownSet]
+    towns: "Mapping[str, TownSet]"
     arms: Mapping[str, Arm]
 
     def chosen(self, names: Sequence[str]) -> list[Arm]:

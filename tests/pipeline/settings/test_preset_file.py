@@ -4,8 +4,8 @@ import pytest
 
 from infgen.errors import ConfigError
 from infgen.views.published import ABLATIONS, PAPER
-from pipeline.settings.presets import TownSet
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
+from pipeline.settings.town_set import TownSet
 
 GOOD = """\
 version: 1

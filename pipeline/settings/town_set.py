@@ -1,0 +1,19 @@
+"""Settings of the synthetic towns that a preset reads where no records are named."""
+
+from pydantic.dataclasses import dataclass
+
+from infgen.settings import RULES, AtLeastOne, Positive, Seed
+
+
+@dataclass(frozen=True, slots=True, config=RULES)
+class TownSet:
+    """Synthetic towns of one split."""
+
+    scenes: AtLeastOne
+    """Number of scenes."""
+    seconds: Positive
+    """Length of each."""
+    seed: Seed = 0
+    """Another seed gives other towns."""
+    scenes_per_file: AtLeastOne = 20
+    """Most scenes of a file."""
