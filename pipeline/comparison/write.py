@@ -25,7 +25,7 @@ from pipeline.engine.manifest import Run, package_versions, write_manifest
 from pipeline.engine.plan import digest
 from pipeline.settings.presets import Preset
 
-SCHEMA = "infgen.comparison/1"
+SCHEMA = "infgen.comparison/2"
 STAGE, PRESETS = "comparison", "presets"
 NUMBERS, TABLES = "comparison.json", "tables"
 _MODULES = (

@@ -18,6 +18,7 @@ import json
 import os
 import uuid
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ RUN = "run.json"
 RUN_FOLDER = "run"
 """... and, in this folder, more of that: no file in it is in the manifest."""
 KEY_DIGITS = 16
+STAGE_SCHEMA, UNIT_SCHEMA = "infgen.stage/2", "infgen.unit/2"
+_OLD_SCHEMAS = ("infgen.stage/1", "infgen.unit/1", "infgen.comparison/1")
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +134,8 @@ def find_root(folder: Path, *, made: bool = False) -> Root:
             would pass for one without damage.
 
     Raises:
-        ConfigError: if it is a file; or if nothing was made there, but must have been.
+        ConfigError: if it is a file; if nothing was made there, but must have been; or if
+            an earlier version made it.
     """
     for place in (folder, *folder.absolute().parents):
         if place.exists() and not place.is_dir():
@@ -144,7 +148,24 @@ def find_root(folder: Path, *, made: bool = False) -> Root:
             f"{folder}: {what}; expected the --root of a run (`infgen run --root {folder}` "
             "makes one)"
         )
+    _refuse_old(root)
     return root
+
+
+def _refuse_old(root: Root) -> None:
+    """Refuse a root whose settings and columns have the names of an earlier version."""
+    folder = next((folder for _, folder in root.made()), None)
+    manifest = None
+    if folder is not None:
+        with suppress(StoreError):  # Commands name damage in their own words.
+            manifest = read_json(folder / MANIFEST)
+    schema = manifest.get("schema") if isinstance(manifest, dict) else None
+    if schema in _OLD_SCHEMAS:
+        raise ConfigError(
+            f"--root {root.path} was made by an earlier version ({schema!r}, "
+            f"expected {STAGE_SCHEMA!r}); remove {root.store} and `infgen run --root "
+            f"{root.path}` makes it anew, or name another root"
+        )
 
 
 def link(name: Path, target: Path) -> None:

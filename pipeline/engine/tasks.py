@@ -5,14 +5,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from pipeline.engine.code_hash import code_hash
-from pipeline.engine.layout import Root
+from pipeline.engine.layout import STAGE_SCHEMA, UNIT_SCHEMA, Root
 from pipeline.engine.manifest import package_versions, read_manifest
 from pipeline.engine.plan import PlanError, PlannedStage, without_locations
 from pipeline.engine.stage import Unit
 from pipeline.engine.units import Task
-
-UNIT_SCHEMA = "infgen.unit/1"
-STAGE_SCHEMA = "infgen.stage/1"
 
 
 def make_tasks(root: Root, planned: PlannedStage, units: Sequence[Unit]) -> list[Task]:

@@ -11,6 +11,13 @@ from infgen.errors import ConfigError
 
 MAPPING = yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG
 SEQUENCE = yaml.resolver.BaseResolver.DEFAULT_SEQUENCE_TAG
+RENAMED_ENTRIES = {
+    "plays": "rollout_sets",
+    "start": "starts_from",
+    "no-leave-token": "no-remove-token",
+    "no-cell-token": "no-position-token",
+}
+"""Names that entries and profiles had before, told where one is given."""
 
 
 class LinedMapping(dict[str, Any]):
@@ -98,6 +105,8 @@ def known(mapping: LinedMapping, names: Sequence[str], what: str) -> None:
 
 def did_you_mean(name: str, names: Sequence[str]) -> str:
     """Say which of some names may have been meant, to be put behind a message."""
+    if (new := RENAMED_ENTRIES.get(name)) in names:
+        return f"; it is now {new!r}"
     near = get_close_matches(name, names, n=1)
     if near:
         return f"; did you mean {near[0]!r}?"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from infgen.rollout.rollout import Rollout
 
-ROLLOUTS_SCHEMA = "infgen.rollouts/1"
+ROLLOUTS_SCHEMA = "infgen.rollouts/2"
 
 
 def read_rollouts(folder: Path) -> "Iterator[Rollout]":

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from infgen.scene import Scene
 
-SCENES_SCHEMA = "infgen.scenes/1"
+SCENES_SCHEMA = "infgen.scenes/2"
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 
 

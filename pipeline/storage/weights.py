@@ -22,7 +22,7 @@ from pipeline.engine.atomic import StoreError, write_file, write_json
 from pipeline.engine.layout import read_json
 from pipeline.storage.initial_weights import DESCRIPTION, WEIGHTS
 
-SCHEMA = "infgen.model/1"
+SCHEMA = "infgen.model/2"
 MAX_NAMED = 3
 MAX_SAID = 300
 _REQUIRED = ("model", "tokenize", "vocabulary", "weights")
@@ -190,7 +190,10 @@ def read_description(folder: Path) -> dict[str, Any]:
     read = read_json(path)
     about: dict[str, Any] = read if isinstance(read, dict) else {}
     if about.get("schema") != SCHEMA:
-        raise StoreError(f"{path} holds {about.get('schema')!r}, expected {SCHEMA!r}")
+        raise StoreError(
+            f"{path} holds {about.get('schema')!r}, expected {SCHEMA!r}; run stage 'train' "
+            "again"
+        )
     lacks = [name for name in _REQUIRED if name not in about]
     if lacks:
         raise StoreError(f"{path} lacks {', '.join(lacks)}; run stage 'train' again")

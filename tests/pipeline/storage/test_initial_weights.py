@@ -89,7 +89,7 @@ def test_the_start_of_a_key_is_enough_if_it_is_of_one_run_only(tmp_path):
         find_initial_weights(tmp_path, "x.initial_weights", "ef")
 
 
-@pytest.mark.parametrize("about", [{}, [], {"schema": "infgen.model/1"}])
+@pytest.mark.parametrize("about", [{}, [], {"schema": "infgen.model/2"}])
 def test_a_page_that_does_not_tell_of_weights_is_refused(tmp_path, about):
     write_json(tmp_path / DESCRIPTION, about)
 

@@ -108,9 +108,9 @@ def test_no_records_at_all_come_back_too(tmp_path, compress, whole):
 
 def test_a_scene_comes_back_from_disk(tmp_path, crossing):
     scene = crossing()
-    write_records(tmp_path / "s.zarr", [scene], Scene, "infgen.scenes/1", compress=True)
+    write_records(tmp_path / "s.zarr", [scene], Scene, "infgen.scenes/2", compress=True)
 
-    (read,) = read_records(tmp_path / "s.zarr", Scene, "infgen.scenes/1", whole=True)
+    (read,) = read_records(tmp_path / "s.zarr", Scene, "infgen.scenes/2", whole=True)
 
     np.testing.assert_array_equal(read.tracks.xyz_m, scene.tracks.xyz_m)
     np.testing.assert_array_equal(read.road_map.xyz_m, scene.road_map.xyz_m)
