@@ -19,7 +19,7 @@ def test_a_root_of_an_earlier_version_is_refused_with_the_way_out(tmp_path):
     root = made_with(tmp_path / "old", "infgen.stage/1")
 
     with pytest.raises(
-        ConfigError, match="earlier version.*`infgen run --root .*old` makes"
+        ConfigError, match=r"earlier version.*`infgen run --root .*old` makes"
     ):
         find_root(root.path)
 

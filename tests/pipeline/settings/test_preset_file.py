@@ -106,6 +106,7 @@ def test_arms_are_picked_by_name_and_bring_those_that_they_start_from(load):
         ("count: 2}", "count: null}", "stages.yaml:17: rollout.count is None"),
         ("long: {rollout", "long: {roll", "stages.yaml:17: long: no entry 'roll'"),
         ("brief: {rollout", "a b: {rollout", "stages.yaml:18: play 'a b'; expected"),
+        ("starts_from: plain", "start: plain", "no entry 'start'; it is now 'starts_from'"),
         (
             "starts_from: plain",
             "starts_from: plan",
