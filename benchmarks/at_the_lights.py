@@ -77,7 +77,7 @@ def look(network: Network, scene: SceneTokens) -> Stood:
     batch = replace(batch, roads=replace(batch.roads, shown=shown))  # Nobody looks away.
     with torch.no_grad():
         motion = network(batch).motion
-    far_m = torch.from_numpy(network.motion_codebook().end_pose[..., :2]).norm(dim=-1)
+    far_m = torch.from_numpy(network.motion_vocabulary().end_pose[..., :2]).norm(dim=-1)
     moves = (far_m > STILL_M)[batch.agents.kind[0]]  # [agent, move]
     odds = motion.rows.spread(motion.move_logits)[0].softmax(dim=-1)  # [token, agent, move]
     stood, went, quiet = _who_stood(batch.agents)

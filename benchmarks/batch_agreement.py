@@ -75,7 +75,7 @@ def follow(
     network: Network, scene: Scene, settings: RolloutSettings, rollouts: int
 ) -> Iterator[Followed]:
     """Play all rollouts of a scene in step, together and each alone."""
-    books = network.motion_codebook(), network.road_codebook()
+    books = network.motion_vocabulary(), network.map_vocabulary()
     tokens = network.grid_settings
     history = tokenize_scene(scene, *books, tokens, until=scene.now)
     starts = [Start(scene, history, at, settings.seed) for at in range(rollouts)]

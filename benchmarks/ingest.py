@@ -17,11 +17,11 @@ from pathlib import Path
 
 import infgen
 from infgen.config import IngestSettings
-from infgen.scene import FeatureKind
+from infgen.scene import FeatureType
 from infgen.sources import wire
 from infgen.sources.tfrecord import Record, iter_records
 from infgen.sources.wire import BYTES, Spans, tag
-from infgen.sources.womd import scene_or_fault
+from infgen.sources.womd import scene_or_bad_record
 from pipeline.engine.stage import Report, Unit
 from pipeline.stages.ingest import STAGE
 
@@ -32,13 +32,13 @@ TOTALS = ("scenes", "quarantined", "record_bytes", "disk_bytes")
 TRACK, DYNAMIC_STATE, FEATURE = tag(2, BYTES), tag(7, BYTES), tag(8, BYTES)
 LINE, OUTLINE = tag(2, BYTES), tag(1, BYTES)
 POINTS = {
-    tag(FeatureKind.LANE, BYTES): tag(8, BYTES),
-    tag(FeatureKind.ROAD_LINE, BYTES): LINE,
-    tag(FeatureKind.ROAD_EDGE, BYTES): LINE,
-    tag(FeatureKind.STOP_SIGN, BYTES): LINE,
-    tag(FeatureKind.CROSSWALK, BYTES): OUTLINE,
-    tag(FeatureKind.SPEED_BUMP, BYTES): OUTLINE,
-    tag(FeatureKind.DRIVEWAY, BYTES): OUTLINE,
+    tag(FeatureType.LANE, BYTES): tag(8, BYTES),
+    tag(FeatureType.ROAD_LINE, BYTES): LINE,
+    tag(FeatureType.ROAD_EDGE, BYTES): LINE,
+    tag(FeatureType.STOP_SIGN, BYTES): LINE,
+    tag(FeatureType.CROSSWALK, BYTES): OUTLINE,
+    tag(FeatureType.SPEED_BUMP, BYTES): OUTLINE,
+    tag(FeatureType.DRIVEWAY, BYTES): OUTLINE,
 }
 GOALS = {"scenes_per_s_per_core": 25.0, "bytes_over_raw": 0.3333, "peak_rss_mib": 1024}
 NEIGHBOURS = (tag(11, BYTES), tag(12, BYTES))
@@ -49,7 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("records", nargs="*", help="TFRecords; shared or built-in ones")
     urls = parser.parse_args().records or default_records()
-    ways: tuple[Callable[[Record], object], ...] = (skip, walk_record, scene_or_fault)
+    ways: tuple[Callable[[Record], object], ...] = (skip, walk_record, scene_or_bad_record)
     seconds = [cpu_s(partial(read, urls, way)) for way in ways]
     ingest(urls[:1])  # What is imported on the way is not counted.
     reports: list[Report] = []

@@ -39,7 +39,7 @@ from infgen.metrics.traffic import Traffic, from_log, from_rollout, on_map
 from infgen.rollout.rules.off_road import Lanes, lane_pieces
 from infgen.scene import AgentType
 from infgen.settings import build
-from infgen.spatial.road_edges import RoadEdges, edges_of
+from infgen.spatial.road_edges import RoadEdges, scene_road_edges
 from infgen.tokens.tracks import TokensError
 from pipeline.commands.screen import show_table
 from pipeline.engine.manifest import read_manifest
@@ -213,7 +213,7 @@ def measure(root: Path, look: Look) -> tuple[Side, Side]:
     sides: list[Side] = []
     for scenario_id, some in groupby(rollouts, key=lambda one: one.scenario_id):
         scene = logs.find(scenario_id)
-        place = Place(edges_of(scene), lane_pieces(scene))
+        place = Place(scene_road_edges(scene), lane_pieces(scene))
         played = [from_rollout(one) for one in some]
         if not sides:
             steps = played[0].motion.valid.shape[2] - played[0].now - 1

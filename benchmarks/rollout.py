@@ -115,8 +115,8 @@ class Pace:
         later = tokens.presence[:, tokens.now + 1 :]
         there = (later != Presence.ABSENT).sum()
         return cls(
-            entries=float((later == Presence.ENTERING).sum() / later.shape[1]),
-            leaves=float((later == Presence.LEAVING).sum() / max(there, 1)),
+            entries=float((later == Presence.INSERTED).sum() / later.shape[1]),
+            leaves=float((later == Presence.REMOVED).sum() / max(there, 1)),
         )
 
 
@@ -142,9 +142,9 @@ def _always(head: nn.Module, logit: float) -> None:
     nn.init.constant_(last.bias, logit)
 
 
-def _slowly(head: nn.Module, codebook: MotionVocabulary) -> None:
+def _slowly(head: nn.Module, vocabulary: MotionVocabulary) -> None:
     """Make long moves of vehicles less likely; the kinds share their outputs."""
-    length_m = np.linalg.norm(codebook.path[:, :, -1, :2], axis=-1).max(axis=0)
+    length_m = np.linalg.norm(vocabulary.path[:, :, -1, :2], axis=-1).max(axis=0)
     last = _last_layer(head)
     with torch.no_grad():
         last.bias.sub_(torch.from_numpy(length_m).float() / SLOW_M)
@@ -194,9 +194,9 @@ def _cropped(history: SceneTokens, roads: int) -> SceneTokens:
     """Keep the road tokens nearest to the ego."""
     if not roads:
         return history
-    away_m = history.road_pose[:, :2] - history.pose[history.ego, history.now, :2]
+    away_m = history.map_pose[:, :2] - history.pose[history.ego, history.now, :2]
     rows = np.sort(np.argsort(np.linalg.norm(away_m, axis=1), kind="stable")[:roads])
-    names = [f.name for f in fields(history) if f.name.startswith("road_")]
+    names = [f.name for f in fields(history) if f.name.startswith("map_")]
     return replace(history, **{name: getattr(history, name)[rows] for name in names})
 
 

@@ -43,7 +43,7 @@ from infgen.metrics.windows import Windows, cut_windows
 from infgen.metrics.wosac import metric
 from infgen.metrics.wosac.logged import FUTURE_STEPS
 from infgen.scene import Scene
-from infgen.spatial.road_edges import edges_of
+from infgen.spatial.road_edges import scene_road_edges
 
 LONG_STEPS = 300
 VERSIONS = ("wosac-2025", "wosac-2024")
@@ -71,7 +71,7 @@ class LongTerm:
             traffic = from_log(scene, TokenSettings())
         except ValueError:
             return
-        edges, radius_m = edges_of(scene), ReferenceSettings().count_radius_m
+        edges, radius_m = scene_road_edges(scene), ReferenceSettings().count_radius_m
         log = bin_traffic(traffic, edges, radius_m, as_logged=True)
         if not _windows(log).count:
             return

@@ -31,7 +31,7 @@ from infgen.metrics.wosac import metric
 from infgen.metrics.wosac.logged import HISTORY_STEPS, LOG_STEPS, LogError, LoggedScene
 from infgen.metrics.wosac.rollouts import Rollouts, played
 from infgen.metrics.wosac.signals import build_stop_lines, runs_red_light
-from infgen.spatial.road_edges import RoadEdges, build_edges, edges_of
+from infgen.spatial.road_edges import RoadEdges, build_road_edges, scene_road_edges
 
 ROLLOUTS = 32
 LONG_STEPS = 300
@@ -72,7 +72,7 @@ def time_features(log: LoggedScene, future: Rollouts) -> dict[str, float]:
     """CPU-seconds of each feature of one scene."""
     motion, objects = played(log, future), log.evaluated
     paths = (motion.x_m, motion.y_m, motion.z_m, motion.heading_rad)
-    edges = build_edges(log.edges())
+    edges = build_road_edges(log.edges())
     lines = build_stop_lines(
         log.lane_id, log.lanes(), log.signal_lane_id, log.signal_state, log.signal_stop_m
     )
@@ -118,7 +118,7 @@ def time_long(limit: int) -> float:
             traffic = kept_velocity(from_log(scene, TokenSettings()), LONG_STEPS)
         except ValueError:
             continue
-        edges = edges_of(scene)
+        edges = scene_road_edges(scene)
         seconds.append(cpu_s(lambda t=traffic, e=edges: _bin(t, e)))  # type: ignore[misc]
     return float(np.mean(seconds))
 

@@ -1,8 +1,8 @@
 """How fast scenes become tokens, on one core, beside merely reading them.
 
 The promise: at least 25 scenes a second and core for the whole stage. Scenes are read from
-ingested files, tokenized with full-size codebooks built from them, and written as the stage
-writes them. Ingest and vocabularies are made first and not counted.
+ingested files, tokenized with full-size vocabularies built from them, and written as the
+stage writes them. Ingest and vocabularies are made first and not counted.
 
     python benchmarks/tokenize.py [RECORDS...] [--passes 3]
 
@@ -83,7 +83,7 @@ def measure(
 ) -> Timing:
     """Time reading, tokenizing in memory, and the stage's own work, each on its own."""
     folders = [Path(unit.task["scenes"]) for unit in units]
-    motion, roads = load_vocabularies(Path(units[0].task["codebooks"]))
+    motion, roads = load_vocabularies(Path(units[0].task["vocabularies"]))
     scenes = [scene for folder in folders for scene in read_scenes(folder)]
 
     def read() -> None:

@@ -22,10 +22,10 @@ from infgen.metrics.kinematics import measure_kinematics, speed_valid
 from infgen.metrics.placement import count_per_token
 from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic, from_log
-from infgen.scene import AgentType, FeatureKind, LaneType, Scene
+from infgen.scene import AgentType, FeatureType, LaneType, Scene
 from infgen.sources.womd import iter_scenes
-from infgen.spatial.road_edges import edges_of
-from infgen.tokens.map import road_pieces
+from infgen.spatial.road_edges import scene_road_edges
+from infgen.tokens.map import cut_map_tokens
 from infgen.tokens.validity_patterns import encode_patterns
 
 NEAR_M = 75.0
@@ -77,20 +77,20 @@ def _count_events(traffic: Traffic) -> Column:
 
 
 def _count_map(scene: Scene) -> Column:
-    road_map, kinds = scene.road_map, scene.road_map.feature_kind
-    lanes = kinds == FeatureKind.LANE
-    bike = lanes & (road_map.feature_type == LaneType.BIKE_LANE)
+    road_map, kinds = scene.road_map, scene.road_map.feature_type
+    lanes = kinds == FeatureType.LANE
+    bike = lanes & (road_map.feature_subtype == LaneType.BIKE_LANE)
     from_ego_m = road_map.xyz_m[:, :2] - scene.tracks.xyz_m[scene.ego, scene.now, :2]
     return {
-        "map tokens": float(len(road_pieces(road_map).line)),
+        "map tokens": float(len(cut_map_tokens(road_map).polyline)),
         "map points": float(len(road_map.xyz_m)),
         "map points within 75 m": float((np.hypot(*from_ego_m.T) < NEAR_M).sum()),
         "lanes": float(lanes.sum()),
         "bicycle lanes": float(bike.sum()),
-        "road lines": float((kinds == FeatureKind.ROAD_LINE).sum()),
-        "road edges": float((kinds == FeatureKind.ROAD_EDGE).sum()),
-        "crosswalks": float((kinds == FeatureKind.CROSSWALK).sum()),
-        "stop signs": float((kinds == FeatureKind.STOP_SIGN).sum()),
+        "road lines": float((kinds == FeatureType.ROAD_LINE).sum()),
+        "road edges": float((kinds == FeatureType.ROAD_EDGE).sum()),
+        "crosswalks": float((kinds == FeatureType.CROSSWALK).sum()),
+        "stop signs": float((kinds == FeatureType.STOP_SIGN).sum()),
         "lanes with signals": float(len(np.unique(scene.signals.lane_id))),
     }
 
@@ -138,7 +138,7 @@ def _stands(traffic: Traffic) -> np.ndarray:
 
 def _off_road(scene: Scene, traffic: Traffic, which: np.ndarray) -> np.ndarray:
     """Whether some vehicles are off the road now."""
-    edges = edges_of(scene)
+    edges = scene_road_edges(scene)
     rows = np.flatnonzero(
         which & (traffic.motion.kind == AgentType.VEHICLE) & traffic.there_now
     )

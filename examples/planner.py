@@ -29,7 +29,7 @@ from infgen.rollout.population import EGO_ROW, Population
 from infgen.rollout.recording import Start
 from infgen.rollout.session import Session
 from infgen.rollout.simulator import Player
-from infgen.scene import FeatureKind, Scene
+from infgen.scene import FeatureType, Scene
 from infgen.tokens.scene_tokens import Presence
 from infgen.tokens.tokenizer import tokenize_scene
 from pipeline.storage.scenes import read_scenes
@@ -70,7 +70,7 @@ class LaneKeeper:
         """Start on the lane nearest to the ego, at the ego's speed."""
         tracks, ego = scene.tracks, scene.ego
         xy_m = tracks.xyz_m[ego, scene.now, :2]
-        rows = scene.road_map.rows(FeatureKind.LANE)
+        rows = scene.road_map.rows(FeatureType.LANE)
         lanes = [scene.road_map.points(row)[:, :2] for row in rows.tolist()]
         gaps_m = [np.linalg.norm(lane_m - xy_m, axis=1).min() for lane_m in lanes]
         lane_m = lanes[int(np.argmin(gaps_m))]
@@ -188,8 +188,8 @@ def make_player(network: Network, settings: RolloutSettings) -> Player:
     """Get a network ready to be played."""
     return Player(
         stepper=Stepper(network),
-        codebook=network.motion_codebook(),
-        roads=network.road_codebook(),
+        vocabulary=network.motion_vocabulary(),
+        roads=network.map_vocabulary(),
         tokens=network.grid_settings,
         settings=settings,
         device=torch.device("cpu"),
@@ -199,7 +199,7 @@ def make_player(network: Network, settings: RolloutSettings) -> Player:
 def begin(scene: Scene, player: Player, seed: int = 0) -> Start:
     """Tokenize the first second of a scene."""
     history = tokenize_scene(
-        scene, player.codebook, player.roads, player.tokens, until=scene.now
+        scene, player.vocabulary, player.roads, player.tokens, until=scene.now
     )
     return Start(scene=scene, history=history, index=0, seed=seed)
 

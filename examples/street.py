@@ -6,9 +6,9 @@ import torch
 from infgen.clock import CLOCK
 from infgen.config import ModelSettings, TokenSettings, VocabSettings
 from infgen.model.network import Network
-from infgen.scene import AgentType, FeatureKind, LaneType, RoadMap, Scene, Signals, Tracks
-from infgen.tokens.clustering.made_motion_samples import fan
-from infgen.tokens.clustering.physical_limits import limits_of
+from infgen.scene import AgentType, FeatureType, LaneType, RoadMap, Scene, Signals, Tracks
+from infgen.tokens.clustering.made_motion_samples import make_fan
+from infgen.tokens.clustering.physical_limits import motion_limits
 from infgen.tokens.vocabulary import BOX_LW_M, MapVocabulary, MotionVocabulary
 
 SMALL = ModelSettings(width=32, heads=4, map_blocks=1, motion_blocks=1, scene_blocks=1)
@@ -48,7 +48,7 @@ def street(
         interest_id=np.empty(0, dtype=np.int32),
         tracks=Tracks(
             id=number.astype(np.int32),
-            kind=np.full(cars, AgentType.VEHICLE, dtype=np.int8),
+            agent_type=np.full(cars, AgentType.VEHICLE, dtype=np.int8),
             xyz_m=xyz_m,
             heading_rad=np.zeros((cars, steps), dtype=np.float32),
             velocity_mps=velocity_mps,
@@ -73,14 +73,14 @@ def _lanes() -> RoadMap:
     few = none.astype(np.int8)
     return RoadMap(
         feature_id=np.arange(1, lanes + 1),
-        feature_kind=np.full(lanes, FeatureKind.LANE, dtype=np.int8),
-        feature_type=np.full(lanes, LaneType.SURFACE_STREET, dtype=np.int8),
+        feature_type=np.full(lanes, FeatureType.LANE, dtype=np.int8),
+        feature_subtype=np.full(lanes, LaneType.SURFACE_STREET, dtype=np.int8),
         speed_limit_mph=np.full(lanes, 30, dtype=np.float32),
         interpolating=np.zeros(lanes, dtype=bool),
         point_offsets=np.arange(lanes + 1) * len(x_m),
         xyz_m=np.concatenate(lines_m).astype(np.float32),
         link_lane_id=none,
-        link_kind=few,
+        link_type=few,
         link_other_id=none,
         neighbour_lane_id=none,
         neighbour_side=few,
@@ -99,8 +99,8 @@ def _lanes() -> RoadMap:
 
 def fresh_network(seed: int = 0) -> Network:
     """Make a small network that has learned nothing, with moves and roads made by rule."""
-    limits = limits_of(VocabSettings())
-    fans = [fan(kind, limits, spacing_m=0.3) for kind in range(3)]
+    limits = motion_limits(VocabSettings())
+    fans = [make_fan(kind, limits, spacing_m=0.3) for kind in range(3)]
     moves = min(len(paths) for paths in fans)
     still = np.zeros((1, CLOCK.steps_per_token + 1, 3), dtype=np.float32)
     path = np.stack([np.concatenate([still, paths[: moves - 1]]) for paths in fans])

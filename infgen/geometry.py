@@ -6,7 +6,7 @@ A pose is [..., 3]: x and y in metres, heading in radians counter-clockwise from
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-SQUARE_ROWS = 1 << 20
+SQUARES_PER_COLUMN = 1 << 20
 """Squares above each other before the next column: more than any map has."""
 
 
@@ -67,12 +67,12 @@ def boxes_overlap(
     Two rectangles are apart if and only if one's own length or width tells them apart.
     """
     return ~(
-        _tells_apart(pose, size_lw_m, other, other_size_lw_m)
-        | _tells_apart(other, other_size_lw_m, pose, size_lw_m)
+        _separates(pose, size_lw_m, other, other_size_lw_m)
+        | _separates(other, other_size_lw_m, pose, size_lw_m)
     )
 
 
-def _tells_apart(
+def _separates(
     pose: np.ndarray, size_lw_m: np.ndarray, other: np.ndarray, other_size_lw_m: np.ndarray
 ) -> np.ndarray:
     """Whether the other box lies wholly beyond an end or a side of the first."""
@@ -87,12 +87,13 @@ def _tells_apart(
     return apart
 
 
-def squares_of(
+def grid_squares(
     xy_m: Float[np.ndarray, "*shape 2"], side_m: float
 ) -> Int64[np.ndarray, "*shape"]:
     """Number the squares of the plane that points are in.
 
-    Those above each other are consecutive, those beside each other ``SQUARE_ROWS`` apart.
+    Those above each other are consecutive, those beside each other ``SQUARES_PER_COLUMN``
+    apart.
     """
     at = np.floor(xy_m / side_m).astype(np.int64)
-    return at[..., 0] * SQUARE_ROWS + at[..., 1]
+    return at[..., 0] * SQUARES_PER_COLUMN + at[..., 1]

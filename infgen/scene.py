@@ -26,7 +26,7 @@ class AgentType(IntEnum):
     OTHER = 3
 
 
-class FeatureKind(IntEnum):
+class FeatureType(IntEnum):
     """Map features. The field numbers of WOMD's ``MapFeature``."""
 
     LANE = 3
@@ -39,7 +39,7 @@ class FeatureKind(IntEnum):
 
 
 class LaneType(IntEnum):
-    """Sub-types of ``FeatureKind.LANE``."""
+    """Sub-types of ``FeatureType.LANE``."""
 
     UNDEFINED = 0
     FREEWAY = 1
@@ -48,7 +48,7 @@ class LaneType(IntEnum):
 
 
 class RoadLineType(IntEnum):
-    """Sub-types of ``FeatureKind.ROAD_LINE``."""
+    """Sub-types of ``FeatureType.ROAD_LINE``."""
 
     UNKNOWN = 0
     BROKEN_SINGLE_WHITE = 1
@@ -62,7 +62,7 @@ class RoadLineType(IntEnum):
 
 
 class RoadEdgeType(IntEnum):
-    """Sub-types of ``FeatureKind.ROAD_EDGE``."""
+    """Sub-types of ``FeatureType.ROAD_EDGE``."""
 
     UNKNOWN = 0
     BOUNDARY = 1
@@ -90,7 +90,7 @@ class Side(IntEnum):
     RIGHT = 1
 
 
-class LinkKind(IntEnum):
+class LinkType(IntEnum):
     """How one lane follows another."""
 
     ENTRY = 0
@@ -107,7 +107,7 @@ class Tracks:
 
     Attributes:
         id: Track id, unique within the scene.
-        kind: ``AgentType`` of each agent.
+        agent_type: ``AgentType`` of each agent.
         xyz_m: Box centres.
         heading_rad: Counter-clockwise from +x.
         velocity_mps: Velocity along world x and y.
@@ -116,7 +116,7 @@ class Tracks:
     """
 
     id: Int32[np.ndarray, " agent"]
-    kind: Int8[np.ndarray, " agent"]
+    agent_type: Int8[np.ndarray, " agent"]
     xyz_m: Float32[np.ndarray, "agent step 3"]
     heading_rad: Float32[np.ndarray, "agent step"]
     velocity_mps: Float32[np.ndarray, "agent step 2"]
@@ -150,13 +150,13 @@ class RoadMap:
 
     Attributes:
         feature_id: WOMD feature id.
-        feature_kind: ``FeatureKind``.
-        feature_type: ``LaneType``, ``RoadLineType`` or ``RoadEdgeType`` by kind; else 0.
+        feature_type: ``FeatureType``.
+        feature_subtype: ``LaneType``, ``RoadLineType`` or ``RoadEdgeType`` by kind; else 0.
         speed_limit_mph: Of lanes; 0 where unknown.
         interpolating: Lane that bridges a gap between two others.
         point_offsets: First point of each feature, and the number of points.
         xyz_m: All points.
-        link_lane_id: Lane, its ``LinkKind`` to the other, and the other.
+        link_lane_id: Lane, its ``LinkType`` to the other, and the other.
         neighbour_lane_id: Lane with a neighbour on ``neighbour_side`` (``Side``) named
             ``neighbour_other_id``; ``neighbour_span`` holds first and last point index
             along the lane, then along the neighbour.
@@ -169,14 +169,14 @@ class RoadMap:
     """
 
     feature_id: Int64[np.ndarray, " feature"]
-    feature_kind: Int8[np.ndarray, " feature"]
     feature_type: Int8[np.ndarray, " feature"]
+    feature_subtype: Int8[np.ndarray, " feature"]
     speed_limit_mph: Float32[np.ndarray, " feature"]
     interpolating: Bool[np.ndarray, " feature"]
     point_offsets: Int64[np.ndarray, " feature+1"]
     xyz_m: Float32[np.ndarray, "point 3"]
     link_lane_id: Int64[np.ndarray, " link"]
-    link_kind: Int8[np.ndarray, " link"]
+    link_type: Int8[np.ndarray, " link"]
     link_other_id: Int64[np.ndarray, " link"]
     neighbour_lane_id: Int64[np.ndarray, " neighbour"]
     neighbour_side: Int8[np.ndarray, " neighbour"]
@@ -200,9 +200,9 @@ class RoadMap:
         """Points [length, 3] of one feature, by row."""
         return self.xyz_m[self.point_offsets[feature] : self.point_offsets[feature + 1]]
 
-    def rows(self, kind: FeatureKind) -> Int64[np.ndarray, " row"]:
+    def rows(self, kind: FeatureType) -> Int64[np.ndarray, " row"]:
         """Rows of all features of one kind."""
-        return np.flatnonzero(self.feature_kind == kind)
+        return np.flatnonzero(self.feature_type == kind)
 
 
 @dataclass(frozen=True, slots=True)

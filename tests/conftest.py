@@ -8,7 +8,7 @@ from hypothesis import settings
 
 from infgen.scene import (
     AgentType,
-    FeatureKind,
+    FeatureType,
     LaneType,
     RoadEdgeType,
     RoadMap,
@@ -63,7 +63,7 @@ def make_tracks(path, kind, valid=None) -> Tracks:
 
     return Tracks(
         id=np.arange(100, 100 + agents, dtype=np.int32),
-        kind=np.asarray(kind, dtype=np.int8),
+        agent_type=np.asarray(kind, dtype=np.int8),
         xyz_m=shown(xyz),
         heading_rad=shown((path[..., 2] + np.pi) % (2 * np.pi) - np.pi),
         velocity_mps=shown(velocity),
@@ -72,7 +72,7 @@ def make_tracks(path, kind, valid=None) -> Tracks:
     )
 
 
-def make_map(lines: Sequence[tuple[int, FeatureKind, int, np.ndarray]]) -> RoadMap:
+def make_map(lines: Sequence[tuple[int, FeatureType, int, np.ndarray]]) -> RoadMap:
     """A map of features (id, kind, type, points [length, 2 or 3]) without relations."""
     points = [
         np.pad(np.asarray(p, float), ((0, 0), (0, 3 - np.shape(p)[1]))) for *_, p in lines
@@ -80,14 +80,14 @@ def make_map(lines: Sequence[tuple[int, FeatureKind, int, np.ndarray]]) -> RoadM
     none_i8, none_i64 = np.empty(0, np.int8), np.empty(0, np.int64)
     return RoadMap(
         feature_id=np.array([line[0] for line in lines], dtype=np.int64),
-        feature_kind=np.array([line[1] for line in lines], dtype=np.int8),
-        feature_type=np.array([line[2] for line in lines], dtype=np.int8),
+        feature_type=np.array([line[1] for line in lines], dtype=np.int8),
+        feature_subtype=np.array([line[2] for line in lines], dtype=np.int8),
         speed_limit_mph=np.zeros(len(lines), dtype=np.float32),
         interpolating=np.zeros(len(lines), dtype=bool),
         point_offsets=np.cumsum([0, *map(len, points)]).astype(np.int64),
         xyz_m=np.concatenate([np.empty((0, 3)), *points]).astype(np.float32),
         link_lane_id=none_i64,
-        link_kind=none_i8,
+        link_type=none_i8,
         link_other_id=none_i64,
         neighbour_lane_id=none_i64,
         neighbour_side=none_i8,
@@ -112,17 +112,17 @@ def straight_road(length_m: float = 200.0) -> RoadMap:
         [
             (
                 LANE_ID,
-                FeatureKind.LANE,
+                FeatureType.LANE,
                 LaneType.SURFACE_STREET,
                 np.column_stack([x, 0 * x]),
             ),
             (
                 EDGE_ID,
-                FeatureKind.ROAD_EDGE,
+                FeatureType.ROAD_EDGE,
                 RoadEdgeType.BOUNDARY,
                 np.column_stack([x, 0 * x - 3]),
             ),
-            (CROSSWALK_ID, FeatureKind.CROSSWALK, 0, np.array(zebra)),
+            (CROSSWALK_ID, FeatureType.CROSSWALK, 0, np.array(zebra)),
         ]
     )
 
@@ -165,7 +165,7 @@ def build_scene() -> Callable[..., Scene]:
 
 @pytest.fixture(scope="session")
 def build_map() -> Callable[..., RoadMap]:
-    """``build_map([(id, FeatureKind, type, points), ...])``."""
+    """``build_map([(id, FeatureType, type, points), ...])``."""
     return make_map
 
 

@@ -4,10 +4,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from infgen.geometry import (
-    SQUARE_ROWS,
+    SQUARES_PER_COLUMN,
     box_corners,
     boxes_overlap,
-    squares_of,
+    grid_squares,
     to_local,
 )
 
@@ -70,6 +70,6 @@ def points_in_both(one, size, other, other_size):
 def test_squares_above_each_other_are_consecutive_and_columns_far_apart():
     xy_m = np.array([[[1.0, 1.0], [9.9, 0.0]], [[1.0, 11.0], [-0.1, 1.0]]])
 
-    number = squares_of(xy_m, 10.0)
+    number = grid_squares(xy_m, 10.0)
 
-    assert number.tolist() == [[0, 0], [1, -SQUARE_ROWS]]
+    assert number.tolist() == [[0, 0], [1, -SQUARES_PER_COLUMN]]

@@ -8,9 +8,9 @@ from jaxtyping import Float64
 
 from infgen.scene import (
     AgentType,
-    FeatureKind,
+    FeatureType,
     LaneType,
-    LinkKind,
+    LinkType,
     RoadEdgeType,
     RoadLineType,
     RoadMap,
@@ -37,7 +37,7 @@ class Feature(NamedTuple):
 
     row: int
     id: int
-    kind: FeatureKind
+    kind: FeatureType
     type: int
     xyz_m: Float64[np.ndarray, "point 3"]
 
@@ -52,16 +52,16 @@ def features_of(scene: Scene) -> Iterator[Feature]:
             yield Feature(
                 row,
                 int(road_map.feature_id[row]),
-                FeatureKind(road_map.feature_kind[row]),
-                int(road_map.feature_type[row]),
+                FeatureType(road_map.feature_type[row]),
+                int(road_map.feature_subtype[row]),
                 world_m[part],
             )
 
 
-def linked(road_map: RoadMap, kind: LinkKind) -> Mapping[int, list[int]]:
+def linked(road_map: RoadMap, kind: LinkType) -> Mapping[int, list[int]]:
     """Lanes before (``ENTRY``) or after (``EXIT``) each lane, by its id."""
     found: dict[int, list[int]] = {}
-    rows = np.flatnonzero(road_map.link_kind == kind)
+    rows = np.flatnonzero(road_map.link_type == kind)
     pairs = zip(road_map.link_lane_id[rows], road_map.link_other_id[rows], strict=True)
     for lane, other in pairs:
         found.setdefault(int(lane), []).append(int(other))
@@ -70,12 +70,12 @@ def linked(road_map: RoadMap, kind: LinkKind) -> Mapping[int, list[int]]:
 
 def womd_name(feature: Feature) -> str:
     """Name a feature's sub-type in capitals, as WOMD's tools do."""
-    if feature.kind == FeatureKind.LANE:
+    if feature.kind == FeatureType.LANE:
         word = LaneType(feature.type).name
         return f"LANE_{'UNKNOWN' if word == 'UNDEFINED' else word}"
-    if feature.kind == FeatureKind.ROAD_LINE:
+    if feature.kind == FeatureType.ROAD_LINE:
         return f"ROAD_LINE_{RoadLineType(feature.type).name}"
-    if feature.kind == FeatureKind.ROAD_EDGE:
+    if feature.kind == FeatureType.ROAD_EDGE:
         return f"ROAD_EDGE_{RoadEdgeType(feature.type).name}"
     return feature.kind.name
 

@@ -22,18 +22,18 @@ from infgen.exports.features import (
 )
 from infgen.exports.states import NO_LIGHT, Lights, States, lights_of, states_of
 from infgen.rollout.rollout import Rollout
-from infgen.scene import FeatureKind, Scene
+from infgen.scene import FeatureType, Scene
 
 STEPS = 91
 """Steps of a trajectory that are read."""
 _GONE = -1e4
 """Value of everything that is not there."""
-_FIRST_ELEMENT = {FeatureKind.LANE: 0, FeatureKind.ROAD_LINE: 5, FeatureKind.ROAD_EDGE: 14}
+_FIRST_ELEMENT = {FeatureType.LANE: 0, FeatureType.ROAD_LINE: 5, FeatureType.ROAD_EDGE: 14}
 _ELEMENTS = {
-    FeatureKind.STOP_SIGN: 17,
-    FeatureKind.CROSSWALK: 18,
-    FeatureKind.SPEED_BUMP: 19,
-    FeatureKind.DRIVEWAY: 20,
+    FeatureType.STOP_SIGN: 17,
+    FeatureType.CROSSWALK: 18,
+    FeatureType.SPEED_BUMP: 19,
+    FeatureType.DRIVEWAY: 20,
 }
 
 

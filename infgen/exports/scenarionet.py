@@ -26,13 +26,13 @@ from infgen.exports.features import (
 )
 from infgen.exports.states import NO_LIGHT, Lights, States, lights_of, states_of
 from infgen.rollout.rollout import Rollout
-from infgen.scene import FeatureKind, LinkKind, RoadMap, Scene, Side
+from infgen.scene import FeatureType, LinkType, RoadMap, Scene, Side
 
 VERSION = "infgen-1"
 """Of what is written here; ScenarioNet puts its own name and number."""
 DATASET = "infgen"
 _KMH_PER_MPH = 1.609344
-_LINES = (FeatureKind.LANE, FeatureKind.ROAD_LINE, FeatureKind.ROAD_EDGE)
+_LINES = (FeatureType.LANE, FeatureType.ROAD_LINE, FeatureType.ROAD_EDGE)
 _ARRAYS = {
     **dict.fromkeys(("position", "length", "width", "height", "heading"), np.float32),
     **dict.fromkeys(("velocity", "polyline", "polygon", "stop_point", "ts"), np.float32),
@@ -187,8 +187,8 @@ class _Lanes:
 
     def __init__(self, road_map: RoadMap) -> None:
         self.map = road_map
-        self.before = linked(road_map, LinkKind.ENTRY)
-        self.after = linked(road_map, LinkKind.EXIT)
+        self.before = linked(road_map, LinkType.ENTRY)
+        self.after = linked(road_map, LinkType.EXIT)
 
     def neighbours(self, lane: int, side: Side) -> list[dict[str, Any]]:
         """Lanes on one side, with the stretches along which they are."""
@@ -224,7 +224,7 @@ class _Lanes:
 
 def _line_name(kind: int) -> str:
     nowhere = np.zeros((0, 3))
-    return _named(Feature(0, 0, FeatureKind.ROAD_LINE, kind, nowhere))
+    return _named(Feature(0, 0, FeatureType.ROAD_LINE, kind, nowhere))
 
 
 def _named(feature: Feature) -> str:
@@ -235,7 +235,7 @@ def _named(feature: Feature) -> str:
 def _feature(feature: Feature, lanes: _Lanes) -> dict[str, Any]:
     found: dict[str, Any] = {"type": _named(feature)}
     points = rounded(feature.xyz_m)
-    if feature.kind == FeatureKind.STOP_SIGN:
+    if feature.kind == FeatureType.STOP_SIGN:
         signs = lanes.map.sign_id == feature.id
         return found | {
             "lane": lanes.map.sign_lane_id[signs].tolist(),
@@ -243,7 +243,7 @@ def _feature(feature: Feature, lanes: _Lanes) -> dict[str, Any]:
         }
     if feature.kind not in _LINES:
         return found | {"polygon": points}
-    if feature.kind == FeatureKind.LANE:
+    if feature.kind == FeatureType.LANE:
         found |= _lane(feature, lanes)
     return found | {"polyline": points}
 

@@ -146,7 +146,7 @@ def complete(scene: Scene, rollouts: Sequence[Rollout]) -> Futures:
     shown = np.flatnonzero(scene.tracks.valid[:, scene.now])
     expected = scene.tracks.id[shown].astype(np.int64)
     there = np.isin(expected, played.object_id)
-    unplayed = ~there & (scene.tracks.kind[shown] == AgentType.OTHER)
+    unplayed = ~there & (scene.tracks.agent_type[shown] == AgentType.OTHER)
     _check_objects(where, expected[there | unplayed], expected, played.object_id)
     joined = _join(played, _keep_velocity(scene, shown[unplayed]), expected)
     _check_finite(where, joined)

@@ -13,7 +13,7 @@ from jaxtyping import Float32, Int16, Int64
 from infgen.clock import CLOCK
 from infgen.rollout.rollout import NEVER, Rollout
 from infgen.scene import Scene
-from infgen.tokens.presence import live, makes_a_move, seen_tokens
+from infgen.tokens.presence import has_motion, presence_states, seen_tokens
 from infgen.tokens.scene_tokens import Presence
 from infgen.tokens.settings import TokenSettings
 from infgen.tokens.tracks import read_paths
@@ -44,13 +44,13 @@ def logged_events(scene: Scene, settings: TokenSettings) -> Events:
     """
     paths = read_paths(scene, settings)
     seen = seen_tokens(paths.valid)
-    rows = np.flatnonzero(makes_a_move(seen))
-    presence = live(seen)
+    rows = np.flatnonzero(has_motion(seen))
+    presence = presence_states(seen)
     first = CLOCK.token_ending_at(scene.now) + 1
     away_m = paths.pose[:, 1:, :2] - paths.pose[paths.ego, 1:, :2]  # at tokens' ends
     distance_m = np.hypot(away_m[..., 0], away_m[..., 1])
     found = []
-    for state in (Presence.ENTERING, Presence.LEAVING):
+    for state in (Presence.INSERTED, Presence.REMOVED):
         agent, token = np.nonzero(presence[rows, first:] == state)
         found += [token.astype(np.int16), distance_m[rows[agent], first + token]]
     return Events(*found)

@@ -66,7 +66,7 @@ def from_log(scene: Scene, settings: TokenSettings) -> Traffic:
     """
     events = logged_events(scene, settings)
     tracks = scene.tracks
-    rows = np.flatnonzero((tracks.kind >= 0) & (tracks.kind < AgentType.OTHER))
+    rows = np.flatnonzero((tracks.agent_type >= 0) & (tracks.agent_type < AgentType.OTHER))
     valid = tracks.valid[rows]
     share = valid / np.maximum(1, valid.sum(axis=1, keepdims=True))
     size_lwh_m = np.einsum("as,asc->ac", share, tracks.size_lwh_m[rows])
@@ -82,7 +82,7 @@ def from_log(scene: Scene, settings: TokenSettings) -> Traffic:
             z_m=xyz_m[None, 2],
             heading_rad=tracks.heading_rad[None, rows],
             size_lwh_m=size_lwh_m.astype(np.float32),
-            kind=tracks.kind[rows],
+            kind=tracks.agent_type[rows],
             valid=valid[None],
         ),
         events=events,

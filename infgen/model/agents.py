@@ -27,7 +27,12 @@ from infgen.model.settings import ModelSettings
 from infgen.model.signal_features import LightAhead
 from infgen.scene import AgentType
 from infgen.tokens.grid import Grid
-from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
+from infgen.tokens.scene_tokens import (
+    FIRST_MOTION_TOKEN,
+    NO_CELL,
+    NO_MOTION_TOKEN,
+    Presence,
+)
 from infgen.tokens.vocabulary import MotionVocabulary
 
 NUM_PATTERNS = 1 << CLOCK.steps_per_token
@@ -51,7 +56,7 @@ class AgentRows:
         pose: Poses [row, 3].
         before: Poses half a second earlier [row, 3] ...
         known: ... and whether they were seen [row].
-        move: Codebook row, ``FIRST_MOVE`` or ``NO_MOVE`` [row].
+        move: Vocabulary row, ``FIRST_MOTION_TOKEN`` or ``NO_MOTION_TOKEN`` [row].
         presence: ``Presence`` [row].
         cell: Cell of the ego's grid, or ``NO_CELL`` [row].
         ego: Whether it is the ego [row].
@@ -73,7 +78,7 @@ class AgentTables:
     """Embeddings that depend on no scene.
 
     Attributes:
-        moves: Of every kind's moves, then ``FIRST_MOVE``, then ``NO_MOVE``.
+        moves: Of every kind's moves, then ``FIRST_MOTION_TOKEN``, then ``NO_MOTION_TOKEN``.
         cells: Of every cell, then ``NO_CELL``; None without a life cycle.
     """
 
@@ -91,13 +96,13 @@ class AgentEmbedding(nn.Module):
     centre_m: Tensor
 
     def __init__(
-        self, settings: ModelSettings, codebook: MotionVocabulary, grid: Grid
+        self, settings: ModelSettings, vocabulary: MotionVocabulary, grid: Grid
     ) -> None:
         super().__init__()
         width, life = settings.width, settings.insertion_and_removal
-        self.num_motion_tokens = codebook.num_motion_tokens
+        self.num_motion_tokens = vocabulary.num_motion_tokens
         self.num_cells = grid.num_cells
-        corners_m = torch.from_numpy(codebook.end_corners_m.copy())
+        corners_m = torch.from_numpy(vocabulary.end_corners_m.copy())
         self.register_buffer("corners_m", corners_m.flatten(2), persistent=False)
         centre_m = torch.from_numpy(grid.centre_m.copy())
         self.register_buffer("centre_m", centre_m, persistent=False)
@@ -124,8 +129,8 @@ class AgentEmbedding(nn.Module):
         """Embed agents: [N, D]."""
         move = agents.kind * self.num_motion_tokens + agents.move
         special = len(KINDS) * self.num_motion_tokens
-        move = torch.where(agents.move == FIRST_MOVE, special, move)
-        move = torch.where(agents.move == NO_MOVE, special + 1, move)
+        move = torch.where(agents.move == FIRST_MOTION_TOKEN, special, move)
+        move = torch.where(agents.move == NO_MOTION_TOKEN, special + 1, move)
         what = self.kind(agents.kind) + self.size(agents.size_lwh_m)
         if self.ego is not None:
             what = what + agents.ego[:, None] * self.ego
@@ -146,7 +151,7 @@ def _last_motion(agents: AgentRows) -> Tensor:
     away_m = agents.pose[:, :2] - agents.before[:, :2]
     length_m = away_m.square().sum(dim=-1).sqrt()
     turned_rad = direction(away_m, agents.pose[:, 2])
-    entering = agents.presence == Presence.ENTERING
+    entering = agents.presence == Presence.INSERTED
     length_m = torch.where(agents.known, length_m, UNKNOWN_M)
     length_m = torch.where(entering, ENTERING_M, length_m)
     turned_rad = torch.where(agents.known & ~entering, turned_rad, 0.0)
@@ -194,7 +199,7 @@ class MotionStack(nn.Module):
     """What every agent does next, all at once (SPEC 4.5)."""
 
     def __init__(
-        self, settings: ModelSettings, codebook: MotionVocabulary, token_s: float
+        self, settings: ModelSettings, vocabulary: MotionVocabulary, token_s: float
     ) -> None:
         super().__init__()
         width, bands = settings.width, settings.fourier_bands
@@ -215,8 +220,8 @@ class MotionStack(nn.Module):
             MotionBlock(settings) for _ in range(settings.motion_blocks)
         )
         shaped = settings.motion_feature_width
-        self.move = None if shaped else mlp(width, width, codebook.num_motion_tokens)
-        self.shaped = MoveHead(width, shaped, codebook) if shaped else None
+        self.move = None if shaped else mlp(width, width, vocabulary.num_motion_tokens)
+        self.shaped = MoveHead(width, shaped, vocabulary) if shaped else None
         leaves = settings.insertion_and_removal and settings.remove_token
         self.leave = mlp(width, width, 1) if leaves else None
         patterns = settings.validity_pattern_tokens

@@ -13,7 +13,7 @@ class MotionOutputs:
 
     Attributes:
         rows: The visible agents among [scene, token, agent].
-        move_logits: [row, move], by the codebook of the agent's kind.
+        move_logits: [row, move], by the vocabulary of the agent's kind.
         leave_logit: Log-odds that the next token is the agent's last [row].
         pattern_logits: When within the next token a log would show the agent [row, 32].
     """

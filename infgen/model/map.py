@@ -12,7 +12,7 @@ from infgen.model.neighbours import Around, Lamps, Reach, RoadFeatures
 from infgen.model.relations import Rows, relation_embedding
 from infgen.model.settings import ModelSettings
 from infgen.model.signal_features import StopLines
-from infgen.tokens.map import LineKind, PointKind
+from infgen.tokens.map import PointType, PolylineType
 from infgen.tokens.scene_tokens import SignalClass
 from infgen.tokens.signals import REMEMBERED
 from infgen.tokens.vocabulary import MapVocabulary
@@ -38,18 +38,18 @@ class RoadEncoder(nn.Module):
 
     curve_m: Tensor
 
-    def __init__(self, settings: ModelSettings, codebook: MapVocabulary) -> None:
+    def __init__(self, settings: ModelSettings, vocabulary: MapVocabulary) -> None:
         super().__init__()
         width = settings.width
         self.radius_m = settings.map_map_radius_m
         self.signals_each_step = settings.signals_each_step
         self.stop_lines = settings.signal_ahead_m > 0
         self.neighbours = settings.map_map_neighbours
-        curve_m = torch.from_numpy(codebook.curve_m.copy())
+        curve_m = torch.from_numpy(vocabulary.curve_m.copy())
         self.register_buffer("curve_m", curve_m, persistent=False)
-        self.curve = embedding_mlp(codebook.curve_m[0].size, width)
-        self.point_kind = nn.Embedding(len(PointKind), width)
-        self.line_kind = nn.Embedding(len(LineKind), width)
+        self.curve = embedding_mlp(vocabulary.curve_m[0].size, width)
+        self.point_type = nn.Embedding(len(PointType), width)
+        self.polyline_type = nn.Embedding(len(PolylineType), width)
         looks = len(SignalClass) + (REMEMBERED if self.signals_each_step else 0)
         self.signal = nn.Embedding(looks, width)
         self.relation = relation_embedding(self.radius_m, settings.fourier_bands, width)
@@ -57,7 +57,7 @@ class RoadEncoder(nn.Module):
             Attention(width, settings.heads, settings.dropout, bipartite=False)
             for _ in range(settings.map_blocks)
         )
-        self.next_token = mlp(width, width, codebook.num_map_tokens)
+        self.next_token = mlp(width, width, vocabulary.num_map_tokens)
 
     def look(self, roads: Roads) -> RoadSight:
         """Find who sees whom on the maps."""
@@ -113,8 +113,8 @@ class RoadEncoder(nn.Module):
         """What each road token is, by itself [row, D]."""
         shapes = self.curve(self.curve_m.flatten(1))  # [token, D]
         embedded: Tensor = gather(shapes, rows.pack(roads.token))
-        embedded = embedded + self.point_kind(rows.pack(roads.point_kind))
-        embedded = embedded + self.line_kind(rows.pack(roads.line_kind))
+        embedded = embedded + self.point_type(rows.pack(roads.point_type))
+        embedded = embedded + self.polyline_type(rows.pack(roads.polyline_type))
         if self.signals_each_step:
             return embedded
         return embedded + self.signal(rows.pack(roads.signal))

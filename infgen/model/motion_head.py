@@ -35,10 +35,10 @@ class MoveHead(nn.Module):
     waves: Tensor
 
     def __init__(
-        self, width: int, motion_feature_width: int, codebook: MotionVocabulary
+        self, width: int, motion_feature_width: int, vocabulary: MotionVocabulary
     ) -> None:
         super().__init__()
-        waves = torch.from_numpy(_waves(codebook.end_pose))
+        waves = torch.from_numpy(_waves(vocabulary.end_pose))
         self.register_buffer("waves", waves, persistent=False)
         self.shape = nn.Sequential(
             nn.Linear(waves.shape[-1], 2 * motion_feature_width),

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
-from infgen.tokens.motion_tokens import make_move_table
+from infgen.tokens.motion_tokens import make_match_table
 from infgen.tokens.vocabulary import MotionVocabulary
 
 _ROWS_AT_ONCE = 1024
@@ -19,7 +19,7 @@ _ROWS_AT_ONCE = 1024
 
 @dataclass(frozen=True, slots=True)
 class MoveEnds:
-    """Where the moves of a codebook end. Fields as in ``tokens.moves.MoveTable``.
+    """Where the moves of a vocabulary end. Fields as in ``tokens.moves.MatchTable``.
 
     Attributes:
         pose: In the frame of each move's start.
@@ -36,16 +36,16 @@ class MoveEnds:
     corners_m: Float64[Tensor, "3 move 8"]
 
     @classmethod
-    def of(cls, codebook: MotionVocabulary, device: torch.device) -> "MoveEnds":
-        """Lay a codebook out on a device."""
-        table = make_move_table(codebook)
-        pose = torch.from_numpy(codebook.end_pose.copy()).to(device)
+    def of(cls, vocabulary: MotionVocabulary, device: torch.device) -> "MoveEnds":
+        """Lay a vocabulary out on a device."""
+        table = make_match_table(vocabulary)
+        pose = torch.from_numpy(vocabulary.end_pose.copy()).to(device)
         reach_m = torch.from_numpy(table.reach_m).to(device).double()
         spread = _spread(pose.double(), reach_m[:, None])
         square = spread.square().sum(dim=-1, keepdim=True)
         return cls(
             pose=pose,
-            size_lw_m=torch.from_numpy(codebook.size_lw_m).to(device).double(),
+            size_lw_m=torch.from_numpy(vocabulary.size_lw_m).to(device).double(),
             reach_m=reach_m,
             weights=torch.cat([-2 * spread, square], dim=-1).transpose(1, 2),
             corners_m=torch.from_numpy(table.corners_m).to(device),
@@ -57,7 +57,7 @@ def nearest(
 ) -> Int64[Tensor, " row"]:
     """Find the move of all that ends nearest to each pose wanted (in its start's frame).
 
-    The same as ``tokens.moves.nearest_moves``: of equally near moves the first.
+    The same as ``tokens.moves.nearest_motion_tokens``: of equally near moves the first.
     """
     move = torch.empty_like(kind)
     for number in range(len(ends.pose)):

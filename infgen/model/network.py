@@ -35,7 +35,7 @@ EGO = 0
 class Network(nn.Module):
     """Roads, agents and newcomers in one network (SPEC 4).
 
-    It carries its codebooks, so weights on disk need nothing beside them.
+    It carries its vocabularies, so weights on disk need nothing beside them.
     """
 
     def __init__(
@@ -71,12 +71,12 @@ class Network(nn.Module):
         """Cells and heading bins that entries are told in."""
         return make_grid(self.grid_settings)
 
-    def motion_codebook(self) -> MotionVocabulary:
+    def motion_vocabulary(self) -> MotionVocabulary:
         """Return the moves that motion logits choose from."""
         names = ("motion_size_lw_m", "motion_path", "motion_real")
         return MotionVocabulary(*(self.get_buffer(n).numpy(force=True) for n in names))
 
-    def road_codebook(self) -> MapVocabulary:
+    def map_vocabulary(self) -> MapVocabulary:
         """Return the shapes of road tokens."""
         names = ("road_curve_m", "road_real")
         return MapVocabulary(*(self.get_buffer(n).numpy(force=True) for n in names))

@@ -11,12 +11,12 @@ second ``c`` of a closed loop::
     while some rollout goes on:
         query = stepper.entry_query(entries)         # add?  which cell?
         details = stepper.entry_details(entries, cell)   # kind; the rest given the kind
-        column = (column with newcomers as rows: ENTERING, FIRST_MOVE, observed=False)
-        entries = stepper.entry_add(entries, column)
+        column = (column with newcomers as rows: INSERTED, FIRST_MOTION_TOKEN,
+        observed=False) entries = stepper.entry_add(entries, column)
     motion = stepper.motion_step(memory, column)     # next move, leaving next?
 
 Dims: ``rollout`` is any mix of scenes and rollouts of them, ``row`` the places for agents.
-Row 0 is always the ego. A row that is ABSENT costs nothing. A row that is ENTERING starts
+Row 0 is always the ego. A row that is ABSENT costs nothing. A row that is INSERTED starts
 with an empty past, so a freed row can be given to a newcomer as it is.
 """
 
@@ -201,7 +201,7 @@ class Stepper:
         motion = self.network.motion
         visible = column.visible
         rows = Rows.where(visible)
-        memory.visible &= (column.presence != Presence.ENTERING)[..., None]
+        memory.visible &= (column.presence != Presence.INSERTED)[..., None]
         x = self._embed(*memory.last(), column, rows)
         sight = self._sight(memory, column, rows)
         x = x if sight.light is None else x + sight.light
@@ -339,7 +339,7 @@ class Stepper:
         if ground is None:
             return None
         row = torch.arange(column.presence.numel(), device=column.pose.device)
-        there = column.visible & (column.presence != Presence.ENTERING)
+        there = column.visible & (column.presence != Presence.INSERTED)
         features = entries.raw.flatten(0, 1)
         lying = Lying(features, row.view_as(column.presence), column.pose, there)
         roads = Lying.roads(entries.map, entries.scene)

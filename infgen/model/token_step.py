@@ -20,8 +20,9 @@ class Column:
         kind: ``AgentType``.
         size_lwh_m: Boxes.
         pose: Quantised x, y, heading (world frame of the scene).
-        move: Move that led here, ``FIRST_MOVE`` where entering, else ``NO_MOVE``.
-        presence: ``Presence``. LEAVING is the last column of an agent.
+        move: Move that led here, ``FIRST_MOTION_TOKEN`` where entering, else
+            ``NO_MOTION_TOKEN``.
+        presence: ``Presence``. REMOVED is the last column of an agent.
         observed: False where absent, unseen or entering (as ``SceneTokens.observed``).
         cell: Cell of the ego's grid that holds the agent, or ``NO_CELL``.
     """
@@ -37,7 +38,7 @@ class Column:
     @property
     def visible(self) -> Bool[Tensor, "rollout row"]:
         """Who can be seen: who is observed, or just entering."""
-        return self.observed | (self.presence == Presence.ENTERING)
+        return self.observed | (self.presence == Presence.INSERTED)
 
     def take(self, rollouts: Int64[Tensor, " kept"]) -> "Column":
         """Go on with some rollouts only."""
@@ -57,12 +58,12 @@ class MotionStep:
 
     @property
     def move_logits(self) -> Float32[Tensor, "rollout row move"]:
-        """Next move, by the row's own kind's codebook."""
+        """Next move, by the row's own kind's vocabulary."""
         return self.packed.rows.spread(self.packed.move_logits)
 
     @property
     def leave_logit(self) -> Float32[Tensor, "rollout row"] | None:
-        """Log-odds that the next token is the agent's last (LEAVING)."""
+        """Log-odds that the next token is the agent's last (REMOVED)."""
         logit = self.packed.leave_logit
         return None if logit is None else self.packed.rows.spread(logit)
 

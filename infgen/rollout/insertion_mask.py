@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, Int64
 from infgen.geometry import boxes_overlap, to_world
 from infgen.rollout.population import EGO_ROW, Newcomers, Population, entry_pose
 from infgen.scene import AgentType
-from infgen.tokens.map import LineKind
+from infgen.tokens.map import PolylineType
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
@@ -104,8 +104,8 @@ def make_room(
 
 def _lanes(tokens: SceneTokens, roads: MapVocabulary) -> tuple[np.ndarray, np.ndarray]:
     """First points of a map's lane tokens, and the way to their last points."""
-    rows = tokens.road_line_kind == LineKind.LANE
-    end_m = roads.curve_m[tokens.road_token[rows], -1]
+    rows = tokens.map_polyline_type == PolylineType.LANE
+    end_m = roads.curve_m[tokens.map_token[rows], -1]
     end = np.pad(end_m, ((0, 0), (0, 1)))
-    pose = tokens.road_pose[rows]
+    pose = tokens.map_pose[rows]
     return pose[:, :2], to_world(end, pose)[:, :2] - pose[:, :2]

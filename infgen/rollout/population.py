@@ -15,7 +15,12 @@ from jaxtyping import Bool, Float32, Int8, Int16, Int32, Int64
 from infgen.geometry import to_world, wrap_angle
 from infgen.rollout.recording import NOBODY, Start
 from infgen.tokens.grid import Grid, encode_cell, from_grid, to_grid
-from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
+from infgen.tokens.scene_tokens import (
+    FIRST_MOTION_TOKEN,
+    NO_CELL,
+    NO_MOTION_TOKEN,
+    Presence,
+)
 from infgen.tokens.vocabulary import MotionVocabulary
 
 EGO_ROW = 0
@@ -31,7 +36,8 @@ class Population:
         kind: ``AgentType``.
         size_lwh_m: Boxes.
         pose: x, y, heading in the scene's frame.
-        move: Move that led here, ``FIRST_MOVE`` where entering, else ``NO_MOVE``.
+        move: Move that led here, ``FIRST_MOTION_TOKEN`` where entering, else
+            ``NO_MOTION_TOKEN``.
         presence: ``Presence``; ``ABSENT`` in a free row.
         observed: False where absent, entering, or (in the history) not seen by the log.
     """
@@ -153,10 +159,10 @@ def _settle_at(starts: Sequence[Start], rows: int, token: int) -> Population:
         place = slice(0, len(order))
         empty.life[at, place] = order
         empty.born[at] = len(order)
-        empty.kind[at, place] = history.kind[order]
+        empty.kind[at, place] = history.agent_type[order]
         empty.size_lwh_m[at, place] = history.size_lwh_m[order]
         empty.pose[at, place] = history.pose[order, token]
-        empty.move[at, place] = history.move[order, token]
+        empty.move[at, place] = history.motion_token[order, token]
         empty.presence[at, place] = history.presence[order, token]
         empty.observed[at, place] = history.observed[order, token]
         if token == history.now:
@@ -181,7 +187,7 @@ def _empty(rollouts: int, rows: int) -> Population:
         kind=np.zeros(shape, dtype=np.int8),
         size_lwh_m=np.zeros((*shape, 3), dtype=np.float32),
         pose=np.zeros((*shape, 3), dtype=np.float32),
-        move=np.full(shape, NO_MOVE, dtype=np.int16),
+        move=np.full(shape, NO_MOTION_TOKEN, dtype=np.int16),
         presence=np.zeros(shape, dtype=np.int8),
         observed=np.zeros(shape, dtype=bool),
     )
@@ -191,7 +197,7 @@ def move_on(
     population: Population,
     move: Int64[np.ndarray, "rollout row"],
     leave: Bool[np.ndarray, "rollout row"],
-    codebook: MotionVocabulary,
+    vocabulary: MotionVocabulary,
 ) -> tuple[Population, Float32[np.ndarray, "rollout row 5 3"]]:
     """Move everyone by half a second; whoever was leaving is gone, its row free.
 
@@ -199,24 +205,24 @@ def move_on(
         population: At the end of a half second.
         move: Next move of each row.
         leave: Rows whose agent will be there for the last time. The ego never is.
-        codebook: The moves.
+        vocabulary: The moves.
 
     Returns:
         The population at the end of the next half second, and the poses
         [rollout, row, 5, 3] on the way there.
     """
-    gone = population.presence == Presence.LEAVING
+    gone = population.presence == Presence.REMOVED
     there = (population.presence != Presence.ABSENT) & ~gone
     leave = leave & there
     leave[:, EGO_ROW] = False
-    steps = codebook.path[population.kind, move][:, :, 1:]
+    steps = vocabulary.path[population.kind, move][:, :, 1:]
     path = to_world(steps, population.pose[:, :, None]) * there[..., None, None]
-    presence = np.where(leave, Presence.LEAVING, Presence.PRESENT) * there
+    presence = np.where(leave, Presence.REMOVED, Presence.PRESENT) * there
     moved = replace(
         population,
         life=np.where(there, population.life, NOBODY).astype(np.int32),
         pose=path[:, :, -1],
-        move=np.where(there, move, NO_MOVE).astype(np.int16),
+        move=np.where(there, move, NO_MOTION_TOKEN).astype(np.int16),
         presence=presence.astype(np.int8),
         observed=there,
     )
@@ -235,7 +241,7 @@ def leave_beyond(before: Population, moved: Population, radius_m: float) -> Popu
     """
     leaves = (_ego_distance_m(moved) > radius_m) & (_ego_distance_m(before) <= radius_m)
     leaves &= moved.presence == Presence.PRESENT
-    presence = np.where(leaves, np.int8(Presence.LEAVING), moved.presence)
+    presence = np.where(leaves, np.int8(Presence.REMOVED), moved.presence)
     return replace(moved, presence=presence)
 
 
@@ -264,8 +270,8 @@ def enter(
     new.kind[rollout, row] = newcomers.kind[rollout]
     new.size_lwh_m[rollout, row] = newcomers.size_lwh_m[rollout]
     new.pose[rollout, row] = entry_pose(population.pose[:, EGO_ROW], newcomers)[rollout]
-    new.move[rollout, row] = FIRST_MOVE
-    new.presence[rollout, row] = Presence.ENTERING
+    new.move[rollout, row] = FIRST_MOTION_TOKEN
+    new.presence[rollout, row] = Presence.INSERTED
     new.observed[rollout, row] = False
     rows = np.full(len(fits), -1, dtype=np.int64)
     rows[rollout] = row

@@ -15,7 +15,7 @@ from infgen.rollout.heights import ground_z_m
 from infgen.rollout.rollout import NEVER, Rollout
 from infgen.scene import Scene
 from infgen.tokens.scene_tokens import SceneTokens
-from infgen.tokens.signals import Lights
+from infgen.tokens.signals import LoggedSignals
 
 NOBODY = -1
 """Life of a free row."""
@@ -65,7 +65,7 @@ class Start:
     history: SceneTokens
     index: int
     seed: int
-    lights: Lights | None = None
+    lights: LoggedSignals | None = None
 
     @property
     def logged_row(self) -> Int32[np.ndarray, " agent"]:
@@ -146,7 +146,7 @@ def _write_history(lives: _Lives, start: Start) -> None:
     lives.there[:logged, span] = lives.valid[:logged, span] = seen
     lives.pose[:logged, span, :2] = tracks.xyz_m[rows, span, :2] * seen[..., None]
     lives.pose[:logged, span, 2] = tracks.heading_rad[rows, span] * seen
-    lives.kind[:logged] = start.history.kind
+    lives.kind[:logged] = start.history.agent_type
     lives.size_lwh_m[:logged] = start.history.size_lwh_m
     lives.entry_step[:logged] = seen.argmax(axis=1)
 
@@ -220,7 +220,7 @@ def _ground_at_knots(start: Start, lives: _Lives) -> Float32[np.ndarray, "life k
     history, there = start.history, lives.there[:, knots]
     ground_m = np.zeros(there.shape, dtype=np.float32)
     xy_m = lives.pose[:, knots, :2][there]
-    ground_m[there] = ground_z_m(xy_m, history.road_pose[:, :2], history.road_z_m)
+    ground_m[there] = ground_z_m(xy_m, history.map_pose[:, :2], history.map_z_m)
     # Hold the last known height after an exit, the first known one before an entry.
     last = np.maximum.accumulate(np.where(there, np.arange(len(knots)), -1), axis=1)
     held = np.where(last < 0, there.argmax(axis=1)[:, None], last)

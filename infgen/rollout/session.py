@@ -42,7 +42,7 @@ from infgen.rollout.rules.rejection import look_out
 from infgen.rollout.rules.stalls import Patience
 from infgen.rollout.sampling import choose, happens
 from infgen.rollout.simulator import Player
-from infgen.tokens.motion_tokens import follow, make_move_table
+from infgen.tokens.motion_tokens import follow, make_match_table
 from infgen.tokens.scene_tokens import Presence
 
 
@@ -79,11 +79,11 @@ class Session:
             player.stepper.motion_step(self._memory, player.column(population))
         self.population = history[-1]
         self.token = starts[0].history.now
-        self._table = make_move_table(player.codebook)
+        self._table = make_match_table(player.vocabulary)
         self._lookout = look_out(
-            starts, player.codebook, reject_off_road=player.settings.reject_off_road
+            starts, player.vocabulary, reject_off_road=player.settings.reject_off_road
         )
-        self._standing = player.tensor(player.codebook.standing)
+        self._standing = player.tensor(player.vocabulary.stationary)
         self._driven_to: np.ndarray | None = None
 
     @property
@@ -100,7 +100,7 @@ class Session:
         Args:
             ego_pose: Where the ego drives, in the scene's frame: its pose [3] at the end of
                 the half second, or at each of its five steps [5, 3]. For a batch with the
-                rollouts as first dimension. The network sees it as moves of its codebook,
+                rollouts as first dimension. The network sees it as moves of its vocabulary,
                 each of which makes up for what the last one left out. None lets the network
                 drive.
         """
@@ -119,7 +119,7 @@ class Session:
             life=moved.life,
             path=paths,
             shown=self._shown(before, moved, said, token),
-            leaving=moved.presence == Presence.LEAVING,
+            leaving=moved.presence == Presence.REMOVED,
             born=np.where(after.life != moved.life, after.life, np.int32(NOBODY)),
             kind=after.kind,
             size_lwh_m=after.size_lwh_m,
@@ -180,7 +180,7 @@ class Session:
         driven = np.zeros(move.shape, dtype=bool)
         driven[:, EGO_ROW] = ego_path is not None
         move = self._take_care(before, said, token, move, driven)
-        moved, path = move_on(before, move, leave, player.codebook)
+        moved, path = move_on(before, move, leave, player.vocabulary)
         if settings.removes and settings.removal_radius_m:
             moved = leave_beyond(before, moved, settings.removal_radius_m)
         if ego_path is not None:
@@ -258,7 +258,7 @@ class Session:
         if self._patience is None:
             return move
         stalled = self._patience.stalled(before, token - 1)
-        stalled &= self._player.codebook.standing[before.kind, move]
+        stalled &= self._player.vocabulary.stationary[before.kind, move]
         if not stalled.any():
             return move
         attempt = (
@@ -309,8 +309,8 @@ class Session:
         pattern = packed.rows.spread(drawn).cpu().numpy()
         shown &= (pattern[..., None] >> np.arange(steps) & 1).astype(bool)
         shown[:, EGO_ROW] = True
-        shown[..., 0] |= before.presence == Presence.ENTERING
-        shown[..., -1] |= moved.presence == Presence.LEAVING
+        shown[..., 0] |= before.presence == Presence.INSERTED
+        shown[..., -1] |= moved.presence == Presence.REMOVED
         return shown
 
 
@@ -356,7 +356,7 @@ def _begin(
     if settings.insertion_mask:
         room = make_room(
             histories,
-            (player.codebook, player.roads),
+            (player.vocabulary, player.roads),
             scene,
             settings.insertion_lane_distance_m,
         )

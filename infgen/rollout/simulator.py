@@ -23,7 +23,7 @@ class Player:
 
     Attributes:
         stepper: The network, ready to be played.
-        codebook: Its moves.
+        vocabulary: Its moves.
         roads: Its road tokens.
         tokens: How histories are tokenized for it.
         settings: Length, sampling and caps.
@@ -31,7 +31,7 @@ class Player:
     """
 
     stepper: Stepper
-    codebook: MotionVocabulary
+    vocabulary: MotionVocabulary
     roads: MapVocabulary
     tokens: TokenSettings
     settings: RolloutSettings

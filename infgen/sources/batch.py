@@ -19,7 +19,7 @@ from infgen.sources import wire
 from infgen.sources.wire import BYTES, FIXED32, FIXED64, VARINT, Field, Spans, WireError
 
 _MAX_LAYOUTS = 32
-_DECIDES = {VARINT: 0x80, FIXED32: 0, FIXED64: 0, BYTES: 0}
+_LAYOUT_BITS = {VARINT: 0x80, FIXED32: 0, FIXED64: 0, BYTES: 0}
 """Bits of a value's bytes, by wire type, that decide where the next field starts."""
 
 _TYPES: dict[int, np.dtype[Any]] = {
@@ -143,7 +143,7 @@ def _same_layout(
     """Compare with the first row every bit that decides where values lie."""
     mask = np.full(bodies.shape[1], 0xFF, np.uint8)
     for field in fields:
-        mask[field.start - at : field.end - at] = _DECIDES.get(field.tag & 7, 0xFF)
+        mask[field.start - at : field.end - at] = _LAYOUT_BITS.get(field.tag & 7, 0xFF)
     decides = np.flatnonzero(mask)
     differ = (bodies[:, decides] ^ bodies[0, decides]) & mask[decides]
     return ~differ.any(axis=1)

@@ -37,10 +37,10 @@ def iter_scenes(url: str | Path) -> Iterator[Scene | BadRecord]:
         OSError: if the file cannot be opened or read.
     """
     for record in iter_records(url):
-        yield record if isinstance(record, BadRecord) else scene_or_fault(record)
+        yield record if isinstance(record, BadRecord) else scene_or_bad_record(record)
 
 
-def scene_or_fault(record: Record) -> Scene | BadRecord:
+def scene_or_bad_record(record: Record) -> Scene | BadRecord:
     """Decode one record; one that is no usable scene comes back with the reason."""
     try:
         return decode_scene(record.data)

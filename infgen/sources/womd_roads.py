@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from infgen.scene import (
-    FeatureKind,
+    FeatureType,
     LaneType,
-    LinkKind,
+    LinkType,
     RoadEdgeType,
     RoadLineType,
     RoadMap,
@@ -24,24 +24,24 @@ from infgen.sources.wire import BYTES, FIXED64, VARINT, Field, Spans, WireError,
 POINT = {"x": tag(1, FIXED64), "y": tag(2, FIXED64), "z": tag(3, FIXED64)}
 
 _ID = tag(1, VARINT)
-_KINDS = {tag(kind, BYTES): kind for kind in FeatureKind}
-_POLYLINES = (FeatureKind.LANE, FeatureKind.ROAD_LINE, FeatureKind.ROAD_EDGE)
+_FEATURE_TYPES = {tag(kind, BYTES): kind for kind in FeatureType}
+_POLYLINES = (FeatureType.LANE, FeatureType.ROAD_LINE, FeatureType.ROAD_EDGE)
 _POINTS = {
-    FeatureKind.LANE: tag(8, BYTES),
-    FeatureKind.ROAD_LINE: tag(2, BYTES),
-    FeatureKind.ROAD_EDGE: tag(2, BYTES),
-    FeatureKind.STOP_SIGN: tag(2, BYTES),
-    FeatureKind.CROSSWALK: tag(1, BYTES),
-    FeatureKind.SPEED_BUMP: tag(1, BYTES),
-    FeatureKind.DRIVEWAY: tag(1, BYTES),
+    FeatureType.LANE: tag(8, BYTES),
+    FeatureType.ROAD_LINE: tag(2, BYTES),
+    FeatureType.ROAD_EDGE: tag(2, BYTES),
+    FeatureType.STOP_SIGN: tag(2, BYTES),
+    FeatureType.CROSSWALK: tag(1, BYTES),
+    FeatureType.SPEED_BUMP: tag(1, BYTES),
+    FeatureType.DRIVEWAY: tag(1, BYTES),
 }
-_TYPES = {
-    FeatureKind.LANE: (tag(2, VARINT), max(LaneType)),
-    FeatureKind.ROAD_LINE: (tag(1, VARINT), max(RoadLineType)),
-    FeatureKind.ROAD_EDGE: (tag(1, VARINT), max(RoadEdgeType)),
+_SUBTYPES = {
+    FeatureType.LANE: (tag(2, VARINT), max(LaneType)),
+    FeatureType.ROAD_LINE: (tag(1, VARINT), max(RoadLineType)),
+    FeatureType.ROAD_EDGE: (tag(1, VARINT), max(RoadEdgeType)),
 }
 _SPEED_LIMIT, _INTERPOLATING = tag(1, FIXED64), tag(3, VARINT)
-_LINKS = {LinkKind.ENTRY: 9, LinkKind.EXIT: 10}
+_LINKS = {LinkType.ENTRY: 9, LinkType.EXIT: 10}
 _NEIGHBOURS = {tag(11, BYTES): Side.LEFT, tag(12, BYTES): Side.RIGHT}
 _BOUNDARIES = {tag(13, BYTES): Side.LEFT, tag(14, BYTES): Side.RIGHT}
 _NEIGHBOUR_BOUNDARY = tag(6, BYTES)
@@ -77,7 +77,7 @@ def read_road_map(
 ) -> RoadMap:
     """Decode all map features of a record, points in metres around an origin.
 
-    Features of kinds that ``FeatureKind`` does not know are passed over.
+    Features of kinds that ``FeatureType`` does not know are passed over.
 
     Raises:
         WireError: if a message is not sound.
@@ -92,8 +92,8 @@ def read_road_map(
     offsets = np.array([*starts, tables.point_spans.total], np.int64)
     road_map = RoadMap(
         feature_id=np.array(ids, np.int64),
-        feature_kind=np.array(kinds, np.int8),
-        feature_type=np.array(types, np.int8),
+        feature_type=np.array(kinds, np.int8),
+        feature_subtype=np.array(types, np.int8),
         speed_limit_mph=_speeds(speeds),
         interpolating=np.array(interpolating, bool),
         point_offsets=offsets,
@@ -121,27 +121,27 @@ def read_points(
 
 def _read_feature(data: bytes, feature: Field, tables: _Tables) -> None:
     fields = wire.walk(data, feature.start, feature.end)
-    parts = [field for field in fields if field.tag in _KINDS]
+    parts = [field for field in fields if field.tag in _FEATURE_TYPES]
     if len(parts) > 1:
         raise WireError(f"map feature at byte {feature.start} is of two kinds")
     if not parts:
         return
     (part,) = parts
-    feature_id, kind = wire.signed(wire.last(fields, _ID)), _KINDS[part.tag]
+    feature_id, kind = wire.signed(wire.last(fields, _ID)), _FEATURE_TYPES[part.tag]
     start = tables.point_spans.total
     inner = wire.split(data, part.start, part.end, _POINTS[kind], tables.point_spans)
-    kind_type, speed_mph, interpolating = 0, 0.0, False
-    if kind in _TYPES:
-        kind_type = wire.last_enum(inner, *_TYPES[kind])
-    if kind is FeatureKind.LANE:
+    subtype, speed_mph, interpolating = 0, 0.0, False
+    if kind in _SUBTYPES:
+        subtype = wire.last_enum(inner, *_SUBTYPES[kind])
+    if kind is FeatureType.LANE:
         speed_mph = _last_double(data, inner, _SPEED_LIMIT)
         interpolating = wire.last(inner, _INTERPOLATING) != 0
         _read_lane(data, feature_id, inner, tables)
-    if kind is FeatureKind.STOP_SIGN:
+    if kind is FeatureType.STOP_SIGN:
         if tables.point_spans.total - start > 1:
             raise WireError(f"stop sign {feature_id} has two positions")
         tables.sign += [(feature_id, lane) for lane in wire.varints(data, inner, 1)]
-    tables.feature.append((feature_id, kind, kind_type, speed_mph, interpolating, start))
+    tables.feature.append((feature_id, kind, subtype, speed_mph, interpolating, start))
 
 
 def _read_lane(data: bytes, lane: int, fields: list[Field], tables: _Tables) -> None:
@@ -171,7 +171,7 @@ def _links(tables: _Tables) -> dict[str, np.ndarray]:
     lanes, kinds, others = _columns(tables.link, 3)
     return {
         "link_lane_id": np.array(lanes, np.int64),
-        "link_kind": np.array(kinds, np.int8),
+        "link_type": np.array(kinds, np.int8),
         "link_other_id": np.array(others, np.int64),
     }
 
@@ -237,7 +237,7 @@ def _check(road_map: RoadMap) -> None:
         row = _feature_of(road_map, int(np.argmin(finite)))
         raise RecordError(f"map feature {ids[row]} has a point that is not finite")
     lengths = np.diff(road_map.point_offsets)
-    lines = np.isin(road_map.feature_kind, _POLYLINES)
+    lines = np.isin(road_map.feature_type, _POLYLINES)
     if (empty := lines & (lengths == 0)).any():
         raise RecordError(f"polyline {ids[np.argmax(empty)]} has no points")
     flat = lines & (lengths > 1) & ~_moves(road_map)

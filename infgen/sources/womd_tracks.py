@@ -56,7 +56,7 @@ class WorldTracks:
         zero_m = (-origin_xyz_m).astype(np.float32)
         return Tracks(
             id=self.id,
-            kind=_kinds(self.type),
+            agent_type=_agent_types(self.type),
             xyz_m=self._finite(local_m, "position", zero_m),
             heading_rad=self._finite(self.heading_rad, "heading"),
             velocity_mps=self._finite(self.velocity_mps, "velocity"),
@@ -132,7 +132,7 @@ def origin_near(tracks: WorldTracks, ego: int, now: int) -> Float64[np.ndarray, 
     return np.round(xyz_m) + 0.0  # No negative zeros.
 
 
-def _kinds(types: Int32[np.ndarray, " agent"]) -> np.ndarray:
+def _agent_types(types: Int32[np.ndarray, " agent"]) -> np.ndarray:
     """Turn WOMD's object types into ``AgentType``: less one; the unset ones are other."""
     return np.where(types == 0, AgentType.OTHER, types - 1).astype(np.int8)
 

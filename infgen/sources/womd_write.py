@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from infgen.scene import FeatureKind, LinkKind, RoadMap, Scene, Side, Signals, Tracks
+from infgen.scene import FeatureType, LinkType, RoadMap, Scene, Side, Signals, Tracks
 from infgen.sources.tfrecord import frame
 from infgen.sources.wire import BYTES, FIXED32, FIXED64, VARINT
 from infgen.sources.wire_write import double, integer, key, message, varint
@@ -39,7 +39,7 @@ _STATE: _Fields = {
     "velocity_y": (10, FIXED32),
     "valid": (11, VARINT),
 }
-_UNSEEN = b"\x58\x00"
+_INVALID_STATE = b"\x58\x00"
 """The message of a state that says ``valid: false`` and nothing else."""
 
 
@@ -80,7 +80,7 @@ def tfrecord(records: Iterable[bytes], *, zipped: bool) -> bytes:
 
 
 def _tracks(tracks: Tracks, origin_xyz_m: Float64[np.ndarray, "3"]) -> bytes:
-    kinds = tracks.kind.astype(int) + 1
+    kinds = tracks.agent_type.astype(int) + 1
     states = _states(tracks, origin_xyz_m)
     blank = _bytes_of(_rows(_STATE, **dict.fromkeys(_STATE, np.zeros(1))))
     unseen = (_bytes_of(states) == blank).all(axis=-1)  # [agent, step]
@@ -89,7 +89,7 @@ def _tracks(tracks: Tracks, origin_xyz_m: Float64[np.ndarray, "3"]) -> bytes:
         zip(tracks.id.tolist(), kinds.tolist(), strict=True)
     ):
         written = [
-            message(3, _UNSEEN if skip else state.tobytes())
+            message(3, _INVALID_STATE if skip else state.tobytes())
             for state, skip in zip(states[row], unseen[row].tolist(), strict=True)
         ]
         parts.append(message(2, integer(1, track) + integer(2, kind) + b"".join(written)))
@@ -161,7 +161,7 @@ def _map_features(road_map: RoadMap, origin_xyz_m: np.ndarray) -> bytes:
     tables = _Tables(road_map)
     parts = []
     for row, (feature, kind) in enumerate(
-        zip(road_map.feature_id.tolist(), road_map.feature_kind.tolist(), strict=True)
+        zip(road_map.feature_id.tolist(), road_map.feature_type.tolist(), strict=True)
     ):
         points_m = xyz_m[road_map.point_offsets[row] : road_map.point_offsets[row + 1]]
         body = _feature(road_map, tables, row, points_m)
@@ -170,12 +170,12 @@ def _map_features(road_map: RoadMap, origin_xyz_m: np.ndarray) -> bytes:
 
 
 def _feature(road_map: RoadMap, tables: "_Tables", row: int, points_m: np.ndarray) -> bytes:
-    kind = FeatureKind(road_map.feature_kind[row])
-    if kind == FeatureKind.LANE:
+    kind = FeatureType(road_map.feature_type[row])
+    if kind == FeatureType.LANE:
         return _lane(road_map, tables, row, points_m)
-    if kind in (FeatureKind.ROAD_LINE, FeatureKind.ROAD_EDGE):
-        return integer(1, int(road_map.feature_type[row])) + _points(2, points_m)
-    if kind == FeatureKind.STOP_SIGN:
+    if kind in (FeatureType.ROAD_LINE, FeatureType.ROAD_EDGE):
+        return integer(1, int(road_map.feature_subtype[row])) + _points(2, points_m)
+    if kind == FeatureType.STOP_SIGN:
         lanes = road_map.sign_lane_id[tables.signs.get(int(road_map.feature_id[row]), [])]
         return b"".join(integer(1, lane) for lane in lanes.tolist()) + _points(2, points_m)
     return _points(1, points_m)
@@ -187,7 +187,7 @@ class _Tables:
     def __init__(self, road_map: RoadMap) -> None:
         own = np.where(road_map.boundary_neighbour < 0, road_map.boundary_lane_id, -1)
         links = zip(
-            road_map.link_lane_id.tolist(), road_map.link_kind.tolist(), strict=True
+            road_map.link_lane_id.tolist(), road_map.link_type.tolist(), strict=True
         )
         sides = zip(
             road_map.neighbour_lane_id.tolist(),
@@ -215,11 +215,11 @@ def _lane(road_map: RoadMap, tables: _Tables, row: int, points_m: np.ndarray) ->
     lane = int(road_map.feature_id[row])
     parts = [
         double(1, float(road_map.speed_limit_mph[row])),
-        integer(2, int(road_map.feature_type[row])),
+        integer(2, int(road_map.feature_subtype[row])),
         integer(3, int(road_map.interpolating[row])),
         _points(8, points_m),
     ]
-    for number, link in ((9, LinkKind.ENTRY), (10, LinkKind.EXIT)):
+    for number, link in ((9, LinkType.ENTRY), (10, LinkType.EXIT)):
         others = road_map.link_other_id[tables.links.get((lane, link), [])]
         parts += [integer(number, other) for other in others.tolist()]
     for number, side in ((11, Side.LEFT), (12, Side.RIGHT)):

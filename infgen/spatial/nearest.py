@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int64
 
-CELLS_M = (24.0, 4.0)
+CELL_WIDTHS_M = (24.0, 4.0)
 """Width of a cell, coarse to fine."""
 SLACK_M = 0.05
 """Added to every bound, so that float32 rounding cannot prune the nearest."""
@@ -36,13 +36,13 @@ def nearest_by_cells(
     The place on a segment is found in the plane, the distance to it in space.
     """
     segments = np.ascontiguousarray(np.concatenate([start_m, along_m], axis=1).T)
-    change = _most_change(along_m)
+    change = _distance_slope(along_m)
     known = Candidates(np.array([0, len(start_m)]), np.arange(len(start_m)))
     group = np.zeros(len(points_m), dtype=np.int64)
-    for width_m in CELLS_M:
+    for width_m in CELL_WIDTHS_M:
         parent, group = group, _cells(points_m, width_m, group)
         middle_m, radius_m, above = _bounds(points_m, group, parent)
-        known = _narrow(middle_m, radius_m, above, known, segments, change)
+        known = _prune(middle_m, radius_m, above, known, segments, change)
     return _first_nearest(points_m, group, known, segments)
 
 
@@ -68,7 +68,7 @@ def _bounds(
     return middle_m, radius_m, parent[order][first]
 
 
-def _most_change(along_m: np.ndarray) -> Float32[np.ndarray, " segment"]:
+def _distance_slope(along_m: np.ndarray) -> Float32[np.ndarray, " segment"]:
     """By how much the distance to a segment changes at most, per metre that one goes.
 
     The place on it is found in the plane: it moves up and down with its slope, beside the
@@ -79,7 +79,7 @@ def _most_change(along_m: np.ndarray) -> Float32[np.ndarray, " segment"]:
     return (slope + np.sqrt(slope * slope + 4)) / 2
 
 
-def _narrow(
+def _prune(
     middle_m: np.ndarray,
     radius_m: np.ndarray,
     parent: np.ndarray,

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from infgen.scene import FeatureKind, Scene
+from infgen.scene import FeatureType, Scene
 from infgen.spatial.nearest import nearest_by_cells
 
-STRETCH_Z = np.float32(3.0)
+HEIGHT_SCALE = np.float32(3.0)
 """Heights weigh this much more when the nearest segment is chosen."""
-CLOSED_M2 = np.float32(1.0)
+CLOSED_GAP_M2 = np.float32(1.0)
 """Squared distance of first and last point below which an edge is closed."""
 NONE = -1
 
@@ -44,7 +44,7 @@ class RoadEdges:
     after: Int32[np.ndarray, " segment"]
 
 
-def build_edges(polylines_m: Sequence[Float32[np.ndarray, "_ 3"]]) -> RoadEdges:
+def build_road_edges(polylines_m: Sequence[Float32[np.ndarray, "_ 3"]]) -> RoadEdges:
     """Cut road edges into segments. Edges of one point are left out.
 
     Raises:
@@ -56,7 +56,7 @@ def build_edges(polylines_m: Sequence[Float32[np.ndarray, "_ 3"]]) -> RoadEdges:
     longest = max(len(line_m) for line_m in lines_m)
     starts, alongs, neighbours, first = [], [], [], 0
     for line_m in lines_m:
-        stretched_m = line_m * np.array([1, 1, STRETCH_Z], dtype=np.float32)
+        stretched_m = line_m * np.array([1, 1, HEIGHT_SCALE], dtype=np.float32)
         starts.append(stretched_m[:-1])
         alongs.append(stretched_m[1:] - stretched_m[:-1])
         neighbours.append(_neighbours(line_m, first, closable=len(line_m) == longest))
@@ -75,30 +75,30 @@ def _neighbours(
     """Segments before and after each of one edge, whose first segment is ``first``."""
     rows = np.arange(first, first + len(line_m) - 1, dtype=np.int32)
     before, after = np.roll(rows, 1), np.roll(rows, -1)
-    closed = closable and ((line_m[0] - line_m[-1]) ** 2).sum() < CLOSED_M2
+    closed = closable and ((line_m[0] - line_m[-1]) ** 2).sum() < CLOSED_GAP_M2
     if not closed:
         before[0] = after[-1] = NONE
     return before, after
 
 
-def edges_of(scene: Scene, *, flat: bool = False) -> RoadEdges | None:
+def scene_road_edges(scene: Scene, *, flat: bool = False) -> RoadEdges | None:
     """Road edges of a scene, in its own frame; None if it has none.
 
     Args:
         scene: Whose map it is.
         flat: Lay all of them on the ground.
     """
-    rows = scene.road_map.rows(FeatureKind.ROAD_EDGE)
+    rows = scene.road_map.rows(FeatureType.ROAD_EDGE)
     flatten = np.array([1, 1, not flat], dtype=np.float32)
     lines_m = [scene.road_map.points(row) * flatten for row in rows.tolist()]
-    return build_edges(lines_m) if any(len(line) >= 2 for line in lines_m) else None
+    return build_road_edges(lines_m) if any(len(line) >= 2 for line in lines_m) else None
 
 
 def signed_distance_m(
     points_m: Float32[np.ndarray, "point 3"], edges: RoadEdges
 ) -> Float32[np.ndarray, " point"]:
     """Distance in the plane to the edge segment nearest in space; positive on its right."""
-    stretched_m = points_m * np.array([1, 1, STRETCH_Z], dtype=np.float32)
+    stretched_m = points_m * np.array([1, 1, HEIGHT_SCALE], dtype=np.float32)
     nearest = nearest_by_cells(stretched_m, edges.start_m, edges.along_m)
     along_m = edges.along_m[nearest, :2]
     to_point_m = stretched_m[:, :2] - edges.start_m[nearest, :2]

@@ -23,7 +23,7 @@ from infgen.tokens.grid import (
 
 
 @dataclass(frozen=True, slots=True)
-class Entries:
+class Insertions:
     """Newcomers, token by token.
 
     Attributes:
@@ -42,10 +42,10 @@ class Entries:
     heading: Int16[np.ndarray, " entry"]
     residual_rad: Float32[np.ndarray, " entry"]
 
-    def at(self, token: int) -> "Entries":
+    def at(self, token: int) -> "Insertions":
         """Return the newcomers of one token."""
         rows = slice(*np.searchsorted(self.token, [token, token + 1]))
-        return Entries(
+        return Insertions(
             token=self.token[rows],
             agent=self.agent[rows],
             cell=self.cell[rows],
@@ -55,18 +55,18 @@ class Entries:
         )
 
 
-def encode_entries(
+def encode_insertions(
     token: int,
     agent: Int64[np.ndarray, " entry"],
     pose: Float32[np.ndarray, "entry 3"],
     ego_pose: Float32[np.ndarray, "3"],
     grid: Grid,
-) -> Entries:
+) -> Insertions:
     """Write newcomers of one token by where they stand to the ego. Keeps their order."""
     xy_m = to_grid(pose[:, :2], ego_pose)
     relative_rad = wrap_angle(pose[:, 2] - ego_pose[2])
     cell, heading = encode_cell(xy_m, grid), encode_heading(relative_rad, grid)
-    return Entries(
+    return Insertions(
         token=np.full(len(agent), token, dtype=np.int16),
         agent=agent.astype(np.int16),
         cell=cell,
@@ -76,8 +76,8 @@ def encode_entries(
     )
 
 
-def decode_entries(
-    entries: Entries, ego_pose: Float32[np.ndarray, "3"], grid: Grid
+def decode_insertions(
+    entries: Insertions, ego_pose: Float32[np.ndarray, "3"], grid: Grid
 ) -> Float32[np.ndarray, "entry 3"]:
     """Return the poses at which newcomers of one token enter."""
     xy_m = from_grid(decode_cell(entries.cell, grid) + entries.offset_m, ego_pose)
@@ -89,11 +89,11 @@ def decode_entries(
 def insertion_order(
     pose: Float32[np.ndarray, "entry 3"], ego_pose: Float32[np.ndarray, "3"], order: str
 ) -> Int64[np.ndarray, " entry"]:
-    """Order newcomers of one token by their ``entry_key``."""
-    return np.argsort(entry_key(pose, ego_pose, order), kind="stable")
+    """Order newcomers of one token by their ``insertion_key``."""
+    return np.argsort(insertion_key(pose, ego_pose, order), kind="stable")
 
 
-def entry_key(
+def insertion_key(
     pose: Float32[np.ndarray, "entry 3"],
     ego_pose: Float32[np.ndarray, "*#entry 3"],
     order: str,
@@ -112,9 +112,9 @@ def entry_key(
     return wrap_angle(np.arctan2(away_m[:, 1], away_m[:, 0]) - ego_pose[..., 2])
 
 
-def join_entries(parts: list[Entries]) -> Entries:
+def join_insertions(parts: list[Insertions]) -> Insertions:
     """Lay the newcomers of consecutive tokens end to end."""
-    return Entries(
+    return Insertions(
         token=np.concatenate([part.token for part in parts]),
         agent=np.concatenate([part.agent for part in parts]),
         cell=np.concatenate([part.cell for part in parts]),

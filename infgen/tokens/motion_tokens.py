@@ -1,4 +1,4 @@
-"""From poses to moves and back: the nearest row of a codebook, and where it leads.
+"""From poses to moves and back: the nearest row of a vocabulary, and where it leads.
 
 Two moves are as far apart as the corners of a box at their ends are on average (SPEC 2.1).
 """
@@ -12,13 +12,13 @@ from jaxtyping import Float32, Float64, Int8, Int16
 from infgen.geometry import box_corners, to_local, to_world
 from infgen.tokens.vocabulary import MotionVocabulary
 
-_ROWS_AT_ONCE = 4096
+_BLOCK_ROWS = 4096
 """Keeps the table of gaps (rows x moves) within 32 MiB."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class MoveTable:
-    """A motion codebook laid out for matching.
+class MatchTable:
+    """A motion vocabulary laid out for matching.
 
     The *spread* of a pose is the point (x, y, r cos heading, r sin heading), where r is
     half the diagonal of the kind's box. The distance of two spreads is the root mean square
@@ -27,7 +27,7 @@ class MoveTable:
     are worth measuring.
 
     Attributes:
-        codebook: The moves.
+        vocabulary: The moves.
         reach_m: Half the diagonal of each kind's box.
         weights: One column per move and kind: the spread of its end times -2, then its
             squared length. The product with a spread and a one is the squared distance of
@@ -35,28 +35,28 @@ class MoveTable:
         corners_m: Corners of each kind's box at each move's end: x of the four, then y.
     """
 
-    codebook: MotionVocabulary
+    vocabulary: MotionVocabulary
     reach_m: Float32[np.ndarray, " 3"]
     weights: Float32[np.ndarray, "3 5 move"]
     corners_m: Float64[np.ndarray, "3 move 8"]
 
 
 @lru_cache(maxsize=4)
-def make_move_table(codebook: MotionVocabulary) -> MoveTable:
-    """Lay a codebook out for matching; of the last few codebooks only once."""
-    reach_m = np.linalg.norm(codebook.size_lw_m, axis=1) / np.float32(2)
-    spread = _spread(codebook.end_pose, reach_m[:, None]).swapaxes(1, 2)
+def make_match_table(vocabulary: MotionVocabulary) -> MatchTable:
+    """Lay a vocabulary out for matching; of the last few vocabularies only once."""
+    reach_m = np.linalg.norm(vocabulary.size_lw_m, axis=1) / np.float32(2)
+    spread = _spread(vocabulary.end_pose, reach_m[:, None]).swapaxes(1, 2)
     square = (spread**2).sum(axis=1, keepdims=True)
-    return MoveTable(
-        codebook=codebook,
+    return MatchTable(
+        vocabulary=vocabulary,
         reach_m=reach_m,
         weights=np.concatenate([-2 * spread, square], axis=1),
-        corners_m=_corners(codebook.end_pose, codebook.size_lw_m[:, None]),
+        corners_m=_corners(vocabulary.end_pose, vocabulary.size_lw_m[:, None]),
     )
 
 
 @lru_cache(maxsize=4)
-def neighbours(table: MoveTable, count: int) -> Int16[np.ndarray, "3 move near"]:
+def neighbour_tokens(table: MatchTable, count: int) -> Int16[np.ndarray, "3 move near"]:
     """Return for each move some that end near to it, itself (or a twin) among them.
 
     Args:
@@ -71,11 +71,11 @@ def neighbours(table: MoveTable, count: int) -> Int16[np.ndarray, "3 move near"]
     return np.stack(near).astype(np.int16)
 
 
-def nearest_moves(
+def nearest_motion_tokens(
     target: Float32[np.ndarray, "row 3"],
     pose: Float32[np.ndarray, "row 3"],
     kind: Int8[np.ndarray, " row"],
-    table: MoveTable,
+    table: MatchTable,
 ) -> Int16[np.ndarray, " row"]:
     """Find the move from each pose that ends nearest to each target.
 
@@ -88,26 +88,26 @@ def nearest_moves(
         kind: ``AgentType`` of each agent.
         table: The moves to choose from.
     """
-    return nearest_few(target, pose, kind, table, 1)[:, 0]
+    return nearest_k_motion_tokens(target, pose, kind, table, 1)[:, 0]
 
 
-def nearest_few(
+def nearest_k_motion_tokens(
     target: Float32[np.ndarray, "row 3"],
     pose: Float32[np.ndarray, "row 3"],
     kind: Int8[np.ndarray, " row"],
-    table: MoveTable,
+    table: MatchTable,
     count: int,
 ) -> Int16[np.ndarray, "row near"]:
     """Find the few moves from each pose that end nearest to each target, nearest first.
 
-    What near is and the arguments are as for ``nearest_moves``, the first of these; there
-    must be ``count`` moves.
+    What near is and the arguments are as for ``nearest_motion_tokens``, the first of these;
+    there must be ``count`` moves.
     """
     order = np.argsort(kind, kind="stable")
     move = np.empty((len(order), count), dtype=np.int16)
-    near = neighbours(table, count)
-    for start in range(0, len(order), _ROWS_AT_ONCE):
-        rows = order[start : start + _ROWS_AT_ONCE]
+    near = neighbour_tokens(table, count)
+    for start in range(0, len(order), _BLOCK_ROWS):
+        rows = order[start : start + _BLOCK_ROWS]
         wanted = to_local(target[rows], pose[rows])
         move[rows] = _nearest(wanted, kind[rows], table, near)
     return move
@@ -117,10 +117,10 @@ def advance(
     pose: Float32[np.ndarray, "agent 3"],
     kind: Int8[np.ndarray, " agent"],
     move: Int16[np.ndarray, " agent"],
-    codebook: MotionVocabulary,
+    vocabulary: MotionVocabulary,
 ) -> Float32[np.ndarray, "agent 3"]:
     """Move agents on by half a second; who has no move (a negative one) stays."""
-    end = codebook.end_pose[kind, np.maximum(move, 0)]
+    end = vocabulary.end_pose[kind, np.maximum(move, 0)]
     return np.where(move[:, None] >= 0, to_world(end, pose), pose)
 
 
@@ -128,7 +128,7 @@ def follow(
     target: Float32[np.ndarray, "agent 3"],
     pose: Float32[np.ndarray, "agent 3"],
     kind: Int8[np.ndarray, " agent"],
-    table: MoveTable,
+    table: MatchTable,
 ) -> tuple[Int16[np.ndarray, " agent"], Float32[np.ndarray, "agent 3"]]:
     """Write one half second of agents driven from outside as moves.
 
@@ -138,15 +138,15 @@ def follow(
     Returns:
         The moves, and the poses they lead to.
     """
-    move = nearest_moves(target, pose, kind, table)
-    return move, advance(pose, kind, move, table.codebook)
+    move = nearest_motion_tokens(target, pose, kind, table)
+    return move, advance(pose, kind, move, table.vocabulary)
 
 
 def _nearest(
-    wanted: np.ndarray, kind: np.ndarray, table: MoveTable, near: np.ndarray
+    wanted: np.ndarray, kind: np.ndarray, table: MatchTable, near: np.ndarray
 ) -> np.ndarray:
     """Return the nearest moves [row, few] of each pose wanted; ``kind`` ascends."""
-    corners_m = _corners(wanted, table.codebook.size_lw_m[kind])  # [row, 8]
+    corners_m = _corners(wanted, table.vocabulary.size_lw_m[kind])  # [row, 8]
     row, move = _candidates(wanted, corners_m, kind, table, near)
     gap_m = _mean_gap(table.corners_m[kind[row], move], corners_m[row])
 
@@ -159,7 +159,7 @@ def _candidates(
     wanted: np.ndarray,
     corners_m: np.ndarray,
     kind: np.ndarray,
-    table: MoveTable,
+    table: MatchTable,
     near: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return rows and moves, ascending, among which each row's nearest few surely are."""
@@ -181,7 +181,7 @@ def _candidates(
         slack = np.float32(5e-6) * (square[rows] + twice)
         flat = np.flatnonzero(gap <= (twice - square[rows] + slack)[:, None])
         found.append(flat + ends[number] * gap.shape[1])
-    return np.divmod(np.concatenate(found), table.codebook.num_motion_tokens)
+    return np.divmod(np.concatenate(found), table.vocabulary.num_motion_tokens)
 
 
 def _mean_gap(one_m: np.ndarray, other_m: np.ndarray) -> np.ndarray:

@@ -28,35 +28,37 @@ def last_token(seen: Bool[np.ndarray, "agent token"]) -> Int64[np.ndarray, " age
     return seen.shape[1] - 1 - first_token(seen[:, ::-1])
 
 
-def makes_a_move(seen: Bool[np.ndarray, "agent token"]) -> Bool[np.ndarray, " agent"]:
+def has_motion(seen: Bool[np.ndarray, "agent token"]) -> Bool[np.ndarray, " agent"]:
     """Tell the agents of whom one token and the next are seen: there is a move to learn."""
     return (seen[:, :-1] & seen[:, 1:]).any(axis=1)
 
 
-def live(seen: Bool[np.ndarray, "agent token"]) -> Int8[np.ndarray, "agent token"]:
+def presence_states(
+    seen: Bool[np.ndarray, "agent token"],
+) -> Int8[np.ndarray, "agent token"]:
     """Give each agent its presence at each token.
 
     The end of the log is not an exit: who is seen in the last token stays. A gap is not one
     either: an agent is present throughout its life, seen or not. A life of one token is
-    ``ENTERING``, then ``ABSENT``: nobody leaves who has not moved.
+    ``INSERTED``, then ``ABSENT``: nobody leaves who has not moved.
     """
     tokens = np.arange(seen.shape[1])
     first, last = first_token(seen)[:, None], last_token(seen)[:, None]
     presence = np.where((first <= tokens) & (tokens <= last), Presence.PRESENT, 0)
     leaving = (tokens == last) & (tokens < seen.shape[1] - 1)
-    presence = np.where(leaving, Presence.LEAVING, presence)
-    presence = np.where(tokens == first, Presence.ENTERING, presence)
+    presence = np.where(leaving, Presence.REMOVED, presence)
+    presence = np.where(tokens == first, Presence.INSERTED, presence)
     return presence.astype(np.int8)
 
 
-def observe(
+def observed_tokens(
     seen: Bool[np.ndarray, "agent token"], presence: Int8[np.ndarray, "agent token"]
 ) -> Bool[np.ndarray, "agent token"]:
     """Tell the tokens at which an agent's own motion is known: seen, and not entering."""
-    return seen & (presence != Presence.ENTERING)
+    return seen & (presence != Presence.INSERTED)
 
 
-def resumes(
+def gap_ends(
     seen: Bool[np.ndarray, "agent token"], presence: Int8[np.ndarray, "agent token"]
 ) -> Bool[np.ndarray, "agent token"]:
     """Tell the last token of each gap: at its end the agent is back in the log."""

@@ -10,9 +10,9 @@ from enum import IntEnum
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8, Int16, Int32, UInt8, UInt16
 
-NO_MOVE = -1
+NO_MOTION_TOKEN = -1
 """Move of a token at which the agent is absent or not observed."""
-FIRST_MOVE = -2
+FIRST_MOTION_TOKEN = -2
 """Move of the token at which an agent enters (the paper's BOS)."""
 NO_CELL = -1
 """Cell of an absent agent, or of one outside the grid."""
@@ -23,8 +23,8 @@ class Presence(IntEnum):
 
     ABSENT = 0
     PRESENT = 1
-    ENTERING = 2
-    LEAVING = 3
+    INSERTED = 2
+    REMOVED = 3
 
 
 class SignalClass(IntEnum):
@@ -37,16 +37,16 @@ class SignalClass(IntEnum):
     NO_SIGNAL = 4
 
 
-class Word(IntEnum):
+class TokenType(IntEnum):
     """Kinds of token in the interleaved stream."""
 
-    MOVE = 0
-    STAY = 1
-    LEAVE = 2
+    MOTION = 0
+    KEEP = 1
+    REMOVE = 2
     ADD = 3
-    CELL = 4
+    POSITION = 4
     HEADING = 5
-    KIND = 6
+    AGENT_TYPE = 6
     BEGIN_MOTION = 7
 
 
@@ -63,39 +63,42 @@ class SceneTokens:
         now: Token that ends at the last step of the history (1 in WOMD).
         ego: Row of the recording car.
         track_id: Id of each kept agent's track.
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         size_lwh_m: One box per agent (mean over its observed steps).
         z_m: Height of the box centre at each token's end; meaningless where absent.
         pose: Quantised x, y, heading at each token's end; zero where absent. An agent that
             is present but not observed keeps the last pose it had.
-        move: Row of the kind's codebook, ``FIRST_MOVE`` or ``NO_MOVE``.
+        motion_token: Row of the kind's vocabulary, ``FIRST_MOTION_TOKEN`` or
+            ``NO_MOTION_TOKEN``.
         presence: ``Presence``.
         observed: Whether the log shows the agent at both ends of the token; False at
-            ``ENTERING`` (SPEC 3.3).
+            ``INSERTED`` (SPEC 3.3).
         pattern: Bit i: whether the log shows the agent at step i + 1 of the token, before
             short gaps are filled and at any distance (``tokens.patterns``); 0 where absent.
         cell: Cell of the ego's grid that holds the agent, or ``NO_CELL``; only where it is
             observed or entering.
         near: Whether the agent is ever observed within the motion-loss radius of the ego.
-        entry_token: Token at which each newcomer enters, ascending; within a token from
-            near to far. Who enters outside the grid has ``entry_cell`` ``NO_CELL``.
-        entry_agent: Row of the newcomer.
-        entry_offset_m: Position less the cell's centre, in the ego's grid frame.
-        entry_heading: Heading bin relative to the ego.
-        entry_residual_rad: Heading less the bin's centre.
-        road_pose: First point and heading of each road token.
-        road_z_m: Height of its first point.
-        road_token: Row of the map codebook.
-        road_point_kind: Kind of its points (``tokens.roads.PointKind``).
-        road_line_kind: Kind of the polyline it is part of (``tokens.roads.LineKind``).
-        road_line: Index of that polyline; consecutive tokens of one polyline are adjacent.
-        road_signal: ``SignalClass`` of its lane at ``now``.
-        signal_line: Polylines (as in ``road_line``) that ever have a signal.
+        insertion_token: Token at which each newcomer enters, ascending; within a token from
+            near to far. Who enters outside the grid has ``insertion_cell`` ``NO_CELL``.
+        insertion_agent: Row of the newcomer.
+        insertion_offset_m: Position less the cell's centre, in the ego's grid frame.
+        insertion_heading: Heading bin relative to the ego.
+        insertion_residual_rad: Heading less the bin's centre.
+        map_pose: First point and heading of each road token.
+        map_z_m: Height of its first point.
+        map_token: Row of the map vocabulary.
+        map_point_type: Kind of its points (``tokens.roads.PointType``).
+        map_polyline_type: Kind of the polyline it is part of
+            (``tokens.roads.PolylineType``).
+        map_polyline: Index of that polyline; consecutive tokens of one polyline are
+            adjacent.
+        map_signal: ``SignalClass`` of its lane at ``now``.
+        signal_polyline: Polylines (as in ``map_polyline``) that ever have a signal.
         signal_state: ``SignalClass`` of those at each token's end.
-        word: The interleaved stream: ``Word`` ...
-        word_value: ... its value (move, cell, heading bin or kind; else 0) ...
-        word_agent: ... the agent's row (-1 for ``BEGIN_MOTION``) ...
-        word_token: ... and the half second it belongs to.
+        sequence_type: The interleaved stream: ``TokenType`` ...
+        sequence_value: ... its value (move, cell, heading bin or kind; else 0) ...
+        sequence_agent: ... the agent's row (-1 for ``BEGIN_MOTION``) ...
+        sequence_step: ... and the half second it belongs to.
         anchor_agent: Rows whose chain of moves starts anew from the log: after a gap (at
             the last token not observed), and the ego at its first token. ``anchor_token``
             is when, ``anchor_pose`` the pose at that token's end.
@@ -106,35 +109,35 @@ class SceneTokens:
     now: int
     ego: int
     track_id: Int32[np.ndarray, " agent"]
-    kind: Int8[np.ndarray, " agent"]
+    agent_type: Int8[np.ndarray, " agent"]
     size_lwh_m: Float32[np.ndarray, "agent 3"]
     z_m: Float32[np.ndarray, "agent token"]
     pose: Float32[np.ndarray, "agent token 3"]
-    move: Int16[np.ndarray, "agent token"]
+    motion_token: Int16[np.ndarray, "agent token"]
     presence: Int8[np.ndarray, "agent token"]
     observed: Bool[np.ndarray, "agent token"]
     pattern: UInt8[np.ndarray, "agent token"]
     cell: Int16[np.ndarray, "agent token"]
     near: Bool[np.ndarray, " agent"]
-    entry_token: Int16[np.ndarray, " entry"]
-    entry_agent: Int16[np.ndarray, " entry"]
-    entry_cell: Int16[np.ndarray, " entry"]
-    entry_offset_m: Float32[np.ndarray, "entry 2"]
-    entry_heading: Int16[np.ndarray, " entry"]
-    entry_residual_rad: Float32[np.ndarray, " entry"]
-    road_pose: Float32[np.ndarray, "road 3"]
-    road_z_m: Float32[np.ndarray, " road"]
-    road_token: Int16[np.ndarray, " road"]
-    road_point_kind: Int8[np.ndarray, " road"]
-    road_line_kind: Int8[np.ndarray, " road"]
-    road_line: Int32[np.ndarray, " road"]
-    road_signal: Int8[np.ndarray, " road"]
-    signal_line: Int32[np.ndarray, " signal"]
+    insertion_token: Int16[np.ndarray, " entry"]
+    insertion_agent: Int16[np.ndarray, " entry"]
+    insertion_cell: Int16[np.ndarray, " entry"]
+    insertion_offset_m: Float32[np.ndarray, "entry 2"]
+    insertion_heading: Int16[np.ndarray, " entry"]
+    insertion_residual_rad: Float32[np.ndarray, " entry"]
+    map_pose: Float32[np.ndarray, "road 3"]
+    map_z_m: Float32[np.ndarray, " road"]
+    map_token: Int16[np.ndarray, " road"]
+    map_point_type: Int8[np.ndarray, " road"]
+    map_polyline_type: Int8[np.ndarray, " road"]
+    map_polyline: Int32[np.ndarray, " road"]
+    map_signal: Int8[np.ndarray, " road"]
+    signal_polyline: Int32[np.ndarray, " signal"]
     signal_state: Int8[np.ndarray, "signal token"]
-    word: UInt8[np.ndarray, " word"]
-    word_value: Int16[np.ndarray, " word"]
-    word_agent: Int16[np.ndarray, " word"]
-    word_token: UInt16[np.ndarray, " word"]
+    sequence_type: UInt8[np.ndarray, " word"]
+    sequence_value: Int16[np.ndarray, " word"]
+    sequence_agent: Int16[np.ndarray, " word"]
+    sequence_step: UInt16[np.ndarray, " word"]
     anchor_agent: Int16[np.ndarray, " anchor"]
     anchor_token: Int16[np.ndarray, " anchor"]
     anchor_pose: Float32[np.ndarray, "anchor 3"]
@@ -152,4 +155,4 @@ class SceneTokens:
     @property
     def num_map_tokens(self) -> int:
         """Number of road tokens."""
-        return len(self.road_token)
+        return len(self.map_token)

@@ -25,7 +25,7 @@ REMEMBERED = len(SignalClass)
 """Added to the class of a light that nobody has looked at since: it may have changed."""
 
 
-def merge_states(state: Int8[np.ndarray, " signal"]) -> Int8[np.ndarray, " signal"]:
+def classify_signals(state: Int8[np.ndarray, " signal"]) -> Int8[np.ndarray, " signal"]:
     """Give each ``SignalState`` its ``SignalClass``; an unheard-of state is unknown."""
     known = (state >= 0) & (state < len(_CLASSES))
     return np.where(known, _CLASSES[state * known], np.int8(SignalClass.UNKNOWN))
@@ -54,11 +54,11 @@ def signals_at(
     rows = np.flatnonzero(
         (lane_id[lane] == signals.lane_id) & (step[column] == signals.step)
     )
-    shown[lane[rows], column[rows]] = merge_states(signals.state[rows])
+    shown[lane[rows], column[rows]] = classify_signals(signals.state[rows])
     return shown
 
 
-def remember(
+def hold_last_signals(
     shown: Int8[np.ndarray, "light token"], known: int, tokens: int
 ) -> Int8[np.ndarray, "light all_tokens"]:
     """Return what lights show while they are looked at, then what they showed last.
@@ -72,19 +72,19 @@ def remember(
     return np.concatenate([seen, np.repeat(last, tokens - known, axis=1)], axis=1)
 
 
-class Lights(NamedTuple):
+class LoggedSignals(NamedTuple):
     """What the traffic lights of a scene show.
 
     Attributes:
-        line: Lines of road tokens that ever have a light, ascending.
+        polyline: Lines of road tokens that ever have a light, ascending.
         shown: ``SignalClass`` of each at the end of each half second.
     """
 
-    line: Int32[np.ndarray, " light"]
+    polyline: Int32[np.ndarray, " light"]
     shown: Int8[np.ndarray, "light token"]
 
 
-def signal_lines(
+def signal_polylines(
     signals: Signals,
     line: Int32[np.ndarray, " road"],
     feature_id: Int64[np.ndarray, " road"],

@@ -1,6 +1,6 @@
 """What tokens say about the scenes they were made from: counts to check a data set by.
 
-Figures of scenes add up to the figures of a split, so shards count on their own.
+TokenStatistics of scenes add up to the figures of a split, so shards count on their own.
 """
 
 from dataclasses import dataclass, fields
@@ -17,12 +17,12 @@ from infgen.tokens.scene_tokens import NO_CELL, Presence, SceneTokens
 ERROR_BIN_M = 0.001
 NUM_ERROR_BINS = 1001
 """The last bin holds all errors of a metre and more."""
-MOST_ENTRIES = 32
+MAX_COUNTED_INSERTIONS = 32
 """The last bin holds half seconds with so many newcomers and more."""
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
+class TokenStatistics:
     """Sums over scenes. Histograms by token are as long as the longest log.
 
     Attributes:
@@ -51,7 +51,7 @@ class Figures:
     beyond: int
     error: Int64[np.ndarray, "3 bin"]
 
-    def __add__(self, other: "Figures") -> "Figures":
+    def __add__(self, other: "TokenStatistics") -> "TokenStatistics":
         sums = {}
         for field in fields(self):
             one, two = getattr(self, field.name), getattr(other, field.name)
@@ -59,12 +59,12 @@ class Figures:
                 length = max(len(one), len(two))
                 one, two = _grown(one, length), _grown(two, length)
             sums[field.name] = one + two
-        return Figures(**sums)
+        return TokenStatistics(**sums)
 
 
-def no_figures() -> Figures:
+def no_statistics() -> TokenStatistics:
     """Return the figures of no scene."""
-    return Figures(
+    return TokenStatistics(
         scenes=0,
         tokens=0,
         roads=0,
@@ -74,38 +74,39 @@ def no_figures() -> Figures:
         gaps=0,
         first=np.zeros(0, np.int64),
         last=np.zeros(0, np.int64),
-        entering=np.zeros(MOST_ENTRIES + 1, np.int64),
+        entering=np.zeros(MAX_COUNTED_INSERTIONS + 1, np.int64),
         beyond=0,
         error=np.zeros((3, NUM_ERROR_BINS), np.int64),
     )
 
 
-def count(scene: Scene, tokens: SceneTokens, clock: Clock = CLOCK) -> Figures:
+def count(scene: Scene, tokens: SceneTokens, clock: Clock = CLOCK) -> TokenStatistics:
     """Count one scene and its tokens."""
     there = tokens.presence != Presence.ABSENT
-    late = tokens.entry_token > tokens.now
-    inside = late & (tokens.entry_cell != NO_CELL)
+    late = tokens.insertion_token > tokens.now
+    inside = late & (tokens.insertion_cell != NO_CELL)
     length, after = tokens.num_tokens, tokens.now + 1
-    newcomers = np.bincount(tokens.entry_token[inside], minlength=length)[after:]
-    return Figures(
+    newcomers = np.bincount(tokens.insertion_token[inside], minlength=length)[after:]
+    return TokenStatistics(
         scenes=1,
         tokens=length,
         roads=tokens.num_map_tokens,
-        words=len(tokens.word),
-        agents=np.bincount(tokens.kind, minlength=3),
-        late=np.bincount(tokens.kind[tokens.entry_agent[late]], minlength=3),
+        words=len(tokens.sequence_type),
+        agents=np.bincount(tokens.agent_type, minlength=3),
+        late=np.bincount(tokens.agent_type[tokens.insertion_agent[late]], minlength=3),
         gaps=len(tokens.anchor_agent) - 1,
         first=np.bincount(first_token(there), minlength=length),
         last=np.bincount(last_token(there), minlength=length),
         entering=np.bincount(
-            np.minimum(newcomers, MOST_ENTRIES), minlength=MOST_ENTRIES + 1
+            np.minimum(newcomers, MAX_COUNTED_INSERTIONS),
+            minlength=MAX_COUNTED_INSERTIONS + 1,
         ),
         beyond=int((late & ~inside).sum()),
         error=_errors(scene, tokens, clock),
     )
 
 
-def describe(figures: Figures) -> dict[str, Any]:
+def describe(figures: TokenStatistics) -> dict[str, Any]:
     """Say what the tokens of a split add up to, kind by kind where it matters."""
     scenes, agents = max(1, figures.scenes), max(1, int(figures.agents.sum()))
     steps = max(1, int(figures.entering.sum()))
@@ -142,7 +143,7 @@ def _errors(scene: Scene, tokens: SceneTokens, clock: Clock) -> np.ndarray:
     agent, token = np.nonzero(logged)
     away_m = tokens.pose[agent, token, :2] - scene.tracks.xyz_m[row[agent], ends[token], :2]
     bins = (np.hypot(away_m[:, 0], away_m[:, 1]) / ERROR_BIN_M).astype(np.int64)
-    flat = tokens.kind[agent].astype(np.int64) * NUM_ERROR_BINS + np.minimum(
+    flat = tokens.agent_type[agent].astype(np.int64) * NUM_ERROR_BINS + np.minimum(
         bins, NUM_ERROR_BINS - 1
     )
     counts = np.bincount(flat, minlength=len(AgentType) * NUM_ERROR_BINS)

@@ -8,13 +8,13 @@ from infgen.clock import CLOCK, Clock
 from infgen.scene import Scene
 from infgen.tokens.agents import match_agents
 from infgen.tokens.grid import make_grid
-from infgen.tokens.map import match_roads, road_pieces
-from infgen.tokens.motion_tokens import make_move_table
-from infgen.tokens.presence import makes_a_move, seen_tokens
+from infgen.tokens.map import cut_map_tokens, match_map_tokens
+from infgen.tokens.motion_tokens import make_match_table
+from infgen.tokens.presence import has_motion, seen_tokens
 from infgen.tokens.scene_tokens import Presence, SceneTokens
-from infgen.tokens.sequence import write_words
+from infgen.tokens.sequence import encode_sequence
 from infgen.tokens.settings import TokenSettings
-from infgen.tokens.signals import Lights, signal_lines, signals_at
+from infgen.tokens.signals import LoggedSignals, signal_polylines, signals_at
 from infgen.tokens.tracks import Paths, read_paths
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
@@ -46,39 +46,39 @@ def tokenize_scene(
     last = scene.tracks.num_steps - 1 if until is None else until
     grid = make_grid(settings)
     paths = read_paths(scene, settings, until, clock)
-    paths = paths.take(_kept(paths, whole_log=until is None))
+    paths = paths.take(_kept_agents(paths, whole_log=until is None))
     agents, entries, anchors = match_agents(
-        paths, make_move_table(motion), grid, settings.insertion_order
+        paths, make_match_table(motion), grid, settings.insertion_order
     )
-    words = write_words(agents, entries, paths.ego)
+    words = encode_sequence(agents, entries, paths.ego)
 
-    road_fields = _roads(scene, roads, last, agents.move.shape[1], clock)
+    road_fields = _map_fields(scene, roads, last, agents.motion_token.shape[1], clock)
     return SceneTokens(
         scenario_id=scene.scenario_id,
         origin_xyz_m=scene.origin_xyz_m,
         now=clock.token_ending_at(scene.now),
         ego=paths.ego,
         track_id=paths.track_id,
-        kind=agents.kind,
+        agent_type=agents.agent_type,
         size_lwh_m=paths.size_lwh_m,
         z_m=paths.z_m[:, 1:],
         pose=agents.pose,
-        move=agents.move,
+        motion_token=agents.motion_token,
         presence=agents.presence,
         observed=agents.observed,
         pattern=np.where(agents.presence == Presence.ABSENT, np.uint8(0), paths.pattern),
         cell=agents.cell,
         near=paths.near,
-        entry_token=entries.token,
-        entry_agent=entries.agent,
-        entry_cell=entries.cell,
-        entry_offset_m=entries.offset_m,
-        entry_heading=entries.heading,
-        entry_residual_rad=entries.residual_rad,
-        word=words.word,
-        word_value=words.value,
-        word_agent=words.agent,
-        word_token=words.token,
+        insertion_token=entries.token,
+        insertion_agent=entries.agent,
+        insertion_cell=entries.cell,
+        insertion_offset_m=entries.offset_m,
+        insertion_heading=entries.heading,
+        insertion_residual_rad=entries.residual_rad,
+        sequence_type=words.word,
+        sequence_value=words.value,
+        sequence_agent=words.agent,
+        sequence_step=words.token,
         anchor_agent=anchors.agent,
         anchor_token=anchors.token,
         anchor_pose=anchors.pose,
@@ -86,43 +86,47 @@ def tokenize_scene(
     )
 
 
-def read_lights(scene: Scene, clock: Clock = CLOCK) -> Lights:
+def read_logged_signals(scene: Scene, clock: Clock = CLOCK) -> LoggedSignals:
     """Read what a log's traffic lights show in all of its half seconds.
 
     A history that is tokenized alone ends at ``now``, and its lights with it. Whoever plays
     on may let them change as they did in the log.
     """
-    pieces, last = road_pieces(scene.road_map), scene.tracks.num_steps - 1
-    line, lane_id = signal_lines(scene.signals, pieces.line, pieces.feature_id, last)
+    pieces, last = cut_map_tokens(scene.road_map), scene.tracks.num_steps - 1
+    line, lane_id = signal_polylines(
+        scene.signals, pieces.polyline, pieces.feature_id, last
+    )
     ends = np.arange(clock.steps_per_token, last + 1, clock.steps_per_token)
-    return Lights(line, signals_at(scene.signals, lane_id, ends))
+    return LoggedSignals(line, signals_at(scene.signals, lane_id, ends))
 
 
-def _roads(
+def _map_fields(
     scene: Scene, roads: MapVocabulary, last: int, tokens: int, clock: Clock
 ) -> dict[str, Any]:
     """Return the fields of ``SceneTokens`` that tell of the map and its signals."""
-    pieces = road_pieces(scene.road_map)
-    line, lane_id = signal_lines(scene.signals, pieces.line, pieces.feature_id, last)
+    pieces = cut_map_tokens(scene.road_map)
+    line, lane_id = signal_polylines(
+        scene.signals, pieces.polyline, pieces.feature_id, last
+    )
     ends = clock.steps_per_token * np.arange(1, tokens + 1)
     lanes, lane_of = np.unique(pieces.feature_id, return_inverse=True)
     now = np.array([scene.now])
     return {
-        "road_pose": pieces.pose,
-        "road_z_m": pieces.z_m,
-        "road_token": match_roads(pieces, roads),
-        "road_point_kind": pieces.point_kind,
-        "road_line_kind": pieces.line_kind,
-        "road_line": pieces.line,
-        "road_signal": signals_at(scene.signals, lanes, now)[lane_of, 0],
-        "signal_line": line,
+        "map_pose": pieces.pose,
+        "map_z_m": pieces.z_m,
+        "map_token": match_map_tokens(pieces, roads),
+        "map_point_type": pieces.point_type,
+        "map_polyline_type": pieces.polyline_type,
+        "map_polyline": pieces.polyline,
+        "map_signal": signals_at(scene.signals, lanes, now)[lane_of, 0],
+        "signal_polyline": line,
         "signal_state": signals_at(scene.signals, lane_id, ends),
     }
 
 
-def _kept(paths: Paths, *, whole_log: bool) -> np.ndarray:
+def _kept_agents(paths: Paths, *, whole_log: bool) -> np.ndarray:
     """Return rows of the agents to write: those there now (as the ego is) or moving."""
     kept = paths.at_now
     if whole_log:
-        kept = kept | makes_a_move(seen_tokens(paths.valid))
+        kept = kept | has_motion(seen_tokens(paths.valid))
     return np.flatnonzero(kept)

@@ -30,7 +30,7 @@ class Paths:
 
     Attributes:
         track_id: Id of each agent's track.
-        kind: ``AgentType``; none is ``OTHER``.
+        agent_type: ``AgentType``; none is ``OTHER``.
         ego: Row of the recording car.
         size_lwh_m: Mean box over the observed steps.
         pose: x, y, heading at each border; meaningless where not valid.
@@ -43,7 +43,7 @@ class Paths:
     """
 
     track_id: Int32[np.ndarray, " agent"]
-    kind: Int8[np.ndarray, " agent"]
+    agent_type: Int8[np.ndarray, " agent"]
     ego: int
     size_lwh_m: Float32[np.ndarray, "agent 3"]
     pose: Float32[np.ndarray, "agent border 3"]
@@ -57,7 +57,7 @@ class Paths:
         """Keep some agents; the ego must be one of them."""
         return Paths(
             track_id=self.track_id[rows],
-            kind=self.kind[rows],
+            agent_type=self.agent_type[rows],
             ego=int(np.flatnonzero(rows == self.ego)[0]),
             size_lwh_m=self.size_lwh_m[rows],
             pose=self.pose[rows],
@@ -114,7 +114,7 @@ def read_paths(
         raise TokensError(f"the ego is not observed at step {border} of {last}")
     return Paths(
         track_id=tracks.id,
-        kind=tracks.kind,
+        agent_type=tracks.agent_type,
         ego=ego,
         size_lwh_m=_mean_size(tracks),
         pose=pose,
@@ -163,14 +163,16 @@ def _check_time(scene: Scene, tokens: int, last: int, clock: Clock) -> None:
 def _road_users(scene: Scene, last: int) -> tuple[Tracks, int]:
     """Take the vehicles, pedestrians and cyclists up to a step, and the ego's new row."""
     tracks = scene.tracks
-    rows = np.flatnonzero((tracks.kind >= 0) & (tracks.kind < AgentType.OTHER))
+    rows = np.flatnonzero((tracks.agent_type >= 0) & (tracks.agent_type < AgentType.OTHER))
     ego = np.flatnonzero(rows == scene.ego)
     if len(ego) == 0:
-        raise TokensError(f"the ego is of kind {tracks.kind[scene.ego]}, no road user")
+        raise TokensError(
+            f"the ego is of kind {tracks.agent_type[scene.ego]}, no road user"
+        )
     steps = slice(last + 1)
     users = Tracks(
         id=tracks.id[rows],
-        kind=tracks.kind[rows],
+        agent_type=tracks.agent_type[rows],
         xyz_m=tracks.xyz_m[rows, steps],
         heading_rad=tracks.heading_rad[rows, steps],
         velocity_mps=tracks.velocity_mps[rows, steps],

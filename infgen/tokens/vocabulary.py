@@ -1,6 +1,6 @@
 """The two vocabularies: half-second moves of agents, five-metre pieces of map lines.
 
-A codebook is plain arrays. Which rows there are is decided by ``kdisks`` (from logs) and
+A vocabulary is plain arrays. Which rows there are is decided by ``kdisks`` (from logs) and
 written and read by ``pipeline.stages.vocabulary``; everything that matches or decodes
 tokens needs only what is here.
 """
@@ -15,16 +15,16 @@ from infgen.geometry import box_corners
 BOX_LW_M = np.array([[4.8, 2.0], [1.0, 1.0], [2.0, 1.0]], dtype=np.float32)
 """Length and width of the box that stands for a vehicle, a pedestrian, a cyclist."""
 
-STAND_STILL = 0
-"""Row of every kind's codebook that goes nowhere."""
+STATIONARY_TOKEN = 0
+"""Row of every kind's vocabulary that goes nowhere."""
 
-STANDING_M = 0.1
+STATIONARY_M = 0.1
 """Shorter moves are those of agents that stand (0.2 m/s)."""
 
-ROAD_SPACING_M = 0.5
+MAP_SPACING_M = 0.5
 """Distance along a map line between two points of a piece."""
 
-ROAD_SAMPLES = (0, 5, 10)
+MAP_SAMPLE_POINTS = (0, 5, 10)
 """Points of a piece that pieces are compared by: first, middle, last."""
 
 
@@ -32,8 +32,8 @@ ROAD_SAMPLES = (0, 5, 10)
 class MotionVocabulary:
     """The moves that agents choose from, ``num_motion_tokens`` for each of three kinds.
 
-    The same row means another motion for another kind. Row ``STAND_STILL`` of each kind is
-    the agent that stays where it is.
+    The same row means another motion for another kind. Row ``STATIONARY_TOKEN`` of each
+    kind is the agent that stays where it is.
 
     Attributes:
         size_lw_m: Box by which moves of each kind (row: ``AgentType``) are compared.
@@ -56,9 +56,9 @@ class MotionVocabulary:
         return self.path[:, :, -1]
 
     @property
-    def standing(self) -> Bool[np.ndarray, "3 move"]:
+    def stationary(self) -> Bool[np.ndarray, "3 move"]:
         """Which moves go nowhere, or hardly anywhere."""
-        return np.hypot(*np.moveaxis(self.end_pose[..., :2], -1, 0)) < STANDING_M
+        return np.hypot(*np.moveaxis(self.end_pose[..., :2], -1, 0)) < STATIONARY_M
 
     @property
     def end_corners_m(self) -> Float32[np.ndarray, "3 move 4 2"]:
@@ -87,4 +87,4 @@ class MapVocabulary:
     @property
     def sample_m(self) -> Float32[np.ndarray, "road 3 2"]:
         """First, middle and last point of each shape."""
-        return self.curve_m[:, list(ROAD_SAMPLES)]
+        return self.curve_m[:, list(MAP_SAMPLE_POINTS)]

@@ -15,7 +15,7 @@ import numpy as np
 from infgen.config import IngestSettings
 from infgen.scene import Scene
 from infgen.sources.tfrecord import BadRecord, Record, iter_records
-from infgen.sources.womd import scene_or_fault
+from infgen.sources.womd import scene_or_bad_record
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
 from pipeline.storage.duplicates import mark_duplicates, report_duplicates
 from pipeline.storage.parquet import make_table, read_tables
@@ -112,7 +112,7 @@ class _Shard:
 
     def take(self, record: Record | BadRecord) -> None:
         """Keep one record as a scene, or as a row of the quarantine."""
-        found = record if isinstance(record, BadRecord) else scene_or_fault(record)
+        found = record if isinstance(record, BadRecord) else scene_or_bad_record(record)
         if isinstance(record, Record):
             self._record_bytes += len(record.data)
         if isinstance(found, Scene) and found.scenario_id in self._records:

@@ -72,7 +72,7 @@ def _measure(
     from infgen.metrics.long_term.reference import count_log  # noqa: PLC0415
     from infgen.metrics.traffic import from_log  # noqa: PLC0415
     from infgen.metrics.windows import cut_windows  # noqa: PLC0415
-    from infgen.spatial.road_edges import edges_of  # noqa: PLC0415
+    from infgen.spatial.road_edges import scene_road_edges  # noqa: PLC0415
 
     after = scene.tracks.num_steps - scene.now - 1
     windows = cut_windows(after, settings.window_s, settings.stride_s)
@@ -82,7 +82,7 @@ def _measure(
         traffic = from_log(scene, tokens)
     except ValueError as error:
         return str(error)
-    edges, radius_m = edges_of(scene), settings.count_radius_m
+    edges, radius_m = scene_road_edges(scene), settings.count_radius_m
     logged = bin_traffic(traffic, edges, radius_m, as_logged=True)
     played = bin_traffic(traffic, edges, radius_m, as_logged=False)
     return count_log(logged, windows), played

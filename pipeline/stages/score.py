@@ -128,10 +128,10 @@ class _Scorer:
         from infgen.metrics.long_term.reference import count_simulated  # noqa: PLC0415
         from infgen.metrics.long_term.table import make_row  # noqa: PLC0415
         from infgen.metrics.traffic import from_rollout  # noqa: PLC0415
-        from infgen.spatial.road_edges import edges_of  # noqa: PLC0415
+        from infgen.spatial.road_edges import scene_road_edges  # noqa: PLC0415
         from pipeline.stages.score_write import rows_of  # noqa: PLC0415
 
-        edges, radius_m = edges_of(scene), self._settings.presence_radius_m
+        edges, radius_m = scene_road_edges(scene), self._settings.presence_radius_m
         self.official.append(_score_wosac(scene, rollouts, self._settings.wosac_version))
         for rollout in rollouts:
             lived = live_within(rollout, radius_m) if radius_m else rollout

@@ -39,8 +39,8 @@ def load_player(
     network = load_network(weights).to(device).eval()
     player = Player(
         stepper=Stepper(network),
-        codebook=network.motion_codebook(),
-        roads=network.road_codebook(),
+        vocabulary=network.motion_vocabulary(),
+        roads=network.map_vocabulary(),
         tokens=network.grid_settings,
         settings=settings,
         device=device,
@@ -64,13 +64,15 @@ def begin(player: "Player", scene: "Scene") -> "list[Start]":
         ValueError: if it cannot be played, with the reason.
     """
     from infgen.rollout.recording import Start  # noqa: PLC0415
-    from infgen.tokens.tokenizer import read_lights, tokenize_scene  # noqa: PLC0415
+    from infgen.tokens.tokenizer import read_logged_signals, tokenize_scene  # noqa: PLC0415
 
     tokens, settings = player.tokens, player.settings
     if settings.simulates_all_agents:
         tokens = replace(tokens, max_ego_distance_m=1e9)  # All agents.
-    history = tokenize_scene(scene, player.codebook, player.roads, tokens, until=scene.now)
-    lights = read_lights(scene) if settings.signals == "log" else None
+    history = tokenize_scene(
+        scene, player.vocabulary, player.roads, tokens, until=scene.now
+    )
+    lights = read_logged_signals(scene) if settings.signals == "log" else None
     return [
         Start(scene, history, at, settings.seed, lights) for at in range(settings.count)
     ]

@@ -1,4 +1,4 @@
-"""Stage ``tokenize``: scenes and codebooks to tokens that training reads scene by scene.
+"""Stage ``tokenize``: scenes and vocabularies to tokens that training reads scene by scene.
 
 One unit per ingested file. Groups are uncompressed, so their chunk files are the arrays. A
 scene that cannot be written as tokens is a named row of ``refused.parquet``.
@@ -15,7 +15,7 @@ import numpy as np
 from infgen.config import TokenSettings
 from infgen.scene import Scene
 from infgen.tokens.scene_tokens import SceneTokens
-from infgen.tokens.statistics import Figures, count, describe, no_figures
+from infgen.tokens.statistics import TokenStatistics, count, describe, no_statistics
 from infgen.tokens.tokenizer import tokenize_scene
 from infgen.tokens.tracks import TokensError
 from pipeline.engine.atomic import write_json
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "infgen.tokens/2"
 SCENES_PER_GROUP = 500
-CODEBOOKS = ("motion.zarr", "roads.zarr")
+VOCABULARIES = ("motion.zarr", "roads.zarr")
 
 _INDEX = {
     "scenario_id": str,
@@ -62,13 +62,13 @@ def open_tokens(unit_folder: Path) -> "list[PackedRecords[SceneTokens]]":
 
 def plan(inputs: Inputs, settings: TokenSettings) -> list[Unit]:
     """One unit per ingested file."""
-    codebooks = inputs.folder("build-vocab")
-    identity = inputs.content("build-vocab", *CODEBOOKS)
+    vocabularies = inputs.folder("build-vocab")
+    identity = inputs.content("build-vocab", *VOCABULARIES)
     return [
         Unit(
             name=done.name,
-            inputs={"scenes": done.key, "codebooks": identity},
-            task={**scenes_task(done), "codebooks": str(codebooks)},
+            inputs={"scenes": done.key, "vocabularies": identity},
+            task={**scenes_task(done), "vocabularies": str(vocabularies)},
         )
         for done in inputs.units("ingest")
     ]
@@ -79,7 +79,7 @@ def work(unit: Unit, target: Path, settings: TokenSettings, progress: Progress) 
     from pipeline.stages.vocabulary import load_vocabularies  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
-    motion, roads = load_vocabularies(Path(unit.task["codebooks"]))
+    motion, roads = load_vocabularies(Path(unit.task["vocabularies"]))
     shard = _Shard(target, unit.name)
     for scene in read_task_scenes(unit.task):
         try:
@@ -104,7 +104,7 @@ def finish(
         read_tables(paths, f"{name}.parquet", columns).write_parquet(
             target / f"{name}.parquet"
         )
-    splits = {split_of(done.name): no_figures() for done in units}
+    splits = {split_of(done.name): no_statistics() for done in units}
     for done in units:
         splits[split_of(done.name)] += _read_figures(done.path)
     write_json(
@@ -126,7 +126,7 @@ class _Shard:
         self._pending: list[SceneTokens] = []
         self._index: list[dict[str, Any]] = []
         self._refused: list[dict[str, Any]] = []
-        self._figures = no_figures()
+        self._figures = no_statistics()
         self._groups = 0
 
     def keep(self, scene: Scene, tokens: SceneTokens) -> None:
@@ -141,8 +141,8 @@ class _Shard:
                 "agents": tokens.num_agents,
                 "tokens": tokens.num_tokens,
                 "roads": tokens.num_map_tokens,
-                "words": len(tokens.word),
-                "entries": len(tokens.entry_agent),
+                "words": len(tokens.sequence_type),
+                "entries": len(tokens.insertion_agent),
             }
         )
         self._figures += count(scene, tokens)
@@ -191,12 +191,12 @@ class _Shard:
         self._groups += 1
 
 
-def _read_figures(unit_folder: Path) -> Figures:
+def _read_figures(unit_folder: Path) -> TokenStatistics:
     values: dict[str, Any] = json.loads((unit_folder / "figures.json").read_text())
     for name, value in values.items():
         if isinstance(value, list):
             values[name] = np.array(value, np.int64)
-    return Figures(**values)
+    return TokenStatistics(**values)
 
 
 STAGE = Stage(

@@ -1,4 +1,4 @@
-"""Stage ``build-vocab``: scenes to the two codebooks, and a report on what they can write.
+"""Stage ``build-vocab``: the two vocabularies of scenes, and a report on what they fit.
 
 A unit is one ingested file: a bounded sample of its moves and map pieces. Samples are
 chosen by hashes of what they are, so neither workers nor the order of files matter.
@@ -13,22 +13,22 @@ import numpy as np
 
 from infgen.config import TokenSettings, VocabSettings
 from infgen.scene import Scene
-from infgen.tokens.clustering.coverage import describe_moves, describe_roads, match_paths
+from infgen.tokens.clustering.coverage import describe_map, describe_motion, match_paths
 from infgen.tokens.clustering.map_samples import (
-    NO_CURVES,
-    Curves,
-    sample_curves,
-    scene_curves,
+    NO_MAP_SAMPLES,
+    MapSamples,
+    merge_map_samples,
+    scene_map_samples,
 )
 from infgen.tokens.clustering.motion_samples import (
-    NO_SEGMENTS,
-    Segments,
-    sample_segments,
-    scene_segments,
+    NO_MOTION_SAMPLES,
+    MotionSamples,
+    merge_motion_samples,
+    scene_motion_samples,
 )
-from infgen.tokens.clustering.physical_limits import limits_of
+from infgen.tokens.clustering.physical_limits import motion_limits
 from infgen.tokens.clustering.sample_keys import name_key
-from infgen.tokens.clustering.vocabularies import Origin, cluster_moves, cluster_roads
+from infgen.tokens.clustering.vocabularies import Origin, cluster_map, cluster_motion
 from infgen.tokens.tracks import Paths, TokensError, read_paths
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from infgen.views.charts.vocabularies import codebook_page
@@ -62,7 +62,7 @@ HELD_OUT_EVERY = 8
 """Without a split to hold out, one scene in so many is."""
 
 SCENES_PER_UNIT = {LEARN: 8, HELD_OUT: 250}
-"""Scenes of a file whose tracks are matched once the codebooks stand ..."""
+"""Scenes of a file whose tracks are matched once the vocabularies stand ..."""
 SCENES_IN_ALL = {LEARN: 200, HELD_OUT: 1000}
 """... and of all files."""
 
@@ -85,13 +85,13 @@ class KeyedPaths:
 class _Gathered(NamedTuple):
     """One side's samples of all files."""
 
-    segments: Segments
-    curves: Curves
+    segments: MotionSamples
+    curves: MapSamples
     paths: Sequence[Paths]
 
 
 class _Books(NamedTuple):
-    """Both codebooks, the ``Origin`` of their rows, and the radius of a disk of roads."""
+    """Both vocabularies, the ``Origin`` of their rows, and the radius of a map disk."""
 
     motion: MotionVocabulary
     move_origin: np.ndarray
@@ -101,7 +101,7 @@ class _Books(NamedTuple):
 
 
 def load_vocabularies(folder: Path) -> tuple[MotionVocabulary, MapVocabulary]:
-    """Read both codebooks from the folder of this stage.
+    """Read both vocabularies from the folder of this stage.
 
     Raises:
         StoreError: if one is missing or damaged.
@@ -112,7 +112,7 @@ def load_vocabularies(folder: Path) -> tuple[MotionVocabulary, MapVocabulary]:
 
 
 def reads(root: Path, settings: VocabSettings) -> list[Source]:
-    """Find the weights whose codebooks are taken, if any are named.
+    """Find the weights whose vocabularies are taken, if any are named.
 
     Raises:
         ConfigError: if there are none, or a key is of several.
@@ -176,7 +176,7 @@ def finish(
     settings: VocabSettings,
     progress: Progress,
 ) -> Report:
-    """Cluster all samples, and measure the codebooks on what was held out."""
+    """Cluster all samples, and measure the vocabularies on what was held out."""
     progress(0, 4, "samples")
     learn, validation_split = (_gather(units, side, settings) for side in _SIDES)
     starts = [Path(source.url) for source in inputs.sources]
@@ -194,8 +194,8 @@ def finish(
         "validation_split": _held_out_words(units, settings),
         "tolerance_m": settings.tolerance_m,
         "road_tolerance_m": round(road_tolerance_m, 5),
-        "motion": describe_moves(motion, move_origin, matches, familiar, settings),
-        "roads": describe_roads(
+        "motion": describe_motion(motion, move_origin, matches, familiar, settings),
+        "roads": describe_map(
             roads, road_origin, validation_split.curves.curve_m, learn.curves.curve_m
         ),
     }
@@ -209,14 +209,14 @@ def finish(
 
 def _clustered(learn: _Gathered, settings: VocabSettings, progress: Progress) -> _Books:
     progress(1, 4, "moves")
-    motion, move_origin = cluster_moves(learn.segments, settings)
+    motion, move_origin = cluster_motion(learn.segments, settings)
     progress(2, 4, "roads")
-    roads, road_origin, tolerance_m = cluster_roads(learn.curves.curve_m, settings)
+    roads, road_origin, tolerance_m = cluster_map(learn.curves.curve_m, settings)
     return _Books(motion, move_origin, roads, road_origin, tolerance_m)
 
 
 def _taken(folder: Path) -> _Books:
-    """Take codebooks from weights; what is not logged in them counts as made."""
+    """Take vocabularies from weights; what is not logged in them counts as made."""
     from pipeline.storage.weights import load_vocabularies as load  # noqa: PLC0415
 
     motion, roads = load(folder)
@@ -233,9 +233,9 @@ class _Sample:
     def __init__(self, side: str, settings: VocabSettings) -> None:
         self.scenes = 0
         self._side, self._settings = side, settings
-        self._limits = limits_of(settings)
-        self._segments: list[Segments] = []
-        self._curves: list[Curves] = []
+        self._limits = motion_limits(settings)
+        self._segments: list[MotionSamples] = []
+        self._curves: list[MapSamples] = []
         self._paths: dict[int, Paths] = {}
 
     def take(self, scene: Scene) -> None:
@@ -243,8 +243,8 @@ class _Sample:
         self.scenes += 1
         if self._side == LEARN:
             still_m = self._settings.tolerance_m
-            self._segments.append(scene_segments(scene, self._limits, still_m))
-        self._curves.append(scene_curves(scene))
+            self._segments.append(scene_motion_samples(scene, self._limits, still_m))
+        self._curves.append(scene_map_samples(scene))
         self._take_paths(scene)
         if len(self._curves) == _MERGE_EVERY:
             self._merge()
@@ -257,8 +257,8 @@ class _Sample:
         folder = target / self._side
         folder.mkdir(parents=True)
         paths = [KeyedPaths(key, self._paths[key]) for key in sorted(self._paths)]
-        _write(folder / "segments.zarr", self._segments, Segments, SEGMENTS_SCHEMA)
-        _write(folder / "curves.zarr", self._curves, Curves, CURVES_SCHEMA)
+        _write(folder / "segments.zarr", self._segments, MotionSamples, SEGMENTS_SCHEMA)
+        _write(folder / "curves.zarr", self._curves, MapSamples, CURVES_SCHEMA)
         _write(folder / "paths.zarr", paths, KeyedPaths, PATHS_SCHEMA)
 
     def _take_paths(self, scene: Scene) -> None:
@@ -276,22 +276,22 @@ class _Sample:
     def _merge(self) -> None:
         most = self._settings.samples_per_shard
         if self._segments:
-            self._segments = [sample_segments(self._segments, most)]
-        self._curves = [sample_curves(self._curves, most)]
+            self._segments = [merge_motion_samples(self._segments, most)]
+        self._curves = [merge_map_samples(self._curves, most)]
 
 
 def _gather(units: Sequence[FinishedUnit], side: str, settings: VocabSettings) -> _Gathered:
     """Merge one side's samples of all files, one file in memory at a time."""
-    segments, curves, paths = NO_SEGMENTS, NO_CURVES, dict[int, Paths]()
+    segments, curves, paths = NO_MOTION_SAMPLES, NO_MAP_SAMPLES, dict[int, Paths]()
     most = settings.samples_per_type
     for done in units:
         folder = done.path / side
         if not folder.is_dir():
             continue
-        parts = _read(folder / "segments.zarr", Segments, SEGMENTS_SCHEMA)
-        segments = sample_segments([segments, *parts], most)
-        pieces = _read(folder / "curves.zarr", Curves, CURVES_SCHEMA)
-        curves = sample_curves([curves, *pieces], most)
+        parts = _read(folder / "segments.zarr", MotionSamples, SEGMENTS_SCHEMA)
+        segments = merge_motion_samples([segments, *parts], most)
+        pieces = _read(folder / "curves.zarr", MapSamples, CURVES_SCHEMA)
+        curves = merge_map_samples([curves, *pieces], most)
         scenes = _read(folder / "paths.zarr", KeyedPaths, PATHS_SCHEMA)
         paths |= {scene.key: scene.paths for scene in scenes}
         paths = {key: paths[key] for key in sorted(paths)[: SCENES_IN_ALL[side]]}

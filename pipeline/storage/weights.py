@@ -1,4 +1,4 @@
-"""Weights on disk: safetensors with the codebooks in them, and a page of JSON."""
+"""Weights on disk: safetensors with the vocabularies in them, and a page of JSON."""
 
 import hashlib
 import json
@@ -56,7 +56,7 @@ def save_network(
 
     Args:
         folder: Where to.
-        network: Whose sizes, codebooks and grid they are for.
+        network: Whose sizes, vocabularies and grid they are for.
         state: The weights (of the network itself, or averaged).
         step: Optimiser step they are from.
 
@@ -69,7 +69,7 @@ def save_network(
         "model": asdict(network.settings),
         "tokenize": asdict(network.grid_settings),
         "vocabulary": vocabulary_fingerprint(
-            network.motion_codebook(), network.road_codebook()
+            network.motion_vocabulary(), network.map_vocabulary()
         ),
         "parameters": sum(p.numel() for p in network.parameters()),
         "step": step,
@@ -106,7 +106,7 @@ def load_network(folder: Path) -> Network:
 
 
 def load_vocabularies(folder: Path) -> tuple[MotionVocabulary, MapVocabulary]:
-    """Read the codebooks that the weights in a folder were trained with.
+    """Read the vocabularies that the weights in a folder were trained with.
 
     Raises:
         StoreError: if a file is missing, damaged, or of another schema.
@@ -125,7 +125,9 @@ def copy_weights(network: Network, folder: Path) -> None:
             the weights were made with other vocabularies, or are not what they were.
     """
     about = read_description(folder)
-    own_books = vocabulary_fingerprint(network.motion_codebook(), network.road_codebook())
+    own_books = vocabulary_fingerprint(
+        network.motion_vocabulary(), network.map_vocabulary()
+    )
     if about["vocabulary"] != own_books:
         raise StoreError(
             f"{folder} was trained with vocabulary {about['vocabulary'][:12]}, expected "
@@ -201,7 +203,7 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 def vocabulary_fingerprint(motion: MotionVocabulary, roads: MapVocabulary) -> str:
-    """Identity of two codebooks: the same arrays, the same text."""
+    """Identity of two vocabularies: the same arrays, the same text."""
     digest = hashlib.sha256()
     for array in (motion.size_lw_m, motion.path, motion.real, roads.curve_m, roads.real):
         digest.update(f"{array.shape}{array.dtype}".encode())
@@ -210,7 +212,7 @@ def vocabulary_fingerprint(motion: MotionVocabulary, roads: MapVocabulary) -> st
 
 
 def state_dict_of(network: torch.nn.Module) -> dict[str, Tensor]:
-    """Weights and codebooks of a network by name (not copied)."""
+    """Weights and vocabularies of a network by name (not copied)."""
     return {name: tensor.detach() for name, tensor in network.state_dict().items()}
 
 

@@ -32,7 +32,7 @@ def replay(scene: Scene, index: int = 0, shift_m: float = 0.0) -> Rollout:
         now=scene.now,
         ego=int(np.flatnonzero(rows == scene.ego)[0]),
         id=tracks.id[rows],
-        kind=tracks.kind[rows],
+        kind=tracks.agent_type[rows],
         size_lwh_m=tracks.size_lwh_m[rows, scene.now],
         xyz_m=xyz_m.astype(np.float32),
         heading_rad=np.where(valid, heading_rad, 0).astype(np.float32),

@@ -4,8 +4,8 @@ import pytest
 from infgen.clock import CLOCK
 from infgen.exports.states import NO_LIGHT, lights_of, states_of
 from infgen.scene import SignalState
-from infgen.tokens.signals import REMEMBERED, merge_states, remember
-from infgen.tokens.tokenizer import read_lights
+from infgen.tokens.signals import REMEMBERED, classify_signals, hold_last_signals
+from infgen.tokens.tokenizer import read_logged_signals
 from tests.exports.replays import replay, with_newcomer
 
 
@@ -92,14 +92,14 @@ def test_lights_played_as_logged_are_those_that_the_network_sees(
 ):
     rows = [(step, 1, SignalState(step // 7 % 9)) for step in range(steps)]
     scene = crossing(steps=steps, signals=build_signals(rows))
-    seen = read_lights(scene)
+    seen = read_logged_signals(scene)
     known, tokens = seen.shown.shape[1], 30
 
     lights = lights_of(scene, CLOCK.end_step(tokens - 1) + 1, "log")
 
     ends = [CLOCK.end_step(token) for token in range(tokens)]
-    told = remember(seen.shown, known, tokens)[0] % REMEMBERED
-    assert merge_states(lights.state[0, ends]).tolist() == told.tolist()
+    told = hold_last_signals(seen.shown, known, tokens)[0] % REMEMBERED
+    assert classify_signals(lights.state[0, ends]).tolist() == told.tolist()
 
 
 @pytest.mark.parametrize("played", ["now", "log"])

@@ -37,9 +37,9 @@ def rollouts(scene):
 
 
 def of_other_kind(scene, row):
-    kind = scene.tracks.kind.copy()
+    kind = scene.tracks.agent_type.copy()
     kind[row] = AgentType.OTHER
-    return replace(scene, tracks=replace(scene.tracks, kind=kind))
+    return replace(scene, tracks=replace(scene.tracks, agent_type=kind))
 
 
 def test_protobuf_reads_what_is_written_and_would_write_the_same_bytes(scene, rollouts):

@@ -12,9 +12,9 @@ from infgen.model.batching.batch import Limits
 from infgen.model.network import Network
 from infgen.tokens.grid import encode_cell, encode_heading, make_grid, to_grid
 from infgen.tokens.scene_tokens import (
-    FIRST_MOVE,
+    FIRST_MOTION_TOKEN,
     NO_CELL,
-    NO_MOVE,
+    NO_MOTION_TOKEN,
     Presence,
     SceneTokens,
     SignalClass,
@@ -103,23 +103,23 @@ def make_record(
         lives = [_life(random, tokens) for _ in range(agents - 1)]
     lives = [(0, tokens - 1), *lives]
     agents = len(lives)
-    codebook = make_motion_codebook()
+    vocabulary = make_motion_codebook()
     kind = np.array([0, *random.choice(kinds, agents - 1)], dtype=np.int8)
-    move = random.integers(codebook.num_motion_tokens, size=(agents, tokens))
+    move = random.integers(vocabulary.num_motion_tokens, size=(agents, tokens))
     start = random.uniform(-1, 1, size=(agents, 3)) * [spread_m, spread_m, np.pi]
     start[0] = [0, 0, 0.4]
     pose = [start.astype(np.float32)]
     for token in range(1, tokens):
-        ends = codebook.end_pose[kind, move[:, token]]
+        ends = vocabulary.end_pose[kind, move[:, token]]
         pose.append(to_world(ends, pose[-1]))
     pose = np.stack(pose, axis=1).astype(np.float32)
 
     presence = np.zeros((agents, tokens), dtype=np.int8)
     for row, (first, last) in enumerate(lives):
         presence[row, first : last + 1] = Presence.PRESENT
-        presence[row, first] = Presence.ENTERING
+        presence[row, first] = Presence.INSERTED
         if last < tokens - 1:
-            presence[row, last] = Presence.LEAVING
+            presence[row, last] = Presence.REMOVED
     return _record(f"scene-{seed}", kind, pose, move, presence, roads, random)
 
 
@@ -135,10 +135,10 @@ def _life(random, tokens):
 def _record(name, kind, pose, move, presence, roads, random):
     agents, tokens = presence.shape
     grid = make_grid(GRID)
-    entering = presence == Presence.ENTERING
+    entering = presence == Presence.INSERTED
     absent = presence == Presence.ABSENT
     observed = ~absent & ~entering
-    move = np.where(absent, NO_MOVE, np.where(entering, FIRST_MOVE, move))
+    move = np.where(absent, NO_MOTION_TOKEN, np.where(entering, FIRST_MOTION_TOKEN, move))
     pose = np.where(absent[..., None], 0, pose).astype(np.float32)
     in_grid_m = to_grid(pose[..., :2], pose[:1])
     cell = np.where(absent, NO_CELL, encode_cell(in_grid_m, grid)).astype(np.int16)
@@ -152,43 +152,43 @@ def _record(name, kind, pose, move, presence, roads, random):
     none = np.empty(0)
     line = np.arange(roads) // 6
     lit = np.unique(line)[1::3]
-    road_pose = random.uniform(-1, 1, (roads, 3)) * [50, 50, np.pi]
-    road_pose[np.searchsorted(line, lit)] = _somewhere_ahead(pose, observed, len(lit))
+    map_pose = random.uniform(-1, 1, (roads, 3)) * [50, 50, np.pi]
+    map_pose[np.searchsorted(line, lit)] = _somewhere_ahead(pose, observed, len(lit))
     return SceneTokens(
         scenario_id=name,
         origin_xyz_m=np.zeros(3),
         now=1,
         ego=0,
         track_id=np.arange(agents, dtype=np.int32),
-        kind=kind,
+        agent_type=kind,
         size_lwh_m=random.uniform(1, 5, size=(agents, 3)).astype(np.float32),
         z_m=np.zeros((agents, tokens), dtype=np.float32),
         pose=pose,
-        move=move.astype(np.int16),
+        motion_token=move.astype(np.int16),
         presence=presence,
         observed=observed,
         pattern=np.where(absent, 0, _any_pattern(absent.shape)).astype(np.uint8),
         cell=cell,
         near=np.ones(agents, dtype=bool),
-        entry_token=token.astype(np.int16),
-        entry_agent=row.astype(np.int16),
-        entry_cell=cell[row, token],
-        entry_offset_m=offset_m.astype(np.float32),
-        entry_heading=encode_heading(pose[row, token, 2] - pose[0, token, 2], grid),
-        entry_residual_rad=np.zeros(len(row), dtype=np.float32),
-        road_pose=road_pose.astype(np.float32),
-        road_z_m=np.zeros(roads, dtype=np.float32),
-        road_token=random.integers(NUM_ROADS, size=roads).astype(np.int16),
-        road_point_kind=random.integers(10, size=roads).astype(np.int8),
-        road_line_kind=random.integers(4, size=roads).astype(np.int8),
-        road_line=line.astype(np.int32),
-        road_signal=random.integers(len(SignalClass), size=roads).astype(np.int8),
-        signal_line=lit.astype(np.int32),
+        insertion_token=token.astype(np.int16),
+        insertion_agent=row.astype(np.int16),
+        insertion_cell=cell[row, token],
+        insertion_offset_m=offset_m.astype(np.float32),
+        insertion_heading=encode_heading(pose[row, token, 2] - pose[0, token, 2], grid),
+        insertion_residual_rad=np.zeros(len(row), dtype=np.float32),
+        map_pose=map_pose.astype(np.float32),
+        map_z_m=np.zeros(roads, dtype=np.float32),
+        map_token=random.integers(NUM_ROADS, size=roads).astype(np.int16),
+        map_point_type=random.integers(10, size=roads).astype(np.int8),
+        map_polyline_type=random.integers(4, size=roads).astype(np.int8),
+        map_polyline=line.astype(np.int32),
+        map_signal=random.integers(len(SignalClass), size=roads).astype(np.int8),
+        signal_polyline=lit.astype(np.int32),
         signal_state=_any_signal((len(lit), tokens)),
-        word=none.astype(np.uint8),
-        word_value=none.astype(np.int16),
-        word_agent=none.astype(np.int16),
-        word_token=none.astype(np.uint16),
+        sequence_type=none.astype(np.uint8),
+        sequence_value=none.astype(np.int16),
+        sequence_agent=none.astype(np.int16),
+        sequence_step=none.astype(np.uint16),
         anchor_agent=none.astype(np.int16),
         anchor_token=none.astype(np.int16),
         anchor_pose=np.empty((0, 3), dtype=np.float32),
@@ -219,11 +219,11 @@ def move_world(record, turn_rad, shift_m):
     frame = np.float32([*shift_m, turn_rad])
     absent = record.presence == Presence.ABSENT
     pose = to_world(record.pose, np.broadcast_to(frame, record.pose.shape))
-    road_pose = to_world(record.road_pose, np.broadcast_to(frame, record.road_pose.shape))
+    map_pose = to_world(record.map_pose, np.broadcast_to(frame, record.map_pose.shape))
     return replace(
         record,
         pose=np.where(absent[..., None], 0, pose).astype(np.float32),
-        road_pose=road_pose.astype(np.float32),
+        map_pose=map_pose.astype(np.float32),
     )
 
 
@@ -278,7 +278,7 @@ def grid_settings():
 
 
 @pytest.fixture(scope="session")
-def codebooks():
+def vocabularies():
     def make(num_motion_tokens=NUM_MOVES, num_map_tokens=NUM_ROADS):
         return make_motion_codebook(num_motion_tokens), make_road_codebook(num_map_tokens)
 

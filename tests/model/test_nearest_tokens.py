@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from infgen import geometry
 from infgen.model.nearest_tokens import MoveEnds, nearest, nearest_of, to_local, to_world
-from infgen.tokens.motion_tokens import advance, make_move_table, nearest_moves
+from infgen.tokens.motion_tokens import advance, make_match_table, nearest_motion_tokens
 from infgen.tokens.vocabulary import BOX_LW_M, MotionVocabulary
 
 CPU = torch.device("cpu")
@@ -36,17 +36,17 @@ def poses(rng, rows, far_m=30.0):
 @settings(max_examples=40)
 def test_the_nearest_move_is_the_same_on_tensors(seed, stray, rows):
     rng = np.random.default_rng(seed)
-    codebook = random_codebook(rng)
+    vocabulary = random_codebook(rng)
     kind = rng.integers(0, 3, rows).astype(np.int8)
     pose = poses(rng, rows)
-    ahead = advance(pose, kind, rng.integers(0, 200, rows).astype(np.int16), codebook)
+    ahead = advance(pose, kind, rng.integers(0, 200, rows).astype(np.int16), vocabulary)
     target = ahead + (rng.normal(size=(rows, 3)) * stray).astype(np.float32)
 
     wanted = torch.from_numpy(geometry.to_local(target, pose))
-    ends = MoveEnds.of(codebook, CPU)
+    ends = MoveEnds.of(vocabulary, CPU)
     found = nearest(wanted, torch.from_numpy(kind).long(), ends)
 
-    expected = nearest_moves(target, pose, kind, make_move_table(codebook))
+    expected = nearest_motion_tokens(target, pose, kind, make_match_table(vocabulary))
     np.testing.assert_array_equal(found.numpy(), expected)
 
 
@@ -66,9 +66,9 @@ def test_the_nearest_of_all_moves_is_the_nearest(seed):
 
 def test_the_nearest_of_some_is_among_them_and_the_first_of_twins():
     rng = np.random.default_rng(0)
-    codebook = random_codebook(rng)
-    ends = MoveEnds.of(codebook, CPU)
-    wanted = torch.from_numpy(codebook.end_pose[0, [1, 1, 7]])
+    vocabulary = random_codebook(rng)
+    ends = MoveEnds.of(vocabulary, CPU)
+    wanted = torch.from_numpy(vocabulary.end_pose[0, [1, 1, 7]])
     kind = torch.zeros(3, dtype=torch.int64)
     choice = torch.tensor([[1, 7, 100], [7, 100, 1], [7, 9, 3]])
 
@@ -78,9 +78,9 @@ def test_the_nearest_of_some_is_among_them_and_the_first_of_twins():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_the_search_is_exact_under_autocast(dtype):
     rng = np.random.default_rng(1)
-    codebook = random_codebook(rng)
-    ends = MoveEnds.of(codebook, CPU)
-    wanted = torch.from_numpy(codebook.end_pose[1])
+    vocabulary = random_codebook(rng)
+    ends = MoveEnds.of(vocabulary, CPU)
+    wanted = torch.from_numpy(vocabulary.end_pose[1])
     kind = torch.ones(200, dtype=torch.int64)
 
     with torch.autocast("cpu", dtype=torch.bfloat16, enabled=dtype == torch.bfloat16):

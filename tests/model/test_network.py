@@ -90,7 +90,7 @@ def cut_short(scene, tokens):
         for name in (
             "z_m",
             "pose",
-            "move",
+            "motion_token",
             "presence",
             "observed",
             "pattern",
@@ -98,11 +98,11 @@ def cut_short(scene, tokens):
             "signal_state",
         )
     }
-    kept = scene.entry_token < tokens
+    kept = scene.insertion_token < tokens
     entries = {
         field.name: getattr(scene, field.name)[kept]
         for field in fields(scene)
-        if field.name.startswith("entry_")
+        if field.name.startswith("insertion_")
     }
     return replace(scene, **per_token, **entries)
 
@@ -306,11 +306,11 @@ def test_sizes_follow_the_vocabularies(network, record, limits):
     assert outputs.roads.logits.shape[-1] == 12
 
 
-def test_the_network_carries_its_codebooks(network, codebooks):
-    motion, roads = codebooks()
+def test_the_network_carries_its_codebooks(network, vocabularies):
+    motion, roads = vocabularies()
 
-    np.testing.assert_array_equal(network.motion_codebook().path, motion.path)
-    np.testing.assert_array_equal(network.road_codebook().curve_m, roads.curve_m)
+    np.testing.assert_array_equal(network.motion_vocabulary().path, motion.path)
+    np.testing.assert_array_equal(network.map_vocabulary().curve_m, roads.curve_m)
 
 
 def test_every_parameter_is_used(new_network, record, limits):
@@ -323,8 +323,8 @@ def test_every_parameter_is_used(new_network, record, limits):
     assert [name for name, p in network.named_parameters() if p.grad is None] == []
 
 
-def test_the_papers_sizes_make_about_eleven_million_parameters(codebooks):
-    network = Network(ModelSettings(), *codebooks(2048, 1024), TokenSettings())
+def test_the_papers_sizes_make_about_eleven_million_parameters(vocabularies):
+    network = Network(ModelSettings(), *vocabularies(2048, 1024), TokenSettings())
 
     assert 11e6 < sum(p.numel() for p in network.parameters()) < 12e6
 
@@ -333,6 +333,6 @@ def test_leaving_agents_are_there_to_be_seen(network, record, limits):
     scene = record(1, lives=[(0, 3), (0, 6)])
     batch, outputs = run(network, [scene], limits)
 
-    leaving = batch.agents.presence == Presence.LEAVING
+    leaving = batch.agents.presence == Presence.REMOVED
     assert leaving.sum() == 1
     assert outputs.motion.rows.number[leaving].tolist() != [0]

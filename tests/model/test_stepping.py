@@ -10,7 +10,7 @@ from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.neighbours import grid_place
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import Column
-from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE, Presence
+from infgen.tokens.scene_tokens import NO_CELL, NO_MOTION_TOKEN, Presence
 
 CLOSE = {"atol": 1e-4, "rtol": 1e-4}
 
@@ -23,7 +23,7 @@ def column_at(agents, token, turns=OUTSIDE + 1):
         kind=agents.kind,
         size_lwh_m=agents.size_lwh_m,
         pose=agents.pose[:, token],
-        move=agents.move[:, token].masked_fill(hidden, NO_MOVE),
+        move=agents.move[:, token].masked_fill(hidden, NO_MOTION_TOKEN),
         presence=presence,
         observed=agents.observed[:, token] & ~hidden,
         cell=agents.cell[:, token].masked_fill(hidden, NO_CELL),
@@ -138,7 +138,7 @@ def test_weights_that_know_motion_only_let_nobody_in(tiny, new_network, records)
         kind=torch.zeros((2, 4), dtype=torch.int64),
         size_lwh_m=torch.ones((2, 4, 3)),
         pose=torch.zeros((2, 4, 3)),
-        move=torch.full((2, 4), NO_MOVE),
+        move=torch.full((2, 4), NO_MOTION_TOKEN),
         presence=torch.zeros((2, 4), dtype=torch.int64),
         observed=torch.zeros((2, 4), dtype=torch.bool),
         cell=torch.full((2, 4), NO_CELL),

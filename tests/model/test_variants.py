@@ -91,11 +91,11 @@ def test_figures_call_no_distance_right_or_wrong(tiny, new_network, batch):
     )
 
 
-def test_heads_that_are_off_leave_the_others_weights_as_they_were(codebooks, tiny):
+def test_heads_that_are_off_leave_the_others_weights_as_they_were(vocabularies, tiny):
     def weights(**switches):
         torch.manual_seed(0)
         grid = TokenSettings(grid_radius_m=60.0, grid_cell_m=4.0)
-        network = Network(replace(tiny, **switches), *codebooks(), grid)
+        network = Network(replace(tiny, **switches), *vocabularies(), grid)
         return dict(network.named_parameters())
 
     full, smart = weights(), weights(insertion_and_removal=False)
@@ -111,9 +111,9 @@ def test_heads_that_are_off_leave_the_others_weights_as_they_were(codebooks, tin
     assert weights(validity_pattern_tokens=True).keys() > full.keys()
 
 
-def test_smart_has_about_seven_million_parameters(codebooks):
+def test_smart_has_about_seven_million_parameters(vocabularies):
     settings = ModelSettings(insertion_and_removal=False, temporal_window_tokens=6)
-    network = Network(settings, *codebooks(2048, 1024), TokenSettings())
+    network = Network(settings, *vocabularies(2048, 1024), TokenSettings())
 
     assert 6.8e6 < sum(p.numel() for p in network.parameters()) < 7.4e6
 
@@ -123,7 +123,7 @@ def test_who_enters_where_changes_nothing_where_only_motion_is_modelled(
 ):
     network = new_network(replace(tiny, insertion_and_removal=False)).eval()
     agents = batch.agents
-    leaving = agents.presence == Presence.LEAVING
+    leaving = agents.presence == Presence.REMOVED
     presence = agents.presence.masked_fill(leaving, int(Presence.PRESENT))
     other = replace(agents, presence=presence, cell=agents.cell * 0)
 
@@ -189,7 +189,7 @@ def test_patterns_are_learned_as_long_as_an_agent_lives_on(batch, tiny, new_netw
     mask = pattern_mask(agents)
     following = torch.roll(agents.presence, -1, dims=1)[:, :-1]
 
-    lives_on = (following == Presence.PRESENT) | (following == Presence.LEAVING)
+    lives_on = (following == Presence.PRESENT) | (following == Presence.REMOVED)
     assert torch.equal(mask[:, :-1], agents.visible[:, :-1] & lives_on)
     assert not mask[:, -1].any()
     assert mask[:, :-1, 0].any()

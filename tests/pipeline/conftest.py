@@ -147,7 +147,7 @@ def train_settings():
 
 @pytest.fixture(scope="session")
 def shards(tmp_path_factory, crossing, metre_moves, bent_roads):
-    """Two token shards of three scenes each, and the codebooks they are written with."""
+    """Two token shards of three scenes each, and the vocabularies they are written with."""
     folder = tmp_path_factory.mktemp("shards")
     for number, name in enumerate(("training", "validation")):
         scenes = [crossing(speed_mps=8.0 + 2 * number + i) for i in range(3)]
@@ -177,7 +177,7 @@ def train_unit(shards):
     task = {
         "scenes": [str(shards / "training")],
         "validation_split": [str(shards / "validation")],
-        "codebooks": str(shards / "vocab"),
+        "vocabularies": str(shards / "vocab"),
     }
     return Unit("weights", {}, task)
 
@@ -197,7 +197,7 @@ def course(shards, tmp_path):
 
 @pytest.fixture
 def books(metre_moves, bent_roads):
-    """The codebooks of the shards."""
+    """The vocabularies of the shards."""
     return metre_moves, bent_roads
 
 

@@ -27,7 +27,7 @@ def player(metre_moves, bent_roads):
         network = Network(sizes, metre_moves, bent_roads, TokenSettings())
         return Player(
             stepper=Stepper(network),
-            codebook=metre_moves,
+            vocabulary=metre_moves,
             roads=bent_roads,
             tokens=TokenSettings(),
             settings=RolloutSettings(**{"seconds": 4.0, "max_agents": 24, **settings}),

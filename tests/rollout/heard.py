@@ -20,7 +20,7 @@ from infgen.model.token_step import Column, EntryDetails, EntryQuery, MotionStep
 from infgen.rollout.population import settle
 from infgen.rollout.recording import NOBODY
 from infgen.rollout.session import Session
-from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE, Presence
+from infgen.tokens.scene_tokens import NO_CELL, NO_MOTION_TOKEN, Presence
 
 QUERY_LOGITS = ("add_logit", "cell_logits", "place_m")
 DETAIL_LOGITS = ("kind_logits", "size_lwh_m", "heading_logits", "turned_rad", "offset_m")
@@ -71,7 +71,7 @@ class Listening(Stepper):
 
 def asked(entries, said, *where):
     """Note who asked; newcomers so far tell the turn."""
-    turn = (entries.column.presence == Presence.ENTERING).sum(dim=1)
+    turn = (entries.column.presence == Presence.INSERTED).sum(dim=1)
     return Asked(entries.token, entries.rollout, turn, said, *where)
 
 
@@ -169,8 +169,8 @@ def _agents(played):
         size_lwh_m=told("size_lwh_m", 0.0).amax(dim=1),
         near=torch.ones((rollouts, count), dtype=torch.bool),
         pose=told("pose", 0.0),
-        move=told("move", NO_MOVE),
-        label=told("move", NO_MOVE),
+        move=told("move", NO_MOTION_TOKEN),
+        label=told("move", NO_MOTION_TOKEN),
         presence=presence,
         observed=told("observed", False),
         pattern=torch.zeros_like(presence),
@@ -182,7 +182,7 @@ def _agents(played):
 
 def _turns(presence, now):
     """Turn of each agent among those that enter at its token: they are numbered so."""
-    entering = presence == Presence.ENTERING
+    entering = presence == Presence.INSERTED
     played = torch.arange(presence.shape[1])[:, None] > now
     turn = torch.where(played, entering.cumsum(dim=-1) - 1, OUTSIDE)
     return torch.where(entering, turn, -1)

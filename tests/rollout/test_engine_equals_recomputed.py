@@ -59,8 +59,8 @@ def compare(player, starts, half_seconds):
 def test_every_logit_of_thirty_seconds_is_that_of_a_plain_pass(starts, listening):
     played, gaps = compare(listening(), starts, 60)
 
-    entering = (played.presence == Presence.ENTERING)[2:]
-    exits = (played.presence == Presence.LEAVING).sum(axis=(0, 2))
+    entering = (played.presence == Presence.INSERTED)[2:]
+    exits = (played.presence == Presence.REMOVED).sum(axis=(0, 2))
     assert played.tokens == 2 + 60
     # How many there are differs between kinds of processors: draws near a boundary do.
     assert (entering.sum(axis=(0, 2)) >= 10).all()
@@ -90,7 +90,7 @@ def test_the_same_holds_for_variants(starts, listening, model, settings):
 
     played, gaps = compare(playing, starts[:2], 10)
 
-    assert (played.presence == Presence.ENTERING)[2:].sum() >= 3
+    assert (played.presence == Presence.INSERTED)[2:].sum() >= 3
     assert max(gaps.largest.values()) < CLOSE, gaps.largest
 
 
@@ -117,7 +117,7 @@ class Blind(Listening):
 
     def entry_add(self, entries, column):
         seen = super().entry_add(entries, column)
-        newcomers = (column.presence == Presence.ENTERING).any()
+        newcomers = (column.presence == Presence.INSERTED).any()
         return replace(seen, within=entries.within) if newcomers else seen
 
 

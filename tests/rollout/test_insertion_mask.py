@@ -7,8 +7,8 @@ from infgen.geometry import boxes_overlap
 from infgen.rollout.insertion_mask import make_room
 from infgen.rollout.population import Newcomers, settle
 from infgen.scene import AgentType
-from infgen.tokens.map import LineKind
-from infgen.tokens.scene_tokens import FIRST_MOVE
+from infgen.tokens.map import PolylineType
+from infgen.tokens.scene_tokens import FIRST_MOTION_TOKEN
 
 CAR, WALKER = AgentType.VEHICLE, AgentType.PEDESTRIAN
 SIZE = {CAR: (4.0, 2.0, 1.5), WALKER: (1.0, 1.0, 1.7)}
@@ -85,7 +85,7 @@ def test_nobody_enters_where_another_will_be_in_half_a_second(begun, books):
     stands = [room.allows(population, one).item() for one in ahead]
     population.move[0, 1] = 5
     drives = [room.allows(population, one).item() for one in ahead]
-    population.move[0, 1] = FIRST_MOVE
+    population.move[0, 1] = FIRST_MOTION_TOKEN
     enters = [room.allows(population, one).item() for one in ahead]
 
     assert stands == enters == [True, True, True]
@@ -123,7 +123,7 @@ def test_each_rollout_is_asked_on_its_own_map(parked, drive, start, books, build
     )
 
     # A map without lanes asks for none.
-    assert not (elsewhere.history.road_line_kind == LineKind.LANE).any()
+    assert not (elsewhere.history.map_polyline_type == PolylineType.LANE).any()
     assert room.allows(population, three).tolist() == [True, False, False]
 
 

@@ -12,8 +12,8 @@ from infgen.rollout.session import Session
 from infgen.scene import SignalState
 from infgen.settings import build
 from infgen.tokens.scene_tokens import SignalClass
-from infgen.tokens.signals import Lights
-from infgen.tokens.tokenizer import read_lights
+from infgen.tokens.signals import LoggedSignals
+from infgen.tokens.tokenizer import read_logged_signals
 
 SEES = {"signals_each_step": True}
 
@@ -55,17 +55,17 @@ def play(player, start):
 
 
 def test_lights_are_read_to_the_end_of_the_log(lit):
-    lights = read_lights(lit)
+    lights = read_logged_signals(lit)
 
-    assert len(lights.line) == 1
+    assert len(lights.polyline) == 1
     assert lights.shown.shape == (1, (lit.tracks.num_steps - 1) // 5)
     stop, go = SignalClass.STOP, SignalClass.GO
     assert lights.shown[0, :8].tolist() == [stop] * 6 + [go] * 2
 
 
 def test_what_follows_a_light_that_changes_changes_and_nothing_before(lit, play):
-    lasting = read_lights(lit)
-    changing = Lights(lasting.line, lasting.shown.copy())
+    lasting = read_logged_signals(lit)
+    changing = LoggedSignals(lasting.polyline, lasting.shown.copy())
     changing.shown[:, 5:] = SignalClass.CAUTION
 
     one, other = play(lit, lasting), play(lit, changing)
@@ -76,16 +76,18 @@ def test_what_follows_a_light_that_changes_changes_and_nothing_before(lit, play)
 
 
 def test_without_a_word_lights_stay_as_they_were_last(lit, play):
-    kept = read_lights(lit)
-    stays = Lights(kept.line, kept.shown[:, :2])
+    kept = read_logged_signals(lit)
+    stays = LoggedSignals(kept.polyline, kept.shown[:, :2])
 
     for a, b in zip(play(lit, None), play(lit, stays), strict=True):
         torch.testing.assert_close(a, b)
 
 
 def test_a_light_nobody_looks_at_any_more_looks_like_no_light_that_is_seen(lit, play):
-    kept = read_lights(lit)
-    held = Lights(kept.line, np.repeat(kept.shown[:, 1:2], kept.shown.shape[1], axis=1))
+    kept = read_logged_signals(lit)
+    held = LoggedSignals(
+        kept.polyline, np.repeat(kept.shown[:, 1:2], kept.shown.shape[1], axis=1)
+    )
 
     one, other = play(lit, held), play(lit, None)
 
@@ -94,7 +96,7 @@ def test_a_light_nobody_looks_at_any_more_looks_like_no_light_that_is_seen(lit, 
 
 
 def test_weights_that_do_not_see_lights_change_are_not_told(lit, play):
-    lights = read_lights(lit)
+    lights = read_logged_signals(lit)
 
     told, untold = (play(lit, each, {}) for each in (lights, None))
 
@@ -102,8 +104,8 @@ def test_weights_that_do_not_see_lights_change_are_not_told(lit, play):
 
 
 def test_lights_of_scenes_side_by_side_last_as_long_as_each_has_them(lit, play):
-    lights = read_lights(lit)
-    shorter = Lights(lights.line, lights.shown[:, :7])
+    lights = read_logged_signals(lit)
+    shorter = LoggedSignals(lights.polyline, lights.shown[:, :7])
     same = np.array_equal(lights.shown[:, 6], lights.shown[:, -1])
 
     assert same  # Green to the end of the log.

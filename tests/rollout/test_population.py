@@ -14,9 +14,14 @@ from infgen.rollout.population import (
 )
 from infgen.scene import AgentType
 from infgen.tokens.grid import make_grid
-from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
+from infgen.tokens.scene_tokens import (
+    FIRST_MOTION_TOKEN,
+    NO_CELL,
+    NO_MOTION_TOKEN,
+    Presence,
+)
 
-PRESENT, LEAVING = Presence.PRESENT, Presence.LEAVING
+PRESENT, REMOVED = Presence.PRESENT, Presence.REMOVED
 
 
 def newcomers(who, cell, heading=60, offset_m=(0.0, 0.0)):
@@ -90,7 +95,7 @@ def test_everyone_moves_by_the_move_of_their_row(parked, start, metre_moves):
 
     np.testing.assert_allclose(after.pose[0, :2, 0], [5, 18], atol=1e-4)
     np.testing.assert_allclose(path[0, 0, :, 0], [1, 2, 3, 4, 5], atol=1e-4)
-    np.testing.assert_array_equal(after.move[0], [5, 10, NO_MOVE])
+    np.testing.assert_array_equal(after.move[0], [5, 10, NO_MOTION_TOKEN])
     np.testing.assert_array_equal(after.pose[0, 2], 0)
 
 
@@ -104,7 +109,7 @@ def test_whoever_leaves_is_there_once_more_and_then_gone_for_good(
     leaving, path = move_on(population, move, leave, metre_moves)
     gone, after = move_on(leaving, move, leave, metre_moves)
 
-    np.testing.assert_array_equal(leaving.presence[0], [PRESENT, LEAVING])
+    np.testing.assert_array_equal(leaving.presence[0], [PRESENT, REMOVED])
     assert path[0, 1].any()
     assert gone.life[0, 1] == NOBODY
     assert gone.presence[0, 1] == Presence.ABSENT
@@ -133,7 +138,7 @@ def test_whoever_crosses_the_circle_outwards_leaves_and_who_was_outside_stays(
     after = leave_beyond(before, moved, 18.0)
 
     np.testing.assert_array_equal(
-        after.presence[0], [PRESENT, PRESENT, LEAVING, PRESENT, 0]
+        after.presence[0], [PRESENT, PRESENT, REMOVED, PRESENT, 0]
     )
     np.testing.assert_array_equal(moved.presence[0, 1:4], PRESENT)
 
@@ -146,8 +151,8 @@ def test_a_newcomer_takes_the_first_free_row_with_a_life_of_its_own(parked, star
     np.testing.assert_array_equal(row, [2, -1])
     np.testing.assert_array_equal(after.life[0], [0, 1, 2, NOBODY])
     np.testing.assert_array_equal(after.born, [3, 3])
-    assert after.presence[0, 2] == Presence.ENTERING
-    assert after.move[0, 2] == FIRST_MOVE
+    assert after.presence[0, 2] == Presence.INSERTED
+    assert after.move[0, 2] == FIRST_MOTION_TOKEN
     assert not after.observed[0, 2]
     assert population.life[0, 2] == NOBODY, "the population it came from stays as it was"
 

@@ -8,7 +8,7 @@ from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence
 
 
-def play(begin, codebook, grid, seconds, speed=5, leave_at=None, add_at=None):
+def play(begin, vocabulary, grid, seconds, speed=5, leave_at=None, add_at=None):
     """Everyone drives at one speed; row 1 may leave, someone may enter 30 m ahead."""
     population = settle([begin], min_rows=4)[-1]
     now = begin.history.now
@@ -16,7 +16,7 @@ def play(begin, codebook, grid, seconds, speed=5, leave_at=None, add_at=None):
         shape = population.life.shape
         leave = np.zeros(shape, bool)
         leave[0, 1] = token == leave_at
-        moved, path = move_on(population, np.full(shape, speed), leave, codebook)
+        moved, path = move_on(population, np.full(shape, speed), leave, vocabulary)
         population = moved
         if token == add_at:
             population, _ = enter(moved, car_ahead(grid))
@@ -25,7 +25,7 @@ def play(begin, codebook, grid, seconds, speed=5, leave_at=None, add_at=None):
             life=moved.life,
             path=path,
             shown=np.ones(path.shape[:3], bool),
-            leaving=moved.presence == Presence.LEAVING,
+            leaving=moved.presence == Presence.REMOVED,
             born=np.where(population.life != moved.life, population.life, np.int32(NOBODY)),
             kind=population.kind,
             size_lwh_m=population.size_lwh_m,

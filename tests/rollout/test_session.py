@@ -73,7 +73,7 @@ def test_a_way_that_turns_past_west_is_not_driven_backwards(session):
 
 
 def test_errors_of_moves_do_not_add_up(session):
-    # The codebook has whole metres only; 4.4 m per half second is none of its moves.
+    # The vocabulary has whole metres only; 4.4 m per half second is none of its moves.
     driven = session()
     gaps_m, moves = [], []
     for step in range(1, 6):
@@ -99,7 +99,7 @@ def test_others_react_in_the_next_half_second_and_not_before(session):
 
 def test_the_network_takes_over_from_where_the_ego_really_is(session):
     driven = session()
-    driven.step(pose(-25.4, 0.2))  # No move of the codebook ends there.
+    driven.step(pose(-25.4, 0.2))  # No move of the vocabulary ends there.
 
     frame = driven.step()
 

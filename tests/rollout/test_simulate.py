@@ -30,8 +30,8 @@ def play(network):
     def run(starts, **settings):
         player = Player(
             stepper=Stepper(network),
-            codebook=network.motion_codebook(),
-            roads=network.road_codebook(),
+            vocabulary=network.motion_vocabulary(),
+            roads=network.map_vocabulary(),
             tokens=network.grid_settings,
             settings=RolloutSettings(**{"seconds": 4.0, "max_agents": 24, **settings}),
             device=torch.device("cpu"),

@@ -26,7 +26,7 @@ VARIANTS = {
     "patterns": {"validity_pattern_tokens": True},
 }
 FASTEST_M = 20.0
-"""The longest move of the codebook of these tests."""
+"""The longest move of the vocabulary of these tests."""
 
 
 def play(player, starts):
@@ -52,7 +52,7 @@ def check_session(session, frames, grid):
         born = {(r, frame.born[r, row]) for r, row in np.argwhere(frame.born != NOBODY)}
         assert not born & (ids | lives), "every newcomer is a new agent"
         ids |= lives | born
-        entering = after.presence == Presence.ENTERING
+        entering = after.presence == Presence.INSERTED
         assert (after.cells(grid)[entering] >= 0).all(), "newcomers are in the grid"
         assert (after.presence[:, EGO_ROW] == Presence.PRESENT).all()
     return ids
@@ -201,7 +201,7 @@ def test_newcomers_are_kept_off_others_and_near_lanes(parked, start, player, for
     for _ in range(3):
         session.step()
         now = session.population
-        entering = now.presence == Presence.ENTERING
+        entering = now.presence == Presence.INSERTED
         entered += entering.sum()
         vehicles += (entering & (now.kind == AgentType.VEHICLE)).sum()
         for rollout, row in np.argwhere(entering):

@@ -53,7 +53,7 @@ def expected_tracks(message, origin) -> Tracks:
     valid = [[state.valid for state in track.states] for track in message.tracks]
     return Tracks(
         id=np.array([t.id for t in message.tracks], np.int32),
-        kind=np.array([(t.object_type or 4) - 1 for t in message.tracks], np.int8),
+        agent_type=np.array([(t.object_type or 4) - 1 for t in message.tracks], np.int8),
         xyz_m=(table[..., :3] - origin).astype(np.float32),
         heading_rad=table[..., 3].astype(np.float32),
         velocity_mps=table[..., 4:6].astype(np.float32),
@@ -102,14 +102,14 @@ def expected_map(message, origin) -> RoadMap:
     boundary = list(zip(*boundaries, strict=True)) or [()] * 6
     return RoadMap(
         feature_id=np.array(ids, np.int64),
-        feature_kind=np.array(kinds, np.int8),
-        feature_type=np.array(types, np.int8),
+        feature_type=np.array(kinds, np.int8),
+        feature_subtype=np.array(types, np.int8),
         speed_limit_mph=np.array(speeds, np.float32),
         interpolating=np.array(interpolating, bool),
         point_offsets=np.cumsum([0, *map(len, points)]),
         xyz_m=np.concatenate([np.empty((0, 3), np.float32), *points]),
         link_lane_id=np.array(link[0], np.int64),
-        link_kind=np.array(link[1], np.int8),
+        link_type=np.array(link[1], np.int8),
         link_other_id=np.array(link[2], np.int64),
         neighbour_lane_id=np.array(neighbour[0], np.int64),
         neighbour_side=np.array(neighbour[1], np.int8),

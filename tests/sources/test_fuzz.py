@@ -38,7 +38,7 @@ def check_usable(scene: Scene) -> None:
     assert tracks.valid[scene.ego, scene.now]
     assert road_map.point_offsets[-1] == len(road_map.xyz_m)
     assert (np.diff(road_map.point_offsets) >= 0).all()
-    assert ((tracks.kind >= 0) & (tracks.kind <= 3)).all()
+    assert ((tracks.agent_type >= 0) & (tracks.agent_type <= 3)).all()
 
 
 @given(at=st.integers(0, len(SOUND) - 1), bits=st.integers(1, 255))

@@ -6,9 +6,9 @@ import pytest
 from infgen.geometry import box_corners, wrap_angle
 from infgen.scene import (
     AgentType,
-    FeatureKind,
+    FeatureType,
     LaneType,
-    LinkKind,
+    LinkType,
     RoadEdgeType,
     SignalState,
 )
@@ -89,7 +89,7 @@ def test_scenes_have_the_steps_and_roles_of_womd(scenes):
         assert scene.now == 10
         np.testing.assert_allclose(np.diff(scene.timestamps_s), 0.1)
         assert scene.tracks.valid[scene.ego].all()
-        assert scene.tracks.kind[scene.ego] == AgentType.VEHICLE
+        assert scene.tracks.agent_type[scene.ego] == AgentType.VEHICLE
         assert scene.ego not in scene.predict_row
         assert scene.tracks.valid[scene.predict_row, scene.now].all()
         assert set(scene.predict_difficulty) <= {1, 2}
@@ -98,7 +98,7 @@ def test_scenes_have_the_steps_and_roles_of_womd(scenes):
 
 def test_all_kinds_of_agents_come_in_both_splits(scenes):
     for part in (scenes[:24], scenes[24:]):
-        kinds = np.concatenate([scene.tracks.kind for scene in part])
+        kinds = np.concatenate([scene.tracks.agent_type for scene in part])
         assert set(kinds) == {AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST}
 
 
@@ -144,14 +144,14 @@ def _off_road_m(scene, *, moving=True):
     """Signed distance to the nearest road edge of each vehicle's most off-road corner."""
     tracks = scene.tracks
     moves = np.linalg.norm(tracks.velocity_mps, axis=-1).max(axis=1) > 0.5
-    rows = (tracks.kind == AgentType.VEHICLE) & (moves == moving)
+    rows = (tracks.agent_type == AgentType.VEHICLE) & (moves == moving)
     pose = np.concatenate([tracks.xyz_m[..., :2], tracks.heading_rad[..., None]], axis=-1)
     shown = tracks.valid[rows][:, ::15]
     corners_m = box_corners(pose[rows][:, ::15], tracks.size_lwh_m[rows][:, ::15, :2])[
         shown
     ]
     starts_m, ends_m = [], []
-    for row in scene.road_map.rows(FeatureKind.ROAD_EDGE):
+    for row in scene.road_map.rows(FeatureType.ROAD_EDGE):
         points_m = scene.road_map.points(int(row))[:, :2]
         starts_m.append(points_m[:-1])
         ends_m.append(points_m[1:])
@@ -179,7 +179,7 @@ def test_vehicles_hardly_ever_overlap(scenes):
     shares, driving = [], []
     for scene in scenes:
         tracks = scene.tracks
-        cars = np.flatnonzero(tracks.kind == AgentType.VEHICLE)
+        cars = np.flatnonzero(tracks.agent_type == AgentType.VEHICLE)
         for step in range(0, 91, 10):
             rows = cars[tracks.valid[cars, step]]
             pose = np.column_stack(
@@ -208,7 +208,7 @@ def _overlaps(corners_m):
 def test_motion_is_smooth(scenes):
     for scene in scenes:
         tracks = scene.tracks
-        cars = tracks.kind == AgentType.VEHICLE
+        cars = tracks.agent_type == AgentType.VEHICLE
         step_m = np.linalg.norm(np.diff(tracks.xyz_m[cars, :, :2], axis=1), axis=-1)
         both = tracks.valid[cars, 1:] & tracks.valid[cars, :-1]
         turned_rad = wrap_angle(np.diff(tracks.heading_rad[cars], axis=1))
@@ -246,7 +246,7 @@ def _crossings(scene):
         lit = np.bincount(signals.step[rows], minlength=steps)
         red = (np.bincount(signals.step[rows], waits, minlength=steps) == lit) & (lit > 0)
         over = _crosses(scene, int(signals.lane_id[rows[0]]), stop_m)
-        over &= (tracks.kind != AgentType.PEDESTRIAN)[:, None]
+        over &= (tracks.agent_type != AgentType.PEDESTRIAN)[:, None]
         assert not over[:, red[1:]].any()
         crossed += over.sum()
     return crossed
@@ -283,15 +283,15 @@ def test_boxes_stand_on_the_ground(scenes):
 
 
 def test_every_kind_of_feature_appears(scenes):
-    kinds = set(np.concatenate([scene.road_map.feature_kind for scene in scenes]))
-    assert kinds == set(FeatureKind)
+    kinds = set(np.concatenate([scene.road_map.feature_type for scene in scenes]))
+    assert kinds == set(FeatureType)
 
 
 def test_lanes_that_follow_each_other_touch(scenes):
     for scene in scenes[:8]:
         road_map = scene.road_map
         row = {int(feature): at for at, feature in enumerate(road_map.feature_id)}
-        exits = road_map.link_kind == LinkKind.EXIT
+        exits = road_map.link_type == LinkType.EXIT
         for lane, other in zip(
             road_map.link_lane_id[exits], road_map.link_other_id[exits], strict=True
         ):
@@ -344,11 +344,11 @@ def test_roads_have_kerbs_and_islands_and_named_types(scenes):
     found = set()
     for scene in scenes:
         road_map = scene.road_map
-        edges = road_map.rows(FeatureKind.ROAD_EDGE)
+        edges = road_map.rows(FeatureType.ROAD_EDGE)
         assert len(edges) > 4
-        found |= set(road_map.feature_type[edges].tolist())
-        lanes = road_map.rows(FeatureKind.LANE)
-        assert set(road_map.feature_type[lanes]) <= {
+        found |= set(road_map.feature_subtype[edges].tolist())
+        lanes = road_map.rows(FeatureType.LANE)
+        assert set(road_map.feature_subtype[lanes]) <= {
             LaneType.SURFACE_STREET,
             LaneType.BIKE_LANE,
         }
@@ -360,10 +360,10 @@ def test_lanes_have_the_road_edge_on_their_right(scenes):
     right = []
     for scene in scenes:
         road_map = scene.road_map
-        lanes = [road_map.points(int(row)) for row in road_map.rows(FeatureKind.LANE)]
+        lanes = [road_map.points(int(row)) for row in road_map.rows(FeatureType.LANE)]
         middles_m = np.array([points[len(points) // 2, :2] for points in lanes])
         edges = [
-            road_map.points(int(r))[:, :2] for r in road_map.rows(FeatureKind.ROAD_EDGE)
+            road_map.points(int(r))[:, :2] for r in road_map.rows(FeatureType.ROAD_EDGE)
         ]
         start_m = np.concatenate([points[:-1] for points in edges])
         way_m = np.concatenate([np.diff(points, axis=0) for points in edges])

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from infgen.scene import (
     AgentType,
-    FeatureKind,
-    LinkKind,
+    FeatureType,
+    LinkType,
     Scene,
     Side,
     SignalState,
@@ -64,7 +64,7 @@ def test_tracks_keep_ids_kinds_sizes_and_roles():
     scene = scene_of()
 
     assert scene.tracks.id.tolist() == [7, 9]
-    assert scene.tracks.kind.tolist() == [AgentType.VEHICLE, AgentType.PEDESTRIAN]
+    assert scene.tracks.agent_type.tolist() == [AgentType.VEHICLE, AgentType.PEDESTRIAN]
     assert scene.tracks.size_lwh_m[0, 0].tolist() == [4.5, 2.0, 1.5]
     assert scene.tracks.valid[1].tolist() == [False, False] + [True] * (STEPS - 2)
     assert (scene.ego, scene.now, scene.tracks.num_steps) == (0, NOW, STEPS)
@@ -76,13 +76,13 @@ def test_the_map_keeps_kinds_points_and_relations():
     road_map = scene_of().road_map
 
     assert road_map.feature_id.tolist() == [100, 101, 300, 301, 400, 500, 600, 700]
-    assert road_map.feature_kind.tolist() == [3, 3, 4, 5, 7, 8, 9, 10]
-    assert road_map.feature_type.tolist() == [2, 3, 7, 1, 0, 0, 0, 0]
+    assert road_map.feature_type.tolist() == [3, 3, 4, 5, 7, 8, 9, 10]
+    assert road_map.feature_subtype.tolist() == [2, 3, 7, 1, 0, 0, 0, 0]
     assert np.diff(road_map.point_offsets).tolist() == [3, 4, 4, 5, 1, 4, 4, 4]
     assert road_map.speed_limit_mph.tolist() == [25, 25, 0, 0, 0, 0, 0, 0]
     assert road_map.points(4).tolist() == [[5.0, 1.0, 1.0]]
-    links = zip(road_map.link_kind, road_map.link_other_id, strict=True)
-    entry, leave = LinkKind.ENTRY, LinkKind.EXIT
+    links = zip(road_map.link_type, road_map.link_other_id, strict=True)
+    entry, leave = LinkType.ENTRY, LinkType.EXIT
     assert [*links] == [(entry, 98), (entry, 99), (leave, 200)]
     assert road_map.neighbour_span.tolist() == [[0, 2, 1, 3]]
     assert road_map.boundary_side.tolist() == [Side.LEFT, Side.RIGHT]
@@ -149,7 +149,7 @@ def test_unset_and_unknown_kinds_of_agents_are_other():
         message.tracks[0].ClearField("object_type")
         message.tracks[1].object_type = 77
 
-    assert scene_of(change).tracks.kind.tolist() == [AgentType.OTHER] * 2
+    assert scene_of(change).tracks.agent_type.tolist() == [AgentType.OTHER] * 2
 
 
 def test_unknown_enum_values_are_unset():
@@ -161,7 +161,7 @@ def test_unknown_enum_values_are_unset():
 
     scene = scene_of(change)
 
-    assert scene.road_map.feature_type[[0, 2]].tolist() == [0, 0]
+    assert scene.road_map.feature_subtype[[0, 2]].tolist() == [0, 0]
     assert scene.signals.state[0] == SignalState.UNKNOWN
     assert scene.predict_difficulty.tolist() == [0]
 
@@ -201,7 +201,7 @@ def test_a_stop_sign_without_position_has_no_points():
     road_map = scene_of(change).road_map
 
     assert len(road_map.points(4)) == 0
-    assert road_map.feature_kind[4] == FeatureKind.STOP_SIGN
+    assert road_map.feature_type[4] == FeatureType.STOP_SIGN
 
 
 def test_packed_and_single_timestamps_and_lanes_are_read_alike():

@@ -199,7 +199,7 @@ def test_real_logs_survive_being_written_and_read_again(split):
 
 def test_tracks_of_every_kind_keep_it(small):
     kinds = np.array([3, 2], np.int8)
-    tracks: Tracks = dataclasses.replace(small.tracks, kind=kinds)
+    tracks: Tracks = dataclasses.replace(small.tracks, agent_type=kinds)
 
     message = Scenario.FromString(
         encode_scenario(dataclasses.replace(small, tracks=tracks))

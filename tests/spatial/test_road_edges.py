@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from infgen.spatial.nearest import nearest_by_cells
-from infgen.spatial.road_edges import NONE, RoadError, build_edges, signed_distance_m
+from infgen.spatial.road_edges import NONE, RoadError, build_road_edges, signed_distance_m
 
 
 def line(*xy, z=0.0):
@@ -18,7 +18,7 @@ def at(edges, *points):
     return signed_distance_m(np.array(points, dtype=np.float32), edges)
 
 
-EAST = build_edges([line((0, 0), (10, 0), (20, 0))])
+EAST = build_road_edges([line((0, 0), (10, 0), (20, 0))])
 
 
 def test_left_of_an_edge_is_on_the_road_and_negative():
@@ -31,15 +31,15 @@ def test_beyond_the_end_of_an_edge_the_distance_is_to_its_end():
 
 def test_a_bridge_overhead_does_not_catch_the_cars_below():
     # The bridge's edge is right above, 5 m up: 15 m away when heights weigh threefold.
-    edges = build_edges([line((0, 0), (20, 0)), line((0, 8), (20, 8), z=5.0)])
+    edges = build_road_edges([line((0, 0), (20, 0)), line((0, 8), (20, 8), z=5.0)])
 
     assert at(edges, (10, 7.9, 0))[0] == pytest.approx(-7.9)
 
 
 def test_inside_a_convex_corner_both_segments_must_agree_it_is_off_the_road():
     # A left turn: the road is inside it. Beyond the vertex the larger sign counts.
-    left = build_edges([line((0, 0), (10, 0), (10, 10))])
-    right = build_edges([line((0, 0), (10, 0), (10, -10))])
+    left = build_road_edges([line((0, 0), (10, 0), (10, 10))])
+    right = build_road_edges([line((0, 0), (10, 0), (10, -10))])
 
     assert at(left, (11, -1, 0))[0] > 0
     assert at(right, (11, 1, 0))[0] < 0
@@ -53,27 +53,27 @@ def square(size, closed=True):
 
 
 def test_an_edge_is_closed_only_if_no_other_has_more_points():
-    alone = build_edges([square(10)])
-    beside = build_edges([square(10), line(*[(50 + i, 50) for i in range(9)])])
+    alone = build_road_edges([square(10)])
+    beside = build_road_edges([square(10), line(*[(50 + i, 50) for i in range(9)])])
 
     assert (alone.before[0], alone.after[3]) == (3, 0)
     assert (beside.before[0], beside.after[3]) == (NONE, NONE)
 
 
 def test_a_closed_edge_is_looked_at_around_its_seam():
-    closed = build_edges([square(10)])
+    closed = build_road_edges([square(10)])
 
     assert at(closed, (-1, -2, 0))[0] == pytest.approx(np.hypot(1, 2), rel=1e-5)
 
 
 def test_edges_of_one_point_are_left_out_and_none_at_all_is_an_error():
-    assert len(build_edges([line((0, 0)), line((0, 0), (1, 0))]).start_m) == 1
+    assert len(build_road_edges([line((0, 0)), line((0, 0), (1, 0))]).start_m) == 1
     with pytest.raises(RoadError, match="no road edge"):
-        build_edges([line((0, 0))])
+        build_road_edges([line((0, 0))])
 
 
 def test_a_point_that_is_given_twice_makes_no_nan():
-    doubled = build_edges([line((0, 0), (0, 0), (10, 0))])
+    doubled = build_road_edges([line((0, 0), (0, 0), (10, 0))])
 
     assert np.isfinite(at(doubled, (5, 1, 0), (-1, 0, 0))).all()
 

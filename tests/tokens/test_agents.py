@@ -7,8 +7,13 @@ from infgen.config import TokenSettings
 from infgen.scene import AgentType
 from infgen.tokens.agents import decode_tracks, match_agents
 from infgen.tokens.grid import make_grid
-from infgen.tokens.motion_tokens import make_move_table
-from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
+from infgen.tokens.motion_tokens import make_match_table
+from infgen.tokens.scene_tokens import (
+    FIRST_MOTION_TOKEN,
+    NO_CELL,
+    NO_MOTION_TOKEN,
+    Presence,
+)
 from infgen.tokens.tracks import read_paths
 
 SETTINGS = TokenSettings()
@@ -19,7 +24,7 @@ GRID = make_grid(SETTINGS)
 def match(metre_moves):
     def run(scene, order="distance"):
         paths = read_paths(scene, SETTINGS)
-        return match_agents(paths, make_move_table(metre_moves), GRID, order)
+        return match_agents(paths, make_match_table(metre_moves), GRID, order)
 
     return run
 
@@ -38,14 +43,14 @@ def flickering(build_scene):
 def test_a_drive_the_codebook_can_write_is_written_exactly(match, drive, kind):
     matrix, _, _ = match(drive(speed_mps=10.0, kind=AgentType(kind)))
 
-    np.testing.assert_array_equal(matrix.move, [[FIRST_MOVE] + [5] * 17])
+    np.testing.assert_array_equal(matrix.motion_token, [[FIRST_MOTION_TOKEN] + [5] * 17])
     np.testing.assert_allclose(matrix.pose[0, :, 0], 5.0 * np.arange(1, 19), atol=1e-4)
 
 
 def test_errors_are_corrected_by_the_next_move_and_never_add_up(match, drive):
     matrix, _, _ = match(drive(speed_mps=9.0))  # 4.5 m: between two moves
 
-    assert set(matrix.move[0, 1:]) == {4, 5}
+    assert set(matrix.motion_token[0, 1:]) == {4, 5}
     error_m = matrix.pose[0, :, 0] - 4.5 * np.arange(1, 19)
     assert np.abs(error_m).max() <= 0.5 + 1e-4
 
@@ -53,10 +58,10 @@ def test_errors_are_corrected_by_the_next_move_and_never_add_up(match, drive):
 def test_the_first_half_second_of_a_newcomer_is_swallowed(match, crossing):
     matrix, entries, _ = match(crossing())  # row 2 is known from step 30 on
 
-    assert matrix.presence[2, 6] == Presence.ENTERING
-    assert matrix.move[2, 6] == FIRST_MOVE
+    assert matrix.presence[2, 6] == Presence.INSERTED
+    assert matrix.motion_token[2, 6] == FIRST_MOTION_TOKEN
     assert not matrix.observed[2, 6]
-    assert (matrix.move[2, :6] == NO_MOVE).all()
+    assert (matrix.motion_token[2, :6] == NO_MOTION_TOKEN).all()
     np.testing.assert_allclose(matrix.pose[2, 6, :2], [22, 8 - 1.4 * 3.5], atol=1e-4)
     assert entries.token.tolist() == [0, 0, 0, 6]
 
@@ -93,7 +98,7 @@ def test_in_a_gap_an_agent_is_present_keeps_its_pose_and_has_no_move(match, flic
     # Known at borders up to 15 and from 50 on: tokens 3 to 9 are not seen.
     assert (matrix.presence[1, 1:] == Presence.PRESENT).all()
     np.testing.assert_array_equal(matrix.observed[1], [0] + [1] * 2 + [0] * 7 + [1] * 8)
-    np.testing.assert_array_equal(matrix.move[1, 3:10], [NO_MOVE] * 7)
+    np.testing.assert_array_equal(matrix.motion_token[1, 3:10], [NO_MOTION_TOKEN] * 7)
     np.testing.assert_array_equal(matrix.cell[1, 3:10], [NO_CELL] * 7)
     np.testing.assert_allclose(matrix.pose[1, 2:9, 0], 15.0, atol=1e-4)
 
@@ -159,7 +164,7 @@ def test_an_agent_of_a_single_token_enters_and_is_gone(match, build_scene):
 
     matrix, entries, _ = match(build_scene(path, [0, 0], valid))
 
-    states = [Presence.ABSENT, Presence.ENTERING, *[Presence.ABSENT] * 16]
+    states = [Presence.ABSENT, Presence.INSERTED, *[Presence.ABSENT] * 16]
     np.testing.assert_array_equal(matrix.presence[1], states)
     assert entries.token.tolist() == [0, 1]
 
@@ -185,6 +190,6 @@ def test_the_whole_matrix_turns_with_the_world(match, crossing):
 
     (here, entries, _), (there, others, _) = match(scene), match(moved)
 
-    np.testing.assert_array_equal(here.move, there.move)
+    np.testing.assert_array_equal(here.motion_token, there.motion_token)
     np.testing.assert_array_equal(here.presence, there.presence)
     np.testing.assert_allclose(entries.offset_m, others.offset_m, atol=1e-3)

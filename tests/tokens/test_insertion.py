@@ -6,10 +6,10 @@ from hypothesis.extra.numpy import arrays
 from infgen.config import TokenSettings
 from infgen.tokens.grid import make_grid
 from infgen.tokens.insertion import (
-    decode_entries,
-    encode_entries,
+    decode_insertions,
+    encode_insertions,
     insertion_order,
-    join_entries,
+    join_insertions,
 )
 from infgen.tokens.scene_tokens import NO_CELL
 
@@ -19,7 +19,7 @@ EGO = np.float32([100, 50, np.pi / 2])  # facing north
 
 def encode(*poses, token=3, ego=EGO):
     pose = np.float32(poses)
-    return encode_entries(token, np.arange(len(pose)), pose, ego, GRID)
+    return encode_insertions(token, np.arange(len(pose)), pose, ego, GRID)
 
 
 def test_a_newcomer_is_a_cell_a_bin_and_what_they_leave_out():
@@ -39,7 +39,7 @@ def test_beyond_the_grid_the_offset_is_the_whole_way():
     assert entry.cell[0] == NO_CELL
     np.testing.assert_allclose(entry.offset_m, [[0, 100]], atol=1e-4)
     np.testing.assert_allclose(
-        decode_entries(entry, EGO, GRID), [[100, 150, np.pi / 2]], atol=1e-4
+        decode_insertions(entry, EGO, GRID), [[100, 150, np.pi / 2]], atol=1e-4
     )
 
 
@@ -50,7 +50,7 @@ def test_beyond_the_grid_the_offset_is_the_whole_way():
 def test_entries_decode_to_the_pose_they_were_made_from(pose, ego):
     pose[:, 2] = (pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
 
-    decoded = decode_entries(encode(*pose, ego=ego), ego, GRID)
+    decoded = decode_insertions(encode(*pose, ego=ego), ego, GRID)
 
     np.testing.assert_allclose(decoded[:, :2], pose[:, :2], atol=1e-4)
     turn = decoded[:, 2] - pose[:, 2]
@@ -79,7 +79,7 @@ def test_bearing_sweeps_from_behind_over_the_right_and_the_front_to_the_left():
 
 
 def test_newcomers_of_one_token_are_found_again():
-    joined = join_entries(
+    joined = join_insertions(
         [encode((1, 2, 0), token=0), encode((3, 4, 0), (5, 6, 0), token=2)]
     )
 

@@ -6,11 +6,17 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from infgen.scene import FeatureKind, LaneType, RoadEdgeType, RoadLineType
-from infgen.tokens.map import LineKind, PointKind, match_curves, match_roads, road_pieces
+from infgen.scene import FeatureType, LaneType, RoadEdgeType, RoadLineType
+from infgen.tokens.map import (
+    PointType,
+    PolylineType,
+    cut_map_tokens,
+    match_map_tokens,
+    nearest_map_tokens,
+)
 from infgen.tokens.vocabulary import MapVocabulary
 
-LANE = (FeatureKind.LANE, LaneType.SURFACE_STREET)
+LANE = (FeatureType.LANE, LaneType.SURFACE_STREET)
 
 
 def along_x(length_m, spacing_m=0.5):
@@ -24,7 +30,7 @@ def pieces_of(build_map):
 
     def build(*lines):
         named = [(number + 1, *LANE, points) for number, points in enumerate(lines)]
-        return road_pieces(build_map(named))
+        return cut_map_tokens(build_map(named))
 
     return build
 
@@ -36,7 +42,7 @@ def test_a_straight_line_of_twenty_metres_gives_four_pieces(pieces_of):
     )
     np.testing.assert_allclose(pieces.length_m, 5, atol=1e-5)
     np.testing.assert_allclose(pieces.sample_m[2], [[0, 0], [2.5, 0], [5, 0]], atol=1e-5)
-    np.testing.assert_array_equal(pieces.line, 0)
+    np.testing.assert_array_equal(pieces.polyline, 0)
     np.testing.assert_array_equal(pieces.feature_id, 1)
 
 
@@ -82,7 +88,7 @@ def test_lines_are_broken_where_points_are_far_apart(pieces_of):
     gap = np.concatenate([along_x(6.0), along_x(6.0) + np.array([17.0, 0.0])])
     pieces = pieces_of(gap)
     np.testing.assert_allclose(pieces.pose[:, 0], [0, 17], atol=1e-5)
-    np.testing.assert_array_equal(pieces.line, [0, 0])
+    np.testing.assert_array_equal(pieces.polyline, [0, 0])
 
 
 def test_lines_are_broken_at_a_stray_chord_but_not_at_a_straight_one(pieces_of):
@@ -96,7 +102,7 @@ def test_the_end_of_one_line_says_nothing_of_the_next(pieces_of):
     pieces = pieces_of(
         along_x(7.0), along_x(12.0) + np.array([3.0, 50.0]), along_x(5.0) - 90
     )
-    np.testing.assert_array_equal(pieces.line, [0, 0, 1, 1, 1, 2])
+    np.testing.assert_array_equal(pieces.polyline, [0, 0, 1, 1, 1, 2])
     np.testing.assert_array_equal(pieces.feature_id, [1, 1, 2, 2, 2, 3])
     np.testing.assert_allclose(pieces.pose[2], [3, 50, 0], atol=1e-5)
 
@@ -116,57 +122,62 @@ def test_repeated_points_and_lines_of_one_point_are_harmless(pieces_of):
 def test_an_empty_map_has_no_pieces(pieces_of, bent_roads):
     pieces = pieces_of()
     assert pieces.num_map_tokens == 0
-    assert match_roads(pieces, bent_roads).shape == (0,)
+    assert match_map_tokens(pieces, bent_roads).shape == (0,)
 
 
 @pytest.mark.parametrize(
-    ("feature", "feature_type", "line_kind", "point_kind"),
+    ("feature", "feature_subtype", "polyline_type", "point_type"),
     [
-        (FeatureKind.LANE, LaneType.FREEWAY, LineKind.LANE, PointKind.FREEWAY),
+        (FeatureType.LANE, LaneType.FREEWAY, PolylineType.LANE, PointType.FREEWAY),
         (
-            FeatureKind.LANE,
+            FeatureType.LANE,
             LaneType.SURFACE_STREET,
-            LineKind.LANE,
-            PointKind.SURFACE_STREET,
+            PolylineType.LANE,
+            PointType.SURFACE_STREET,
         ),
-        (FeatureKind.LANE, LaneType.BIKE_LANE, LineKind.LANE, PointKind.BIKE_LANE),
-        (FeatureKind.LANE, LaneType.UNDEFINED, LineKind.LANE, PointKind.SURFACE_STREET),
+        (FeatureType.LANE, LaneType.BIKE_LANE, PolylineType.LANE, PointType.BIKE_LANE),
+        (FeatureType.LANE, LaneType.UNDEFINED, PolylineType.LANE, PointType.SURFACE_STREET),
         (
-            FeatureKind.ROAD_LINE,
+            FeatureType.ROAD_LINE,
             RoadLineType.BROKEN_SINGLE_WHITE,
-            LineKind.ROAD_LINE,
-            PointKind.BROKEN_LINE,
+            PolylineType.ROAD_LINE,
+            PointType.BROKEN_LINE,
         ),
         (
-            FeatureKind.ROAD_LINE,
+            FeatureType.ROAD_LINE,
             RoadLineType.SOLID_SINGLE_YELLOW,
-            LineKind.ROAD_LINE,
-            PointKind.SOLID_LINE,
+            PolylineType.ROAD_LINE,
+            PointType.SOLID_LINE,
         ),
         (
-            FeatureKind.ROAD_LINE,
+            FeatureType.ROAD_LINE,
             RoadLineType.PASSING_DOUBLE_YELLOW,
-            LineKind.ROAD_LINE,
-            PointKind.DOUBLE_LINE,
+            PolylineType.ROAD_LINE,
+            PointType.DOUBLE_LINE,
         ),
         (
-            FeatureKind.ROAD_EDGE,
+            FeatureType.ROAD_EDGE,
             RoadEdgeType.BOUNDARY,
-            LineKind.ROAD_EDGE,
-            PointKind.BOUNDARY,
+            PolylineType.ROAD_EDGE,
+            PointType.BOUNDARY,
         ),
-        (FeatureKind.ROAD_EDGE, RoadEdgeType.MEDIAN, LineKind.ROAD_EDGE, PointKind.MEDIAN),
-        (FeatureKind.ROAD_EDGE, 9, LineKind.ROAD_EDGE, PointKind.MEDIAN),
+        (
+            FeatureType.ROAD_EDGE,
+            RoadEdgeType.MEDIAN,
+            PolylineType.ROAD_EDGE,
+            PointType.MEDIAN,
+        ),
+        (FeatureType.ROAD_EDGE, 9, PolylineType.ROAD_EDGE, PointType.MEDIAN),
     ],
 )
-def test_lines_are_typed(build_map, feature, feature_type, line_kind, point_kind):
-    pieces = road_pieces(build_map([(7, feature, feature_type, along_x(5.0))]))
-    np.testing.assert_array_equal(pieces.line_kind, line_kind)
-    np.testing.assert_array_equal(pieces.point_kind, point_kind)
+def test_lines_are_typed(build_map, feature, feature_subtype, polyline_type, point_type):
+    pieces = cut_map_tokens(build_map([(7, feature, feature_subtype, along_x(5.0))]))
+    np.testing.assert_array_equal(pieces.polyline_type, polyline_type)
+    np.testing.assert_array_equal(pieces.point_type, point_type)
 
 
 def test_there_are_ten_point_kinds_and_four_line_kinds():
-    assert (len(PointKind), len(LineKind)) == (10, 4)
+    assert (len(PointType), len(PolylineType)) == (10, 4)
 
 
 def test_a_lane_with_a_stop_sign_has_its_own_kind(build_map):
@@ -174,15 +185,15 @@ def test_a_lane_with_a_stop_sign_has_its_own_kind(build_map):
     road_map = dataclasses.replace(
         build_map(lanes), sign_id=np.array([70]), sign_lane_id=np.array([8])
     )
-    assert road_pieces(road_map).point_kind.tolist() == [
-        PointKind.SURFACE_STREET,
-        PointKind.STOP_CONTROLLED,
+    assert cut_map_tokens(road_map).point_type.tolist() == [
+        PointType.SURFACE_STREET,
+        PointType.STOP_CONTROLLED,
     ]
 
 
 def test_stop_signs_and_unknown_features_are_no_lines(build_map):
-    features = [(5, FeatureKind.STOP_SIGN, 0, np.zeros((1, 2))), (6, 0, 0, along_x(9.0))]
-    assert road_pieces(build_map(features)).num_map_tokens == 0
+    features = [(5, FeatureType.STOP_SIGN, 0, np.zeros((1, 2))), (6, 0, 0, along_x(9.0))]
+    assert cut_map_tokens(build_map(features)).num_map_tokens == 0
 
 
 ZEBRA = np.array([[0, 0], [12, 0], [12, 3], [0, 3]])
@@ -193,11 +204,11 @@ ZEBRA = np.array([[0, 0], [12, 0], [12, 3], [0, 3]])
 def test_a_crosswalk_is_drawn_as_its_long_sides_there_and_back(build_map, first, closed):
     outline = np.roll(ZEBRA, first, axis=0)
     outline = np.vstack([outline, outline[:1]]) if closed else outline
-    pieces = road_pieces(build_map([(4, FeatureKind.CROSSWALK, 0, outline)]))
+    pieces = cut_map_tokens(build_map([(4, FeatureType.CROSSWALK, 0, outline)]))
     # 12 m: two whole pieces and one of two metres, four times over; no break at 12 m.
-    np.testing.assert_array_equal(pieces.line, np.repeat(np.arange(4), 3))
-    np.testing.assert_array_equal(pieces.point_kind, PointKind.CROSSING)
-    np.testing.assert_array_equal(pieces.line_kind, LineKind.AREA)
+    np.testing.assert_array_equal(pieces.polyline, np.repeat(np.arange(4), 3))
+    np.testing.assert_array_equal(pieces.point_type, PointType.CROSSING)
+    np.testing.assert_array_equal(pieces.polyline_type, PolylineType.AREA)
     starts = {tuple(np.round(pose, 3) + 0.0) for pose in pieces.pose[::3]}
     pi = np.round(np.pi, 3)
     assert {(x, y, abs(h)) for x, y, h in starts} == {
@@ -212,9 +223,9 @@ def test_the_sides_of_a_bent_speed_bump_follow_the_bend(build_map):
     inner = np.array([[0, 0], [4, 1], [8, 3]])
     outer = inner + np.array([-0.3, 1.0])
     outline = np.vstack([inner, outer[::-1]])
-    pieces = road_pieces(build_map([(4, FeatureKind.SPEED_BUMP, 0, outline)]))
+    pieces = cut_map_tokens(build_map([(4, FeatureType.SPEED_BUMP, 0, outline)]))
     length = np.hypot(4, 1) + np.hypot(4, 2)
-    totals = np.bincount(pieces.line, weights=pieces.length_m)
+    totals = np.bincount(pieces.polyline, weights=pieces.length_m)
     np.testing.assert_allclose(totals, [length] * 4, atol=1e-3)
     assert {tuple(np.round(p[:2], 1) + 0.0) for p in pieces.pose[::2]} == {
         tuple(np.float32(corner))
@@ -228,12 +239,12 @@ def test_areas_of_any_number_of_corners_are_drawn(build_map):
     point = np.zeros((1, 2))
     road_map = build_map(
         [
-            (1, FeatureKind.DRIVEWAY, 0, triangle),
-            (2, FeatureKind.DRIVEWAY, 0, pentagon),
-            (3, FeatureKind.DRIVEWAY, 0, point),
+            (1, FeatureType.DRIVEWAY, 0, triangle),
+            (2, FeatureType.DRIVEWAY, 0, pentagon),
+            (3, FeatureType.DRIVEWAY, 0, point),
         ]
     )
-    pieces = road_pieces(road_map)
+    pieces = cut_map_tokens(road_map)
     assert set(pieces.feature_id) == {1, 2}
     assert np.isfinite(pieces.pose).all()
 
@@ -317,7 +328,7 @@ def test_tokens_do_not_change_when_the_map_is_turned_and_moved(
     gaps = np.abs(one.sample_m[:, None] - bent_roads.sample_m).sum(axis=(2, 3))
     near = np.partition(gaps, 1, axis=1)
     clear = near[:, 1] - near[:, 0] > 0.02  # not between two shapes
-    same = match_roads(one, bent_roads) == match_roads(two, bent_roads)
+    same = match_map_tokens(one, bent_roads) == match_map_tokens(two, bent_roads)
     assert same[clear].all()
 
 
@@ -327,8 +338,10 @@ def test_a_shape_of_the_codebook_is_matched_to_itself():
     length = rng.uniform(1, 5, (1000, 1, 1))
     steps = np.stack([np.cos(turn), np.sin(turn)], axis=-1) * length / 10
     curve = np.concatenate([np.zeros((1000, 1, 2)), np.cumsum(steps, axis=1)], axis=1)
-    codebook = MapVocabulary(curve.astype(np.float32), np.ones(1000, bool))
-    np.testing.assert_array_equal(match_curves(codebook.curve_m, codebook), np.arange(1000))
+    vocabulary = MapVocabulary(curve.astype(np.float32), np.ones(1000, bool))
+    np.testing.assert_array_equal(
+        nearest_map_tokens(vocabulary.curve_m, vocabulary), np.arange(1000)
+    )
 
 
 @given(st.integers(0, 2**32))
@@ -339,6 +352,6 @@ def test_the_match_has_the_least_sum_of_squared_gaps(bent_roads, seed):
     wanted -= wanted[:, :1]
     gaps = wanted[:, None, [0, 5, 10]].astype(float) - bent_roads.sample_m
     squares = (gaps**2).sum(axis=(2, 3))
-    chosen = match_curves(wanted, bent_roads)
+    chosen = nearest_map_tokens(wanted, bent_roads)
     least = squares.min(axis=1)
     np.testing.assert_allclose(squares[np.arange(700), chosen], least, rtol=1e-4, atol=1e-4)

@@ -8,9 +8,9 @@ from infgen.scene import AgentType
 from infgen.tokens.motion_tokens import (
     advance,
     follow,
-    make_move_table,
-    nearest_few,
-    nearest_moves,
+    make_match_table,
+    nearest_k_motion_tokens,
+    nearest_motion_tokens,
 )
 from infgen.tokens.vocabulary import BOX_LW_M, MotionVocabulary
 
@@ -24,11 +24,11 @@ def random_codebook(rng, moves=200, spread=(8.0, 1.0, 0.6)):
     return MotionVocabulary(BOX_LW_M, path.astype(np.float32), real)
 
 
-def measure_them_all(target, pose, kind, codebook):
+def measure_them_all(target, pose, kind, vocabulary):
     """The nearest move by its definition: every corner of every move."""
     wanted = to_local(target, pose).astype(np.float64)
-    size = codebook.size_lw_m.astype(np.float64)
-    corners = box_corners(codebook.end_pose.astype(np.float64), size[:, None])
+    size = vocabulary.size_lw_m.astype(np.float64)
+    corners = box_corners(vocabulary.end_pose.astype(np.float64), size[:, None])
     aim = box_corners(wanted, size[kind])
     gap = np.linalg.norm(corners[kind] - aim[:, None], axis=-1).mean(axis=-1)
     return gap
@@ -43,17 +43,17 @@ def measure_them_all(target, pose, kind, codebook):
 @settings(deadline=None)
 def test_the_nearest_move_is_the_one_that_measuring_all_corners_finds(seed, stray, far):
     rng = np.random.default_rng(seed)
-    codebook = random_codebook(rng)
+    vocabulary = random_codebook(rng)
     rows = 40
     kind = rng.integers(0, 3, rows).astype(np.int8)
     pose = (rng.normal(size=(rows, 3)) * [far, far, 1]).astype(np.float32)
-    ahead = advance(pose, kind, rng.integers(0, 200, rows).astype(np.int16), codebook)
+    ahead = advance(pose, kind, rng.integers(0, 200, rows).astype(np.int16), vocabulary)
     target = ahead + (rng.normal(size=(rows, 3)) * stray).astype(np.float32)
     target[:, 2] = (target[:, 2] + np.pi) % (2 * np.pi) - np.pi
 
-    found = nearest_moves(target, pose, kind, make_move_table(codebook))
+    found = nearest_motion_tokens(target, pose, kind, make_match_table(vocabulary))
 
-    gap_m = measure_them_all(target, pose, kind, codebook)
+    gap_m = measure_them_all(target, pose, kind, vocabulary)
     np.testing.assert_array_equal(found, gap_m.argmin(axis=1))
 
 
@@ -65,50 +65,54 @@ def test_the_nearest_move_is_the_one_that_measuring_all_corners_finds(seed, stra
 @settings(deadline=None)
 def test_the_nearest_few_are_those_that_measuring_all_corners_finds(seed, count, stray):
     rng = np.random.default_rng(seed)
-    codebook = random_codebook(rng)
+    vocabulary = random_codebook(rng)
     rows = 20
     kind = rng.integers(0, 3, rows).astype(np.int8)
     pose = (rng.normal(size=(rows, 3)) * [30, 30, 1]).astype(np.float32)
-    ahead = advance(pose, kind, rng.integers(0, 200, rows).astype(np.int16), codebook)
+    ahead = advance(pose, kind, rng.integers(0, 200, rows).astype(np.int16), vocabulary)
     target = ahead + (rng.normal(size=(rows, 3)) * stray).astype(np.float32)
 
-    few = nearest_few(target, pose, kind, make_move_table(codebook), count)
+    few = nearest_k_motion_tokens(target, pose, kind, make_match_table(vocabulary), count)
 
-    gap_m = measure_them_all(target, pose, kind, codebook)
+    gap_m = measure_them_all(target, pose, kind, vocabulary)
     in_order = np.argsort(gap_m, axis=1, kind="stable")[:, :count]
     np.testing.assert_array_equal(few, in_order)
 
 
 def test_the_nearest_of_few_is_the_nearest():
     rng = np.random.default_rng(3)
-    table = make_move_table(random_codebook(rng))
+    table = make_match_table(random_codebook(rng))
     target = rng.normal(size=(50, 3)).astype(np.float32)
     pose, kind = np.zeros_like(target), rng.integers(0, 3, 50).astype(np.int8)
 
-    few = nearest_few(target, pose, kind, table, 7)
+    few = nearest_k_motion_tokens(target, pose, kind, table, 7)
 
-    np.testing.assert_array_equal(few[:, 0], nearest_moves(target, pose, kind, table))
+    np.testing.assert_array_equal(
+        few[:, 0], nearest_motion_tokens(target, pose, kind, table)
+    )
     assert all(len(set(row)) == 7 for row in few.tolist())
 
 
 def test_of_twins_the_first_is_chosen():
-    codebook = random_codebook(np.random.default_rng(1))
+    vocabulary = random_codebook(np.random.default_rng(1))
     pose, kind = np.zeros((1, 3), np.float32), np.int8([0])
-    target = advance(pose, kind, np.int16([100]), codebook)
+    target = advance(pose, kind, np.int16([100]), vocabulary)
 
-    assert nearest_moves(target, pose, kind, make_move_table(codebook)) == [1]
+    assert nearest_motion_tokens(target, pose, kind, make_match_table(vocabulary)) == [1]
 
 
 def test_many_rows_give_what_each_gives_alone():
     rng = np.random.default_rng(2)
-    table = make_move_table(random_codebook(rng))
+    table = make_match_table(random_codebook(rng))
     target = rng.normal(size=(9000, 3)).astype(np.float32)
     pose, kind = np.zeros_like(target), np.zeros(9000, np.int8)
 
-    together = nearest_moves(target, pose, kind, table)
+    together = nearest_motion_tokens(target, pose, kind, table)
 
     some = [0, 4095, 4096, 8999]
-    alone = [nearest_moves(target[[i]], pose[[i]], kind[[i]], table)[0] for i in some]
+    alone = [
+        nearest_motion_tokens(target[[i]], pose[[i]], kind[[i]], table)[0] for i in some
+    ]
     np.testing.assert_array_equal(together[some], alone)
 
 
@@ -117,8 +121,8 @@ def test_nobody_has_no_moves(metre_moves):
 
     assert (
         len(
-            nearest_moves(
-                nobody, nobody, np.empty(0, np.int8), make_move_table(metre_moves)
+            nearest_motion_tokens(
+                nobody, nobody, np.empty(0, np.int8), make_match_table(metre_moves)
             )
         )
         == 0
@@ -132,10 +136,12 @@ def test_boxes_are_compared_at_each_kinds_own_size(kind):
     # pedestrian's (0.7 m) by 0.21 m.
     ends = np.float32([[0, 0, 0], [1.3, 0, 0], [1, 0, 0.3]])
     path = np.broadcast_to(ends[:, None] * np.linspace(0, 1, 6)[:, None], (3, 3, 6, 3))
-    codebook = MotionVocabulary(BOX_LW_M, path.astype(np.float32), np.ones((3, 3), bool))
+    vocabulary = MotionVocabulary(BOX_LW_M, path.astype(np.float32), np.ones((3, 3), bool))
     target = np.float32([[1, 0, 0]])
 
-    found = nearest_moves(target, 0 * target, np.int8([kind]), make_move_table(codebook))
+    found = nearest_motion_tokens(
+        target, 0 * target, np.int8([kind]), make_match_table(vocabulary)
+    )
 
     assert found[0] == (2 if kind == AgentType.PEDESTRIAN else 1)
 
@@ -149,7 +155,7 @@ def test_an_agent_without_a_move_stays(metre_moves):
 
 
 def test_an_agent_driven_from_outside_is_followed_and_errors_do_not_add_up(metre_moves):
-    table, kind = make_move_table(metre_moves), np.int8([0])
+    table, kind = make_match_table(metre_moves), np.int8([0])
     pose, chosen = np.zeros((1, 3), np.float32), []
 
     for token in range(1, 21):

@@ -12,11 +12,11 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 from infgen.tokens.presence import (
     first_token,
+    gap_ends,
+    has_motion,
     last_token,
-    live,
-    makes_a_move,
-    observe,
-    resumes,
+    observed_tokens,
+    presence_states,
     seen_tokens,
 )
 from infgen.tokens.scene_tokens import Presence
@@ -24,8 +24,8 @@ from infgen.tokens.scene_tokens import Presence
 STATE = {
     ".": Presence.ABSENT,
     "p": Presence.PRESENT,
-    "E": Presence.ENTERING,
-    "L": Presence.LEAVING,
+    "E": Presence.INSERTED,
+    "L": Presence.REMOVED,
 }
 SEEN = arrays(bool, array_shapes(min_dims=2, max_dims=2, max_side=12))
 
@@ -56,7 +56,7 @@ def life(text):
     ],
 )
 def test_life_of(seen, lived):
-    np.testing.assert_array_equal(live(pattern(seen)), life(lived))
+    np.testing.assert_array_equal(presence_states(pattern(seen)), life(lived))
 
 
 def test_a_token_is_seen_if_the_agent_is_known_at_both_its_ends():
@@ -76,13 +76,15 @@ def test_first_and_last_tokens_of_nobody_are_outside_the_log():
     ("seen", "moves"), [("..xx", True), ("..x.", False), ("x.x.", False), ("x..xx", True)]
 )
 def test_only_two_tokens_in_a_row_give_a_move_to_learn(seen, moves):
-    assert makes_a_move(pattern(seen)) == [moves]
+    assert has_motion(pattern(seen)) == [moves]
 
 
 def test_what_an_agent_does_while_it_enters_is_not_observed():
     seen = pattern("..xx.x")
 
-    np.testing.assert_array_equal(observe(seen, live(seen)), pattern("...x.x"))
+    np.testing.assert_array_equal(
+        observed_tokens(seen, presence_states(seen)), pattern("...x.x")
+    )
 
 
 @pytest.mark.parametrize(
@@ -97,12 +99,12 @@ def test_what_an_agent_does_while_it_enters_is_not_observed():
 def test_a_chain_starts_anew_at_the_last_token_of_each_gap(seen, back):
     seen = pattern(seen)
 
-    np.testing.assert_array_equal(resumes(seen, live(seen)), pattern(back))
+    np.testing.assert_array_equal(gap_ends(seen, presence_states(seen)), pattern(back))
 
 
 @given(SEEN)
 def test_lives_are_well_formed(seen):
-    presence = live(seen)
+    presence = presence_states(seen)
 
     for row, known in zip(presence, seen, strict=True):
         states = "".join(".pEL"[state] for state in row).strip(".")
@@ -110,7 +112,7 @@ def test_lives_are_well_formed(seen):
         assert states.count("E") == known.any()
         assert not states or states[0] == "E"
         assert "L" not in states[:-1]
-    assert not (presence[:, -1] == Presence.LEAVING).any()
+    assert not (presence[:, -1] == Presence.REMOVED).any()
     assert (presence[seen] != Presence.ABSENT).all()
 
 
@@ -119,9 +121,9 @@ def test_the_past_does_not_know_the_future(seen, data):
     """Until an agent is gone, its states are those of the log cut short."""
     cut = data.draw(st.integers(1, seen.shape[1]))
 
-    whole, short = live(seen)[:, :cut], live(seen[:, :cut])
+    whole, short = presence_states(seen)[:, :cut], presence_states(seen[:, :cut])
 
     still_seen = seen[:, cut - 1]
-    going = whole == Presence.LEAVING
+    going = whole == Presence.REMOVED
     same = (whole == short) | going
     assert same[still_seen].all()

@@ -8,14 +8,19 @@ from hypothesis import strategies as st
 
 from infgen.config import TokenSettings
 from infgen.sources.womd import iter_scenes
-from infgen.tokens.agents import decode_tracks, matrix_of
-from infgen.tokens.scene_tokens import FIRST_MOVE, NO_MOVE, Presence, Word
+from infgen.tokens.agents import agent_matrix, decode_tracks
+from infgen.tokens.scene_tokens import (
+    FIRST_MOTION_TOKEN,
+    NO_MOTION_TOKEN,
+    Presence,
+    TokenType,
+)
 from infgen.tokens.sequence import decode_sequence
 from infgen.tokens.tokenizer import tokenize_scene
 
 SETTINGS = TokenSettings()
 RECORDS = Path(__file__).parents[2] / "../shared/data/womd"
-FIELDS = ("kind", "pose", "move", "presence", "observed", "cell")
+FIELDS = ("agent_type", "pose", "motion_token", "presence", "observed", "cell")
 
 
 @st.composite
@@ -57,7 +62,13 @@ def stream_alone(tokens):
     """The tokens with everything blanked that the stream should bring back."""
     blank = {
         name: np.zeros_like(getattr(tokens, name))
-        for name in (*FIELDS, "entry_cell", "entry_heading", "entry_agent", "entry_token")
+        for name in (
+            *FIELDS,
+            "insertion_cell",
+            "insertion_heading",
+            "insertion_agent",
+            "insertion_token",
+        )
     }
     return dataclasses.replace(tokens, **blank)
 
@@ -71,15 +82,17 @@ def assert_same(decoded, matrix):
 
 def said(tokens, token):
     """The words of one half second as (word, agent)."""
-    rows = tokens.word_token == token
+    rows = tokens.sequence_step == token
     return [
-        (Word(word).name, int(agent))
-        for word, agent in zip(tokens.word[rows], tokens.word_agent[rows], strict=True)
+        (TokenType(word).name, int(agent))
+        for word, agent in zip(
+            tokens.sequence_type[rows], tokens.sequence_agent[rows], strict=True
+        )
     ]
 
 
 def test_the_first_half_second_adds_everybody_from_near_to_far(tokens_of, crossing):
-    parts = ("ADD", "CELL", "HEADING", "KIND")
+    parts = ("ADD", "POSITION", "HEADING", "AGENT_TYPE")
 
     assert said(tokens_of(crossing()), 0) == [
         *[(part, agent) for agent in (0, 1, 3) for part in parts],
@@ -93,16 +106,16 @@ def test_a_half_second_moves_everybody_then_keeps_or_removes_then_adds(tokens_of
     # At the end of token 5 the ego is at (-10, 0), the cyclist at (28, 2), the car at
     # (0, -30): near to far the car, then the cyclist.
     assert said(tokens, 6) == [
-        ("MOVE", 0),
-        ("MOVE", 1),
-        ("MOVE", 3),
-        ("STAY", 0),
-        ("STAY", 1),
-        ("STAY", 3),
-        *[(part, 2) for part in ("ADD", "CELL", "HEADING", "KIND")],
+        ("MOTION", 0),
+        ("MOTION", 1),
+        ("MOTION", 3),
+        ("KEEP", 0),
+        ("KEEP", 1),
+        ("KEEP", 3),
+        *[(part, 2) for part in ("ADD", "POSITION", "HEADING", "AGENT_TYPE")],
         ("BEGIN_MOTION", -1),
     ]
-    assert ("LEAVE", 3) in said(tokens, 11)
+    assert ("REMOVE", 3) in said(tokens, 11)
     assert not any(agent == 3 for _, agent in said(tokens, 12))
 
 
@@ -115,7 +128,7 @@ def test_near_and_far_are_measured_before_the_move(tokens_of, build_scene):
 
     tokens = tokens_of(build_scene(path, [0, 0, 0]))
 
-    moves = [[agent for word, agent in said(tokens, k) if word == "MOVE"] for k in (2, 3)]
+    moves = [[agent for word, agent in said(tokens, k) if word == "MOTION"] for k in (2, 3)]
     assert tokens.pose[1, 1, 0] == 10
     assert moves == [[0, 1, 2], [0, 2, 1]]
 
@@ -129,9 +142,9 @@ def test_an_unseen_agent_stays_without_a_move(tokens_of, build_scene):
     tokens = tokens_of(build_scene(path, [0, 0], valid))
 
     assert said(tokens, 5) == [
-        ("MOVE", 0),
-        ("STAY", 0),
-        ("STAY", 1),
+        ("MOTION", 0),
+        ("KEEP", 0),
+        ("KEEP", 1),
         ("BEGIN_MOTION", -1),
     ]
 
@@ -144,28 +157,30 @@ def test_a_newcomer_gone_at_once_leaves_after_its_kind(tokens_of, metre_moves, b
 
     tokens = tokens_of(build_scene(path, [0, 0], valid))
 
-    words = ("ADD", "CELL", "HEADING", "KIND", "LEAVE")
+    words = ("ADD", "POSITION", "HEADING", "AGENT_TYPE", "REMOVE")
     assert said(tokens, 1)[2:-1] == [(word, 1) for word in words]
-    assert said(tokens, 2) == [("MOVE", 0), ("STAY", 0), ("BEGIN_MOTION", -1)]
+    assert said(tokens, 2) == [("MOTION", 0), ("KEEP", 0), ("BEGIN_MOTION", -1)]
     decoded = decode_sequence(stream_alone(tokens), metre_moves, SETTINGS)
-    assert_same(decoded, matrix_of(tokens))
+    assert_same(decoded, agent_matrix(tokens))
 
 
 def test_values_are_moves_cells_bins_and_kinds(tokens_of, crossing):
     tokens = tokens_of(crossing())
 
     def values(word):
-        return tokens.word_value[tokens.word == word]
+        return tokens.sequence_value[tokens.sequence_type == word]
 
-    agent, token = (tokens.word_agent, tokens.word_token)
-    moves = tokens.word == Word.MOVE
+    agent, token = (tokens.sequence_agent, tokens.sequence_step)
+    moves = tokens.sequence_type == TokenType.MOTION
     np.testing.assert_array_equal(
-        values(Word.MOVE), tokens.move[agent[moves], token[moves]]
+        values(TokenType.MOTION), tokens.motion_token[agent[moves], token[moves]]
     )
-    np.testing.assert_array_equal(values(Word.CELL), tokens.entry_cell)
-    np.testing.assert_array_equal(values(Word.HEADING), tokens.entry_heading)
-    np.testing.assert_array_equal(values(Word.KIND), tokens.kind[tokens.entry_agent])
-    for word in (Word.STAY, Word.LEAVE, Word.ADD, Word.BEGIN_MOTION):
+    np.testing.assert_array_equal(values(TokenType.POSITION), tokens.insertion_cell)
+    np.testing.assert_array_equal(values(TokenType.HEADING), tokens.insertion_heading)
+    np.testing.assert_array_equal(
+        values(TokenType.AGENT_TYPE), tokens.agent_type[tokens.insertion_agent]
+    )
+    for word in (TokenType.KEEP, TokenType.REMOVE, TokenType.ADD, TokenType.BEGIN_MOTION):
         assert not values(word).any()
 
 
@@ -179,7 +194,7 @@ def test_the_stream_brings_the_matrix_back_bit_for_bit(
 
     decoded = decode_sequence(stream_alone(tokens), metre_moves, chosen)
 
-    assert_same(decoded, matrix_of(tokens))
+    assert_same(decoded, agent_matrix(tokens))
 
 
 @given(drawn=paths_and_gaps())
@@ -188,18 +203,18 @@ def test_the_stream_is_in_order(tokens_of, build_scene, drawn):
     """Every half second: moves, controls, newcomers, and one word that ends it."""
     tokens = tokens_of(build_scene(*drawn))
 
-    assert (np.diff(tokens.word_token.astype(int)) >= 0).all()
+    assert (np.diff(tokens.sequence_step.astype(int)) >= 0).all()
     for token in range(tokens.num_tokens):
         words = [word for word, _ in said(tokens, token)]
         assert words.count("BEGIN_MOTION") == 1
         assert words[-1] == "BEGIN_MOTION"
         adds = words.index("ADD") if "ADD" in words else len(words) - 1
         before = words[:adds]
-        assert sorted(before, key=lambda word: word != "MOVE") == before
+        assert sorted(before, key=lambda word: word != "MOTION") == before
         here = (tokens.presence[:, token] != Presence.ABSENT).sum()
-        kept = words.count("STAY") + before.count("LEAVE")
+        kept = words.count("KEEP") + before.count("REMOVE")
         assert kept + words.count("ADD") == here
-    assert (tokens.word == Word.ADD).sum() == tokens.num_agents
+    assert (tokens.sequence_type == TokenType.ADD).sum() == tokens.num_agents
 
 
 @given(drawn=paths_and_gaps())
@@ -207,14 +222,18 @@ def test_the_stream_is_in_order(tokens_of, build_scene, drawn):
 def test_the_matrix_is_consistent(tokens_of, build_scene, drawn):
     tokens = tokens_of(build_scene(*drawn))
 
-    entering = tokens.presence == Presence.ENTERING
-    np.testing.assert_array_equal(entering, tokens.move == FIRST_MOVE)
-    np.testing.assert_array_equal(tokens.observed, tokens.move >= 0)
-    assert (tokens.move[tokens.presence == Presence.ABSENT] == NO_MOVE).all()
-    assert (tokens.presence[tokens.ego] != Presence.LEAVING).all()
+    entering = tokens.presence == Presence.INSERTED
+    np.testing.assert_array_equal(entering, tokens.motion_token == FIRST_MOTION_TOKEN)
+    np.testing.assert_array_equal(tokens.observed, tokens.motion_token >= 0)
+    assert (
+        tokens.motion_token[tokens.presence == Presence.ABSENT] == NO_MOTION_TOKEN
+    ).all()
+    assert (tokens.presence[tokens.ego] != Presence.REMOVED).all()
     assert tokens.observed[tokens.ego, 1:].all()
-    np.testing.assert_array_equal(np.sort(tokens.entry_agent), np.arange(tokens.num_agents))
-    assert entering[tokens.entry_agent, tokens.entry_token].all()
+    np.testing.assert_array_equal(
+        np.sort(tokens.insertion_agent), np.arange(tokens.num_agents)
+    )
+    assert entering[tokens.insertion_agent, tokens.insertion_token].all()
 
 
 def real_scenes(name, count):
@@ -241,7 +260,7 @@ def test_the_stream_of_real_logs_brings_the_matrix_back(name, dense_moves, bent_
 
         decoded = decode_sequence(stream_alone(tokens), dense_moves, SETTINGS)
 
-        assert_same(decoded, matrix_of(tokens))
+        assert_same(decoded, agent_matrix(tokens))
 
 
 def test_real_logs_come_back_at_ten_hertz_within_the_codebooks_error(
@@ -251,7 +270,7 @@ def test_real_logs_come_back_at_ten_hertz_within_the_codebooks_error(
     errors_m = []
     for scene in real_scenes("validation.tfrecord-00000-of-00004.gz", 5):
         tokens = tokenize_scene(scene, dense_moves, bent_roads, SETTINGS)
-        pose, known = decode_tracks(matrix_of(tokens), dense_moves)
+        pose, known = decode_tracks(agent_matrix(tokens), dense_moves)
 
         row = [list(scene.tracks.id).index(track) for track in tokens.track_id]
         steps = known.shape[1]
@@ -269,12 +288,12 @@ def test_real_logs_come_back_at_ten_hertz_within_the_codebooks_error(
 def test_drawn_at_ten_hertz_every_token_ends_at_its_pose(
     tokens_of, metre_moves, build_scene, drawn
 ):
-    matrix = matrix_of(tokens_of(build_scene(*drawn)))
+    matrix = agent_matrix(tokens_of(build_scene(*drawn)))
 
     pose, known = decode_tracks(matrix, metre_moves)
 
     ends = known[:, 5::5]
-    shown = matrix.observed | (matrix.presence == Presence.ENTERING)
+    shown = matrix.observed | (matrix.presence == Presence.INSERTED)
     assert ends[shown].all()
     np.testing.assert_allclose(pose[:, 5::5][ends], matrix.pose[ends], atol=1e-4)
     assert (pose[~known] == 0).all()

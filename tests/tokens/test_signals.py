@@ -5,9 +5,9 @@ from infgen.scene import SignalState
 from infgen.tokens.scene_tokens import SignalClass
 from infgen.tokens.signals import (
     REMEMBERED,
-    merge_states,
-    remember,
-    signal_lines,
+    classify_signals,
+    hold_last_signals,
+    signal_polylines,
     signals_at,
 )
 
@@ -16,11 +16,11 @@ from infgen.tokens.signals import (
 def test_states_are_merged_by_what_their_name_says(state):
     said = next((c for c in SignalClass if state.name.endswith(c.name)), None)
 
-    assert merge_states(np.int8([state])) == [said]
+    assert classify_signals(np.int8([state])) == [said]
 
 
 def test_a_state_that_nobody_has_heard_of_is_unknown():
-    assert (merge_states(np.int8([-1, 9, 100])) == SignalClass.UNKNOWN).all()
+    assert (classify_signals(np.int8([-1, 9, 100])) == SignalClass.UNKNOWN).all()
 
 
 def test_a_light_is_read_at_the_steps_asked_for(build_signals):
@@ -64,8 +64,8 @@ def test_lines_with_a_light_are_listed_once_and_only_until_a_step(build_signals)
     line = np.int32([0, 0, 1, 2, 2])
     feature_id = np.array([70, 70, 90, 80, 80])
 
-    lines, lanes = signal_lines(signals, line, feature_id, last_step=90)
-    early, _ = signal_lines(signals, line, feature_id, last_step=10)
+    lines, lanes = signal_polylines(signals, line, feature_id, last_step=90)
+    early, _ = signal_polylines(signals, line, feature_id, last_step=10)
 
     assert lines.tolist() == [0, 2]
     assert lanes.tolist() == [70, 80]
@@ -75,7 +75,7 @@ def test_lines_with_a_light_are_listed_once_and_only_until_a_step(build_signals)
 def test_a_light_that_is_looked_at_no_more_is_remembered_as_it_was_last():
     shown = np.array([[0, 1, 2, 3], [4, 0, 0, 1]], np.int8)
 
-    assert remember(shown, 2, 5).tolist() == [[0, 1, 6, 6, 6], [4, 0, 5, 5, 5]]
-    np.testing.assert_array_equal(remember(shown, 4, 4), shown)
-    assert remember(shown, 2, 5).dtype == np.int8
+    assert hold_last_signals(shown, 2, 5).tolist() == [[0, 1, 6, 6, 6], [4, 0, 5, 5, 5]]
+    np.testing.assert_array_equal(hold_last_signals(shown, 4, 4), shown)
+    assert hold_last_signals(shown, 2, 5).dtype == np.int8
     assert len(SignalClass) == REMEMBERED

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from infgen.config import TokenSettings
-from infgen.tokens.statistics import count, describe, no_figures
+from infgen.tokens.statistics import count, describe, no_statistics
 from infgen.tokens.tokenizer import tokenize_scene
 
 
@@ -52,7 +52,7 @@ def test_figures_of_scenes_add_up_whatever_their_length(counted, drive, crossing
 
 def test_nothing_adds_nothing(counted, crossing):
     figures = counted(crossing())
-    same = no_figures() + figures
+    same = no_statistics() + figures
 
     np.testing.assert_array_equal(same.first, figures.first)
     np.testing.assert_array_equal(same.error, figures.error)
@@ -69,4 +69,4 @@ def test_a_description_says_shares_and_means(counted, crossing):
 
 
 def test_nothing_can_be_described_too():
-    assert describe(no_figures())["matching_error_m"]["cyclist"] == {"moves": 0}
+    assert describe(no_statistics())["matching_error_m"]["cyclist"] == {"moves": 0}

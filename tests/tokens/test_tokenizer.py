@@ -10,7 +10,16 @@ from infgen.tokens.tokenizer import tokenize_scene
 from infgen.tokens.tracks import TokensError
 
 SETTINGS = TokenSettings()
-ARRAYS = ("kind", "pose", "move", "presence", "observed", "cell", "size_lwh_m", "near")
+ARRAYS = (
+    "agent_type",
+    "pose",
+    "motion_token",
+    "presence",
+    "observed",
+    "cell",
+    "size_lwh_m",
+    "near",
+)
 
 
 @pytest.fixture
@@ -65,7 +74,7 @@ def test_tracks_without_a_move_are_dropped_unless_they_are_there_now(
 def test_the_ego_is_kept_even_if_the_log_has_one_token(tokens_of, drive):
     tokens = tokens_of(drive(steps=6, now=5))
 
-    assert tokens.presence.tolist() == [[Presence.ENTERING]]
+    assert tokens.presence.tolist() == [[Presence.INSERTED]]
 
 
 def test_a_history_has_the_tokens_up_to_now_of_those_there_now(tokens_of, build_scene):
@@ -83,7 +92,7 @@ def test_a_history_has_the_tokens_up_to_now_of_those_there_now(tokens_of, build_
 
     assert history.num_tokens == 2
     assert history.track_id.tolist() == [100, 101, 103, 105, 106]
-    enter, here, absent = Presence.ENTERING, Presence.PRESENT, Presence.ABSENT
+    enter, here, absent = Presence.INSERTED, Presence.PRESENT, Presence.ABSENT
     expected = [
         [enter, here],
         [enter, here],
@@ -124,7 +133,7 @@ def test_a_history_is_the_start_of_the_whole_log(tokens_of, crossing):
     whole, history = tokens_of(crossing()), tokens_of(crossing(), until=10)
 
     rows = np.searchsorted(whole.track_id, history.track_id)
-    for name in ("pose", "move", "cell", "presence", "observed"):
+    for name in ("pose", "motion_token", "cell", "presence", "observed"):
         np.testing.assert_array_equal(
             getattr(history, name), getattr(whole, name)[rows, :2], err_msg=name
         )
@@ -161,10 +170,10 @@ def test_a_scene_that_cannot_be_tokenized_says_why(tokens_of, drive):
 def test_road_tokens_lie_on_the_map(tokens_of, drive):
     tokens = tokens_of(drive())
 
-    lane = tokens.road_line == tokens.road_line[0]
-    np.testing.assert_allclose(tokens.road_pose[lane, 1:], 0.0, atol=1e-5)
-    assert len(tokens.road_token) == len(tokens.road_pose) == tokens.num_map_tokens
-    assert (np.diff(tokens.road_line) >= 0).all()
+    lane = tokens.map_polyline == tokens.map_polyline[0]
+    np.testing.assert_allclose(tokens.map_pose[lane, 1:], 0.0, atol=1e-5)
+    assert len(tokens.map_token) == len(tokens.map_pose) == tokens.num_map_tokens
+    assert (np.diff(tokens.map_polyline) >= 0).all()
 
 
 def test_road_tokens_know_the_light_of_their_lane_now(tokens_of, drive, build_signals):
@@ -172,9 +181,9 @@ def test_road_tokens_know_the_light_of_their_lane_now(tokens_of, drive, build_si
 
     tokens = tokens_of(drive(signals=lights))
 
-    lane = tokens.road_line == tokens.signal_line[0]
-    assert (tokens.road_signal[lane] == SignalClass.STOP).all()
-    assert (tokens.road_signal[~lane] == SignalClass.NO_SIGNAL).all()
+    lane = tokens.map_polyline == tokens.signal_polyline[0]
+    assert (tokens.map_signal[lane] == SignalClass.STOP).all()
+    assert (tokens.map_signal[~lane] == SignalClass.NO_SIGNAL).all()
 
 
 def test_lights_are_told_at_the_end_of_every_token(tokens_of, drive, build_signals):
@@ -184,7 +193,7 @@ def test_lights_are_told_at_the_end_of_every_token(tokens_of, drive, build_signa
 
     tokens = tokens_of(drive(signals=build_signals(lights)))
 
-    assert len(tokens.signal_line) == 1
+    assert len(tokens.signal_polyline) == 1
     expected = [SignalClass.STOP] * 2 + [SignalClass.GO] * 16
     np.testing.assert_array_equal(tokens.signal_state, [expected])
 
@@ -210,11 +219,11 @@ def test_a_long_log_has_tokens_beyond_what_a_byte_can_count(tokens_of, parked):
     tokens = tokens_of(parked(count=1, steps=3111))
 
     assert tokens.num_tokens == 622
-    assert tokens.word_token.max() == 621
+    assert tokens.sequence_step.max() == 621
 
 
 def test_a_scene_without_a_map_has_no_road_tokens(tokens_of, drive, build_map):
     tokens = tokens_of(drive(road_map=build_map([])))
 
     assert tokens.num_map_tokens == 0
-    assert len(tokens.signal_line) == 0
+    assert len(tokens.signal_polyline) == 0

@@ -165,7 +165,7 @@ def test_only_road_users_are_read(build_scene):
 
     paths = read_paths(build_scene(path, [OTHER, CAR, WALKER], ego=1), SETTINGS)
 
-    np.testing.assert_array_equal(paths.kind, [CAR, WALKER])
+    np.testing.assert_array_equal(paths.agent_type, [CAR, WALKER])
     np.testing.assert_array_equal(paths.track_id, [101, 102])
     assert paths.ego == 0
 

@@ -32,6 +32,6 @@ def test_end_poses_are_the_last_of_each_path(one_metre_ahead):
 
 def test_roads_are_sampled_at_first_middle_and_last_point():
     curve = np.stack([0.5 * np.arange(11), np.zeros(11)], axis=-1)[None]
-    codebook = MapVocabulary(curve.astype(np.float32), np.ones(1, bool))
-    assert codebook.num_map_tokens == 1
-    np.testing.assert_array_equal(codebook.sample_m, [[[0, 0], [2.5, 0], [5, 0]]])
+    vocabulary = MapVocabulary(curve.astype(np.float32), np.ones(1, bool))
+    assert vocabulary.num_map_tokens == 1
+    np.testing.assert_array_equal(vocabulary.sample_m, [[[0, 0], [2.5, 0], [5, 0]]])

@@ -13,7 +13,7 @@ from infgen.metrics.road import road_edge_m
 from infgen.metrics.wosac.logged import LoggedScene
 from infgen.metrics.wosac.signals import build_stop_lines, runs_red_light
 from infgen.scene import AgentType
-from infgen.spatial.road_edges import build_edges
+from infgen.spatial.road_edges import build_road_edges
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ def measure(
         motion.z_m[:, evaluated],
         motion.heading_rad[:, evaluated],
     )
-    edges = build_edges(log.edges())
+    edges = build_road_edges(log.edges())
     return Features(
         linear_speed=kinematics.speed_mps[..., steps],
         linear_acceleration=kinematics.accel_mps2[..., steps],

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int32, Int64
 
 from infgen.metrics.motion import Motion
-from infgen.scene import FeatureKind, LaneType, Scene, world_xyz_m
+from infgen.scene import FeatureType, LaneType, Scene, world_xyz_m
 
 HISTORY_STEPS = 11
 """Steps up to and with now."""
@@ -131,16 +131,16 @@ def from_scene(scene: Scene) -> LoggedScene:
             f"{scene.now}; expected at least {LOG_STEPS} with now at {NOW}"
         )
     xyz_m = world_xyz_m(scene, tracks.xyz_m[:, :LOG_STEPS])
-    edges = _features(scene, scene.road_map.rows(FeatureKind.ROAD_EDGE))
-    lanes = scene.road_map.rows(FeatureKind.LANE)
-    lanes = lanes[scene.road_map.feature_type[lanes] == LaneType.SURFACE_STREET]
+    edges = _features(scene, scene.road_map.rows(FeatureType.ROAD_EDGE))
+    lanes = scene.road_map.rows(FeatureType.LANE)
+    lanes = lanes[scene.road_map.feature_subtype[lanes] == LaneType.SURFACE_STREET]
     lanes = lanes[np.diff(scene.road_map.point_offsets)[lanes] >= 2]
     lane_m, lane_offsets = _features(scene, lanes)
     lane_id, state, stop_m = _signals(scene)
     return LoggedScene(
         scenario_id=scene.scenario_id,
         id=tracks.id,
-        kind=tracks.kind,
+        kind=tracks.agent_type,
         x_m=np.ascontiguousarray(xyz_m[..., 0]),
         y_m=np.ascontiguousarray(xyz_m[..., 1]),
         z_m=np.ascontiguousarray(xyz_m[..., 2]),

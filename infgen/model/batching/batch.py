@@ -21,14 +21,14 @@ from torch import Tensor
 from infgen.model.batching.crop import SceneWindow, cut_window, disturb, hide_far, look_away
 from infgen.model.batching.insertion_targets import detail_arrays, entry_arrays, turns_of
 from infgen.model.batching.padding import Arrays, pad
-from infgen.model.batching.perturbation import Noise, exchange_roads
+from infgen.model.batching.perturbation import Perturbation, perturb_map
 from infgen.model.settings import ModelSettings
 from infgen.model.tensors import map_tensors
 from infgen.model.training_settings import TrainSettings
 from infgen.tokens.grid import make_grid
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.settings import TokenSettings
-from infgen.tokens.signals import Lights, remember
+from infgen.tokens.signals import LoggedSignals, hold_last_signals
 
 T = TypeVar("T")
 
@@ -53,7 +53,8 @@ class Agents:
         size_lwh_m: Boxes.
         near: Whether the agent has a motion loss.
         pose: x, y, heading at each token's end.
-        move: Row of the kind's codebook that led here, ``FIRST_MOVE`` or ``NO_MOVE``.
+        move: Row of the kind's vocabulary that led here, ``FIRST_MOTION_TOKEN`` or
+            ``NO_MOTION_TOKEN``.
         label: The move to learn for the same half second. It differs from ``move`` only
             where agents are led off their ways, and then leads back.
         presence: ``Presence``.
@@ -81,7 +82,7 @@ class Agents:
     @property
     def visible(self) -> Bool[Tensor, "scene token agent"]:
         """Whether others can see the agent: it is observed, or just entering."""
-        return self.observed | (self.presence == Presence.ENTERING)
+        return self.observed | (self.presence == Presence.INSERTED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,9 +92,9 @@ class Roads:
     Attributes:
         real: False for padding.
         pose: First point and heading.
-        token: Row of the map codebook.
-        point_kind: ``PointKind``.
-        line_kind: ``LineKind``.
+        token: Row of the map vocabulary.
+        point_type: ``PointType``.
+        polyline_type: ``PolylineType``.
         signal: ``SignalClass`` at the end of the history.
         light: The traffic light of its lane, counted from 1; 0 for none.
         shown: ``SignalClass`` of those lights at the end of each half second, or
@@ -105,8 +106,8 @@ class Roads:
     real: Bool[Tensor, "scene road"]
     pose: Float32[Tensor, "scene road 3"]
     token: Int64[Tensor, "scene road"]
-    point_kind: Int64[Tensor, "scene road"]
-    line_kind: Int64[Tensor, "scene road"]
+    point_type: Int64[Tensor, "scene road"]
+    polyline_type: Int64[Tensor, "scene road"]
     signal: Int64[Tensor, "scene road"]
     light: Int64[Tensor, "scene road"]
     shown: Int64[Tensor, "scene light token"]
@@ -205,7 +206,10 @@ class Limits:
 
 
 def collate(
-    records: Sequence[SceneTokens], limits: Limits, draw: int, noise: Noise | None = None
+    records: Sequence[SceneTokens],
+    limits: Limits,
+    draw: int,
+    noise: Perturbation | None = None,
 ) -> Batch:
     """Put scenes side by side.
 
@@ -230,7 +234,7 @@ def collate(
 def collate_roads(
     records: Sequence[SceneTokens],
     max_map_tokens: int,
-    lights: Sequence[Lights | None] | None = None,
+    lights: Sequence[LoggedSignals | None] | None = None,
 ) -> Roads:
     """Put only the maps of scenes side by side, with nothing hidden.
 
@@ -243,14 +247,14 @@ def collate_roads(
     maps = []
     for at, record in enumerate(records):
         window = cut_window(record, 0, record.num_tokens, record.num_agents, max_map_tokens)
-        token = record.road_token[window.roads]
+        token = record.map_token[window.roads]
         arrays = _roads(window, token, np.zeros(len(token), dtype=bool))
-        known = (lights[at] if lights else None) or Lights(
-            record.signal_line, record.signal_state
+        known = (lights[at] if lights else None) or LoggedSignals(
+            record.signal_polyline, record.signal_state
         )
         tokens = known.shown.shape[1]
-        arrays["light"] = _lights(record.road_line[window.roads], known.line)
-        arrays["shown"] = remember(known.shown, tokens, tokens + 1)
+        arrays["light"] = _lights(record.map_polyline[window.roads], known.polyline)
+        arrays["shown"] = hold_last_signals(known.shown, tokens, tokens + 1)
         maps.append(arrays)
     return _last_shown(pad(maps, Roads), maps)
 
@@ -261,11 +265,13 @@ def to_device(batch: T, device: torch.device) -> T:
 
 
 def _scene(
-    record: SceneTokens, limits: Limits, draw: int, noise: Noise | None
+    record: SceneTokens, limits: Limits, draw: int, noise: Perturbation | None
 ) -> tuple[Arrays, Arrays, Arrays, Arrays]:
     """Arrays of agents, roads, entries and details of one scene."""
     random = _keyed(f"{draw}/{record.scenario_id}")
-    chance = _keyed(f"noise/{draw}/{record.scenario_id}")  # Noise moves no other draw.
+    chance = _keyed(
+        f"noise/{draw}/{record.scenario_id}"
+    )  # Perturbation moves no other draw.
     grid = make_grid(limits.grid)
     spare = max(0, record.num_tokens - limits.tokens)
     start = int(random.integers(spare + 1))
@@ -280,9 +286,9 @@ def _scene(
     entries = entry_arrays(window, turn, limits.entries)
     details = detail_arrays(window, entries, grid, random)
     picked = random.random(len(window.roads)) < PICKED_SHARE
-    token = record.road_token[window.roads]
+    token = record.map_token[window.roads]
     if noise:
-        token = exchange_roads(token, picked, noise, chance)
+        token = perturb_map(token, picked, noise, chance)
     return _agents(window, turn), _roads(window, token, picked), entries, details
 
 
@@ -311,17 +317,17 @@ def _agents(window: SceneWindow, turn: np.ndarray) -> Arrays:
 
 def _roads(window: SceneWindow, token: np.ndarray, picked: np.ndarray) -> Arrays:
     record, rows = window.record, window.roads
-    line = record.road_line[rows]
+    line = record.map_polyline[rows]
     follows = np.zeros(len(rows), dtype=bool)
     follows[1:] = (np.diff(rows) == 1) & (np.diff(line) == 0)
     return {
         "real": np.ones(len(rows), dtype=bool),
-        "pose": record.road_pose[rows],
+        "pose": record.map_pose[rows],
         "token": token,
-        "point_kind": record.road_point_kind[rows],
-        "line_kind": record.road_line_kind[rows],
-        "signal": record.road_signal[rows],
-        "light": _lights(line, record.signal_line),
+        "point_type": record.map_point_type[rows],
+        "polyline_type": record.map_polyline_type[rows],
+        "signal": record.map_signal[rows],
+        "light": _lights(line, record.signal_polyline),
         "shown": window.shown,
         "follows": follows,
         "picked": picked,
@@ -337,9 +343,9 @@ def _last_shown(roads: Roads, maps: Sequence[Arrays]) -> Roads:
     return roads
 
 
-def _lights(line: np.ndarray, signal_line: np.ndarray) -> np.ndarray:
+def _lights(line: np.ndarray, signal_polyline: np.ndarray) -> np.ndarray:
     """Number of the light of each road token's line, from 1; 0 where it has none."""
-    if not len(signal_line):
+    if not len(signal_polyline):
         return np.zeros(len(line), dtype=np.int64)
-    at = np.minimum(np.searchsorted(signal_line, line), len(signal_line) - 1)
-    return np.where(signal_line[at] == line, at + 1, 0)
+    at = np.minimum(np.searchsorted(signal_polyline, line), len(signal_polyline) - 1)
+    return np.where(signal_polyline[at] == line, at + 1, 0)

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int16, Int64, UInt8
 
-from infgen.model.batching.perturbation import Noise, lead_astray
+from infgen.model.batching.perturbation import Perturbation, perturb_motion
 from infgen.tokens.grid import Grid, encode_cell, to_grid
-from infgen.tokens.insertion import entry_key
-from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, Presence, SceneTokens
+from infgen.tokens.insertion import insertion_key
+from infgen.tokens.scene_tokens import FIRST_MOTION_TOKEN, NO_CELL, Presence, SceneTokens
 from infgen.tokens.settings import TokenSettings
-from infgen.tokens.signals import remember
+from infgen.tokens.signals import hold_last_signals
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +30,8 @@ class SceneWindow:
         kind, size_lwh_m, near, pose, move, presence, observed, pattern, cell: As in the
             record.
         entry_row: Row of each newcomer whose agent is kept ...
-        entry_token: ... its token, ascending from 0 ...
-        entry_cell: ... and its cell.
+        insertion_token: ... its token, ascending from 0 ...
+        insertion_cell: ... and its cell.
     """
 
     record: SceneTokens
@@ -49,8 +49,8 @@ class SceneWindow:
     pattern: UInt8[np.ndarray, "agent token"]
     cell: Int16[np.ndarray, "agent token"]
     entry_row: Int64[np.ndarray, " entry"]
-    entry_token: Int64[np.ndarray, " entry"]
-    entry_cell: Int16[np.ndarray, " entry"]
+    insertion_token: Int64[np.ndarray, " entry"]
+    insertion_cell: Int16[np.ndarray, " entry"]
 
 
 def cut_window(
@@ -59,22 +59,22 @@ def cut_window(
     """Take ``tokens`` half seconds from ``start`` on, and what is nearest to the ego."""
     stop = min(start + tokens, record.num_tokens)
     presence, observed, move = _begin_at(record, start, stop)
-    visible = observed | (presence == Presence.ENTERING)
+    visible = observed | (presence == Presence.INSERTED)
     pose, pattern = record.pose[:, start:stop], record.pattern[:, start:stop]
     rows = _nearest_agents(pose, visible, record.ego)[:max_agents]
-    roads = _nearest_roads(record.road_pose, pose[record.ego], max_map_tokens)
+    roads = _nearest_roads(record.map_pose, pose[record.ego], max_map_tokens)
 
     row_of = np.full(record.num_agents, -1, dtype=np.int64)
     row_of[rows] = np.arange(len(rows))
-    entry_token = record.entry_token.astype(np.int64) - start
-    kept = (row_of[record.entry_agent] >= 0) & (entry_token >= 0)
-    kept &= entry_token < stop - start
+    insertion_token = record.insertion_token.astype(np.int64) - start
+    kept = (row_of[record.insertion_agent] >= 0) & (insertion_token >= 0)
+    kept &= insertion_token < stop - start
     return SceneWindow(
         record=record,
         after=record.num_tokens - stop,
         roads=roads,
         shown=record.signal_state[:, start:stop],
-        kind=record.kind[rows],
+        kind=record.agent_type[rows],
         size_lwh_m=record.size_lwh_m[rows],
         near=record.near[rows],
         pose=pose[rows],
@@ -84,25 +84,25 @@ def cut_window(
         observed=observed[rows],
         pattern=np.where(presence == Presence.ABSENT, np.uint8(0), pattern)[rows],
         cell=record.cell[rows, start:stop],
-        entry_row=row_of[record.entry_agent[kept]],
-        entry_token=entry_token[kept],
-        entry_cell=record.entry_cell[kept],
+        entry_row=row_of[record.insertion_agent[kept]],
+        insertion_token=insertion_token[kept],
+        insertion_cell=record.insertion_cell[kept],
     )
 
 
 def disturb(
-    window: SceneWindow, noise: Noise, grid: Grid, random: np.random.Generator
+    window: SceneWindow, noise: Perturbation, grid: Grid, random: np.random.Generator
 ) -> SceneWindow:
     """Lead agents astray, the ego like all others.
 
     Who is absent, entering or not observed is where it was. Cells follow the poses, the
     ego's too; but a newcomer is lost to none for it, and none is won.
     """
-    strays = lead_astray(
+    strays = perturb_motion(
         window.kind, window.pose, window.move, window.observed, noise, random
     )
     cell = encode_cell(to_grid(strays.pose[..., :2], strays.pose[0]), grid)
-    entering = window.presence == Presence.ENTERING
+    entering = window.presence == Presence.INSERTED
     kept = entering & ((cell == NO_CELL) | (window.cell == NO_CELL))
     told = (window.observed | entering) & (strays.off | strays.off[0]) & ~kept
     cell = np.where(told, cell, window.cell)
@@ -112,7 +112,7 @@ def disturb(
         move=strays.move,
         label=strays.label,
         cell=cell,
-        entry_cell=cell[window.entry_row, window.entry_token],
+        insertion_cell=cell[window.entry_row, window.insertion_token],
     )
 
 
@@ -129,7 +129,7 @@ def hide_far(window: SceneWindow, settings: TokenSettings, known: int) -> SceneW
     if not settings.insertion_distance_m or known < 1:
         return window
     away_m = window.pose[..., :2] - window.pose[0, :, :2]
-    visible = window.observed | (window.presence == Presence.ENTERING)
+    visible = window.observed | (window.presence == Presence.INSERTED)
     inside = np.hypot(away_m[..., 0], away_m[..., 1]) < settings.insertion_distance_m
     inside &= visible
     born = visible.argmax(axis=1)
@@ -156,7 +156,9 @@ def hide_far(window: SceneWindow, settings: TokenSettings, known: int) -> SceneW
 def look_away(window: SceneWindow, known: int) -> SceneWindow:
     """Let nobody look at traffic lights after the first ``known`` half seconds."""
     tokens = window.shown.shape[1]
-    return replace(window, shown=remember(window.shown, min(known, tokens), tokens))
+    return replace(
+        window, shown=hold_last_signals(window.shown, min(known, tokens), tokens)
+    )
 
 
 def _begin_at(
@@ -169,11 +171,11 @@ def _begin_at(
     """
     presence = record.presence[:, start:stop]
     observed = record.observed[:, start:stop]
-    move = record.move[:, start:stop]
+    move = record.motion_token[:, start:stop]
     if start == 0:
         return presence, observed, move
     before = record.presence[:, start - 1]
-    running = np.isin(before, (Presence.PRESENT, Presence.ENTERING))
+    running = np.isin(before, (Presence.PRESENT, Presence.INSERTED))
     return _enter_late((presence, observed, move), running, observed)
 
 
@@ -188,26 +190,30 @@ def _enter_late(
     columns = np.arange(presence.shape[1])
     first = np.where(able.any(axis=1), able.argmax(axis=1), len(columns))
     leaves = presence[np.arange(len(first)), first.clip(max=len(columns) - 1)]
-    gone = who & ((first == len(columns)) | (leaves == Presence.LEAVING))
+    gone = who & ((first == len(columns)) | (leaves == Presence.REMOVED))
 
     unseen = who[:, None] & (columns < first[:, None]) | gone[:, None]
     presence[unseen], observed[unseen] = Presence.ABSENT, False
     enters = (who & ~gone)[:, None] & (columns == first[:, None])
-    presence[enters], observed[enters], move[enters] = Presence.ENTERING, False, FIRST_MOVE
+    presence[enters], observed[enters], move[enters] = (
+        Presence.INSERTED,
+        False,
+        FIRST_MOTION_TOKEN,
+    )
     return presence, observed, move
 
 
 def _with_entries(window: SceneWindow, who: np.ndarray, order: str) -> SceneWindow:
     """List the entries of some agents anew, among those of all others."""
-    row, token = np.nonzero((window.presence == Presence.ENTERING) & who[:, None])
+    row, token = np.nonzero((window.presence == Presence.INSERTED) & who[:, None])
     kept = ~who[window.entry_row]
     row = np.concatenate([window.entry_row[kept], row])
-    token = np.concatenate([window.entry_token[kept], token])
-    key = entry_key(window.pose[row, token], window.pose[0, token], order)
+    token = np.concatenate([window.insertion_token[kept], token])
+    key = insertion_key(window.pose[row, token], window.pose[0, token], order)
     sorted_ = np.lexsort((key, token))
     row, token = row[sorted_], token[sorted_]
     return replace(
-        window, entry_row=row, entry_token=token, entry_cell=window.cell[row, token]
+        window, entry_row=row, insertion_token=token, insertion_cell=window.cell[row, token]
     )
 
 
@@ -222,10 +228,10 @@ def _nearest_agents(pose: np.ndarray, visible: np.ndarray, ego: int) -> np.ndarr
     return order[visible[order].any(axis=1) | (order == ego)]
 
 
-def _nearest_roads(road_pose: np.ndarray, path: np.ndarray, limit: int) -> np.ndarray:
+def _nearest_roads(map_pose: np.ndarray, path: np.ndarray, limit: int) -> np.ndarray:
     """Rows, ascending, of the road tokens nearest to the ego's path."""
-    if len(road_pose) <= limit:
-        return np.arange(len(road_pose))
-    away_m = road_pose[:, None, :2] - path[:, :2]  # [road, token, 2]
+    if len(map_pose) <= limit:
+        return np.arange(len(map_pose))
+    away_m = map_pose[:, None, :2] - path[:, :2]  # [road, token, 2]
     distance_m2 = (away_m**2).sum(axis=-1).min(axis=1)
     return np.sort(np.argsort(distance_m2, kind="stable")[:limit])

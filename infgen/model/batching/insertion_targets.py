@@ -28,10 +28,10 @@ def describe(
 def turns_of(window: SceneWindow) -> np.ndarray:
     """Turn of every agent among the newcomers of its token [agent, token]."""
     turn = np.full(window.presence.shape, -1, dtype=np.int64)
-    turn[window.presence == Presence.ENTERING] = OUTSIDE
+    turn[window.presence == Presence.INSERTED] = OUTSIDE
     turn[0] = -1  # The ego is always there to be seen.
-    inside = (window.entry_cell != NO_CELL) & (window.entry_row > 0)
-    row, token = window.entry_row[inside], window.entry_token[inside]
+    inside = (window.insertion_cell != NO_CELL) & (window.entry_row > 0)
+    row, token = window.entry_row[inside], window.insertion_token[inside]
     first = np.searchsorted(token, token)  # Tokens ascend: first newcomer of each.
     turn[row, token] = np.arange(len(token)) - first
     return turn

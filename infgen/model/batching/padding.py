@@ -6,7 +6,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE
+from infgen.tokens.scene_tokens import NO_CELL, NO_MOTION_TOKEN
 
 T = TypeVar("T")
 Arrays = dict[str, np.ndarray]
@@ -16,8 +16,8 @@ NOBODY = -1
 """Agent of an empty slot."""
 
 _PADDING = {
-    "move": NO_MOVE,
-    "label": NO_MOVE,
+    "move": NO_MOTION_TOKEN,
+    "label": NO_MOTION_TOKEN,
     "cell": NO_CELL,
     "turn": -1,
     "agent": NOBODY,

@@ -1,4 +1,4 @@
-"""Noise on tokens to learn from, and the moves that lead back (SPEC 2.3, 1.3).
+"""Perturbation on tokens to learn from, and the moves that lead back (SPEC 2.3, 1.3).
 
 Who only ever sees logs never sees what its own small errors lead to. So agents are led off
 their ways a little: at each half second an agent takes not the move that ends nearest to
@@ -25,11 +25,11 @@ from jaxtyping import Bool, Float, Float32, Float64, Int8, Int16
 
 from infgen.model.training_settings import TrainSettings
 from infgen.tokens.motion_tokens import (
-    MoveTable,
+    MatchTable,
     advance,
-    make_move_table,
-    nearest_few,
-    nearest_moves,
+    make_match_table,
+    nearest_k_motion_tokens,
+    nearest_motion_tokens,
 )
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
@@ -50,7 +50,7 @@ DRIFT_LEAST_WAY_M = 0.75
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Noise:
+class Perturbation:
     """How tokens are disturbed.
 
     Attributes:
@@ -61,14 +61,14 @@ class Noise:
         near_roads: For each map shape those that it is drawn from, itself the first.
     """
 
-    table: MoveTable
+    table: MatchTable
     moves: int
     share: float
     drift: float
     near_roads: Int16[np.ndarray, "road near"]
 
 
-class Strays(NamedTuple):
+class PerturbedMotion(NamedTuple):
     """Agents off their ways: fields [agent, token] as in ``SceneTokens``.
 
     Attributes:
@@ -84,12 +84,12 @@ class Strays(NamedTuple):
     off: np.ndarray
 
 
-def make_noise(
+def make_perturbation(
     settings: TrainSettings, motion: MotionVocabulary, roads: MapVocabulary
-) -> Noise | None:
+) -> Perturbation | None:
     """Make the noise that settings ask for; None if they ask for none.
 
-    In a codebook that has fewer tokens, draws are from all of them.
+    In a vocabulary that has fewer tokens, draws are from all of them.
     """
     if not (
         settings.motion_noise_neighbours
@@ -98,8 +98,8 @@ def make_noise(
     ):
         return None
     moves = min(settings.motion_noise_neighbours, motion.num_motion_tokens)
-    return Noise(
-        table=make_move_table(motion),
+    return Perturbation(
+        table=make_match_table(motion),
         moves=max(moves, 1) if settings.lateral_drift_share else moves,
         share=settings.motion_noise_share,
         drift=settings.lateral_drift_share,
@@ -107,14 +107,14 @@ def make_noise(
     )
 
 
-def lead_astray(
+def perturb_motion(
     kind: Int8[np.ndarray, " agent"],
     pose: Float32[np.ndarray, "agent token 3"],
     move: Int16[np.ndarray, "agent token"],
     moving: Bool[np.ndarray, "agent token"],
-    noise: Noise,
+    noise: Perturbation,
     random: np.random.Generator,
-) -> Strays:
+) -> PerturbedMotion:
     """Walk agents anew along moves that are drawn.
 
     Args:
@@ -128,7 +128,7 @@ def lead_astray(
     """
     turn = random.integers(noise.moves, size=moving.shape)
     turn[random.random(moving.shape) >= noise.share] = 0
-    strays = Strays(move.copy(), pose.copy(), move.copy(), np.zeros_like(moving))
+    strays = PerturbedMotion(move.copy(), pose.copy(), move.copy(), np.zeros_like(moving))
     pushes = _pushes(moving.shape, noise.drift, random)
     aside_m = np.zeros(len(kind))
     for token in range(1, moving.shape[1]):
@@ -139,15 +139,17 @@ def lead_astray(
         aside_m[rows] = _drifted(was_m[rows], way_m, pushes[rows, token])
         led = _led_aside(wanted, way_m, was_m[rows], aside_m[rows])
 
-        few = nearest_few(led, before, kind[rows], noise.table, noise.moves)
+        few = nearest_k_motion_tokens(led, before, kind[rows], noise.table, noise.moves)
         nearest, taken = few[:, 0].copy(), few[np.arange(len(rows)), turn[rows, token]]
-        ends = advance(before, kind[rows], taken, noise.table.codebook)
+        ends = advance(before, kind[rows], taken, noise.table.vocabulary)
         away_m = np.hypot(*(ends - led)[:, :2].T)
         far = np.flatnonzero(away_m > np.minimum(FARTHEST_M, FARTHEST_SHARE * way_m))
         taken[far] = nearest[far]
-        ends[far] = advance(before[far], kind[rows[far]], taken[far], noise.table.codebook)
+        ends[far] = advance(
+            before[far], kind[rows[far]], taken[far], noise.table.vocabulary
+        )
         back = np.flatnonzero(aside_m[rows])  # To these, the nearest is on the drift.
-        nearest[back] = nearest_moves(
+        nearest[back] = nearest_motion_tokens(
             wanted[back], before[back], kind[rows[back]], noise.table
         )
 
@@ -195,10 +197,10 @@ def _led_aside(
     return led
 
 
-def exchange_roads(
+def perturb_map(
     token: Int16[np.ndarray, " road"],
     fixed: Bool[np.ndarray, " road"],
-    noise: Noise,
+    noise: Perturbation,
     random: np.random.Generator,
 ) -> Int16[np.ndarray, " road"]:
     """Draw each road token's shape from those near to it, but for the ``fixed``."""
@@ -206,9 +208,9 @@ def exchange_roads(
     return np.where(fixed, token, noise.near_roads[token, turn])
 
 
-def _near_roads(codebook: MapVocabulary, count: int) -> Int16[np.ndarray, "road near"]:
+def _near_roads(vocabulary: MapVocabulary, count: int) -> Int16[np.ndarray, "road near"]:
     """Return for each shape the nearest, as pieces are matched, itself the first."""
-    points_m = codebook.sample_m.reshape(codebook.num_map_tokens, -1)
+    points_m = vocabulary.sample_m.reshape(vocabulary.num_map_tokens, -1)
     square_m2 = ((points_m[:, None] - points_m) ** 2).sum(axis=-1)
     np.fill_diagonal(square_m2, -1.0)
     return np.argsort(square_m2, axis=1, kind="stable")[:, :count].astype(np.int16)

@@ -63,8 +63,8 @@ def _play(network: Network, batch: Batch, top: int) -> tuple[Agents, Tensor]:
     """Play all agents; also tell where [scene, token, agent] one is not as logged."""
     logged, stepper, grid = batch.agents, Stepper(network), network.grid
     device = logged.pose.device
-    codebook = network.motion_codebook()
-    ends, top = MoveEnds.of(codebook, device), min(top, codebook.num_motion_tokens)
+    vocabulary = network.motion_vocabulary()
+    ends, top = MoveEnds.of(vocabulary, device), min(top, vocabulary.num_motion_tokens)
     scenes, tokens, rows = logged.move.shape
     memory = stepper.begin(batch.roads, torch.arange(scenes, device=device), rows)
     off = torch.zeros_like(logged.observed)
@@ -125,7 +125,7 @@ def _cells(played: Agents, logged: Agents, off: Tensor, token: int, grid: Grid) 
     pose, old = played.pose[:, token].numpy(force=True), logged.cell[:, token]
     found = encode_cell(to_grid(pose[..., :2], pose[:, EGO, None]), grid)
     new = torch.from_numpy(found).to(old)
-    entering = logged.presence[:, token] == Presence.ENTERING
+    entering = logged.presence[:, token] == Presence.INSERTED
     lost = entering & ((old == NO_CELL) | (new == NO_CELL))
     told = logged.visible[:, token] & (off[:, token] | off[:, token, EGO, None])
     return torch.where(told & ~lost, new, old)

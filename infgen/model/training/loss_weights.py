@@ -46,7 +46,7 @@ def supervised(batch: Batch, settings: TrainSettings) -> Tensor:
 def _motion(batch: Batch, settings: TrainSettings) -> Tensor:
     """Moves, a newcomer's first one counting more; at token 0 nobody comes in."""
     mask = motion_mask(batch.agents)
-    first = batch.agents.presence == Presence.ENTERING
+    first = batch.agents.presence == Presence.INSERTED
     first[:, 0] = False
     return mask.sum() + (settings.first_motion_weight - 1) * (mask & first).sum()
 

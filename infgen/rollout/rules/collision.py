@@ -17,11 +17,11 @@ ON_THE_WAY_M = 3.0
 def repeat(
     before: Population,
     move: Int64[np.ndarray, "rollout row"],
-    codebook: MotionVocabulary,
+    vocabulary: MotionVocabulary,
     times: int,
 ) -> Float32[np.ndarray, "rollout row looked 3"]:
     """Where everyone is to be if its move is made several times, at ``LOOKED_AT``."""
-    steps = codebook.path[before.kind, move][:, :, LOOKED_AT]  # [rollout, row, looked, 3]
+    steps = vocabulary.path[before.kind, move][:, :, LOOKED_AT]  # [rollout, row, looked, 3]
     pose, found = before.pose, []
     for _ in range(times):
         found.append(to_world(steps, pose[:, :, None]))

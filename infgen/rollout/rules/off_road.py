@@ -5,11 +5,16 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
-from infgen.geometry import box_corners, squares_of
+from infgen.geometry import box_corners, grid_squares
 from infgen.rollout.population import Population
-from infgen.scene import AgentType, FeatureKind, Scene
+from infgen.scene import AgentType, FeatureType, Scene
 from infgen.spatial.nearest import nearest_by_cells
-from infgen.spatial.road_edges import RoadEdges, edges_of, project, signed_distance_m
+from infgen.spatial.road_edges import (
+    RoadEdges,
+    project,
+    scene_road_edges,
+    signed_distance_m,
+)
 
 POINT_M = 0.5
 """Distances are worked out at points this far apart, and interpolated."""
@@ -32,7 +37,7 @@ class Kerbs:
 
     def __init__(self, scene: Scene) -> None:
         """Look at nothing yet."""
-        self._edges = edges_of(scene, flat=True)
+        self._edges = scene_road_edges(scene, flat=True)
         self._lanes = lane_pieces(scene)
         self._row: dict[int, int] = {}
         self._off_m = np.zeros((0, TILE + 1, TILE + 1), dtype=np.float32)
@@ -61,7 +66,7 @@ class Kerbs:
     ) -> Int64[np.ndarray, " point"]:
         """Row of the tile that each point is in; ``corner`` is the tile's first point."""
         number, first, which = np.unique(
-            squares_of(xy_m, POINT_M * TILE), return_index=True, return_inverse=True
+            grid_squares(xy_m, POINT_M * TILE), return_index=True, return_inverse=True
         )
         tiles = number.tolist()
         new = [at for at, tile in enumerate(tiles) if tile not in self._row]
@@ -92,7 +97,7 @@ def lane_pieces(scene: Scene) -> Lanes:
     road_map = scene.road_map
     flat_m = road_map.xyz_m * np.array([1, 1, 0], dtype=np.float32)
     feature = np.repeat(np.arange(road_map.num_features), np.diff(road_map.point_offsets))
-    lane = road_map.feature_kind[feature[:-1]] == FeatureKind.LANE
+    lane = road_map.feature_type[feature[:-1]] == FeatureType.LANE
     (row,) = np.nonzero(lane & (feature[:-1] == feature[1:]))
     return flat_m[row], flat_m[row + 1] - flat_m[row]
 

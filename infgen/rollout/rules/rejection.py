@@ -28,12 +28,12 @@ class Lookout:
     """Looks ahead for a batch of rollouts.
 
     Attributes:
-        codebook: Moves.
+        vocabulary: Moves.
         kerbs: Of each map; none if nobody is kept on the road.
         scene: Map of each rollout.
     """
 
-    codebook: MotionVocabulary
+    vocabulary: MotionVocabulary
     kerbs: Sequence[Kerbs]
     scene: Int64[np.ndarray, " rollout"]
 
@@ -75,11 +75,11 @@ class Lookout:
         *,
         road: bool,
     ) -> tuple[Bool[np.ndarray, "rollout row"], Bool[np.ndarray, "rollout row"]]:
-        there = (before.presence != Presence.ABSENT) & (before.presence != Presence.LEAVING)
-        moving = there & ~self.codebook.standing[before.kind, move]
+        there = (before.presence != Presence.ABSENT) & (before.presence != Presence.REMOVED)
+        moving = there & ~self.vocabulary.stationary[before.kind, move]
         road = road and bool(self.kerbs)
         times = max(CLEAR_AHEAD, *ROAD_AHEAD) if road else CLEAR_AHEAD
-        ways = repeat(before, move, self.codebook, times)
+        ways = repeat(before, move, self.vocabulary, times)
         soon = ways[:, :, : CLEAR_AHEAD * len(LOOKED_AT)]
         hits = find_hits(before, there, soon) & moving
         if not road:
@@ -106,7 +106,7 @@ class Lookout:
     def _way_m(
         self, before: Population, move: Int64[np.ndarray, "rollout row"]
     ) -> Float32[np.ndarray, "rollout row"]:
-        way_m: np.ndarray = self.codebook.end_pose[before.kind, move, :2]
+        way_m: np.ndarray = self.vocabulary.end_pose[before.kind, move, :2]
         return np.linalg.norm(way_m, axis=-1)
 
     def _road_ahead(
@@ -118,9 +118,9 @@ class Lookout:
 
 
 def look_out(
-    starts: Sequence[Start], codebook: MotionVocabulary, *, reject_off_road: bool
+    starts: Sequence[Start], vocabulary: MotionVocabulary, *, reject_off_road: bool
 ) -> Lookout:
     """Look out for rollouts; those of one scene share its map."""
     maps, scene = number_maps(starts)
     kerbs = [Kerbs(start.scene) for start in maps] if reject_off_road else []
-    return Lookout(codebook, kerbs, scene)
+    return Lookout(vocabulary, kerbs, scene)

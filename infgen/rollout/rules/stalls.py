@@ -68,7 +68,7 @@ class Patience:
         self._remember(everyone, token)
         stood = token - self._since
         vehicle = (everyone.kind == AgentType.VEHICLE) & (everyone.life != NOBODY)
-        vehicle &= everyone.presence != Presence.LEAVING
+        vehicle &= everyone.presence != Presence.REMOVED
         new = vehicle & (stood == self._tokens)
         self._in_lane[new] = self._are_in_lane(everyone.pose[new], np.nonzero(new)[0])
         stalled = vehicle & (stood >= self._tokens) & self._in_lane

@@ -1,4 +1,4 @@
-"""How well two codebooks write scenes they were not made from, and what they hold.
+"""How well two vocabularies write scenes they were not made from, and what they hold.
 
 Moves are matched as tokens are, rolling forward, so the error is that of the tokens.
 """
@@ -13,14 +13,14 @@ from jaxtyping import Float32, Float64, Int8, Int64
 from infgen.clock import CLOCK
 from infgen.scene import AgentType
 from infgen.tokens.agents import match_agents
-from infgen.tokens.clustering.kdisks import Items, Space, gap_m
-from infgen.tokens.clustering.motion_samples import NUM_KINDS
-from infgen.tokens.clustering.physical_limits import limits_of, within
+from infgen.tokens.clustering.kdisks import Items, Space, mean_gap_m
+from infgen.tokens.clustering.motion_samples import NUM_AGENT_TYPES
+from infgen.tokens.clustering.physical_limits import keeps_limits, motion_limits
 from infgen.tokens.clustering.settings import VocabSettings
-from infgen.tokens.clustering.vocabularies import MoveSpace, Origin, RoadSpace
+from infgen.tokens.clustering.vocabularies import MapSpace, MotionSpace, Origin
 from infgen.tokens.grid import make_grid
-from infgen.tokens.map import match_curves
-from infgen.tokens.motion_tokens import make_move_table
+from infgen.tokens.map import nearest_map_tokens
+from infgen.tokens.motion_tokens import make_match_table
 from infgen.tokens.settings import TokenSettings
 from infgen.tokens.tracks import Paths
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
@@ -36,33 +36,33 @@ class Matches:
     """Every observed token of some scenes, matched.
 
     Attributes:
-        kind: ``AgentType`` of the agent.
-        move: The move chosen.
+        agent_type: ``AgentType`` of the agent.
+        motion_token: The move chosen.
         error_m: From the centre where the chain of moves is to the logged centre.
     """
 
-    kind: Int8[np.ndarray, " match"]
-    move: Int64[np.ndarray, " match"]
+    agent_type: Int8[np.ndarray, " match"]
+    motion_token: Int64[np.ndarray, " match"]
     error_m: Float64[np.ndarray, " match"]
 
 
-def match_paths(paths: Iterable[Paths], codebook: MotionVocabulary) -> Matches:
+def match_paths(paths: Iterable[Paths], vocabulary: MotionVocabulary) -> Matches:
     """Match the agents of scenes as the tokenizer does."""
     settings = TokenSettings()
-    table, grid = make_move_table(codebook), make_grid(settings)
+    table, grid = make_match_table(vocabulary), make_grid(settings)
     kinds, moves, errors_m = [np.empty(0, np.int8)], [np.empty(0, int)], [np.empty(0)]
     for scene in paths:
         agents = match_agents(scene, table, grid, settings.insertion_order)[0]
         away_m = agents.pose[..., :2].astype(np.float64) - scene.pose[:, 1:, :2]
         row, token = np.nonzero(agents.observed)
-        kinds.append(agents.kind[row])
-        moves.append(agents.move[row, token].astype(int))
+        kinds.append(agents.agent_type[row])
+        moves.append(agents.motion_token[row, token].astype(int))
         errors_m.append(np.hypot(*away_m[row, token].T))
     return Matches(np.concatenate(kinds), np.concatenate(moves), np.concatenate(errors_m))
 
 
-def describe_moves(
-    codebook: MotionVocabulary,
+def describe_motion(
+    vocabulary: MotionVocabulary,
     origin: Int8[np.ndarray, "3 move"],
     validation_split: Matches,
     familiar: Matches,
@@ -71,53 +71,53 @@ def describe_moves(
     """Say of each kind what its moves are and how well they write held-out scenes.
 
     Args:
-        codebook: The moves.
+        vocabulary: The moves.
         origin: ``Origin`` of each.
-        validation_split: Matches of scenes the codebook was not made from.
+        validation_split: Matches of scenes the vocabulary was not made from.
         familiar: Matches of scenes it was made from; they count only as use.
-        settings: What the codebook was made with.
+        settings: What the vocabulary was made with.
     """
     return {
         AgentType(kind).name.lower(): {
             **_origins(origin[kind]),
-            **_use(kind, codebook.num_motion_tokens, validation_split, familiar),
+            **_use(kind, vocabulary.num_motion_tokens, validation_split, familiar),
             "held_out_error_m": _spread(
-                validation_split.error_m[validation_split.kind == kind]
+                validation_split.error_m[validation_split.agent_type == kind]
             ),
             "held_out_error_moving_m": _spread(
-                _moving_error(codebook, validation_split, kind)
+                _moving_error(vocabulary, validation_split, kind)
             ),
             **_describe_shapes(
-                MoveSpace(kind, limits_of(settings)),
-                codebook.path[kind],
+                MotionSpace(kind, motion_limits(settings)),
+                vocabulary.path[kind],
                 np.array([1, -1, -1], dtype=np.float32),
             ),
-            **_describe_motion(codebook.path[kind], kind, settings),
+            **_describe_kinematics(vocabulary.path[kind], kind, settings),
         }
-        for kind in range(NUM_KINDS)
+        for kind in range(NUM_AGENT_TYPES)
     }
 
 
-def describe_roads(
-    codebook: MapVocabulary,
+def describe_map(
+    vocabulary: MapVocabulary,
     origin: Int8[np.ndarray, " road"],
     held_out_m: Float32[np.ndarray, "unknown 11 2"],
     familiar_m: Float32[np.ndarray, "known 11 2"],
 ) -> dict[str, Any]:
     """Say what the shapes of map pieces are and how well they fit held-out ones."""
-    space = RoadSpace()
-    chosen = match_curves(held_out_m, codebook)
-    used = np.union1d(chosen, match_curves(familiar_m, codebook))
-    away_m = space.points_m(held_out_m) - space.points_m(codebook.curve_m[chosen])
-    steps_m = np.diff(codebook.curve_m.astype(np.float64), axis=1)
+    space = MapSpace()
+    chosen = nearest_map_tokens(held_out_m, vocabulary)
+    used = np.union1d(chosen, nearest_map_tokens(familiar_m, vocabulary))
+    away_m = space.points_m(held_out_m) - space.points_m(vocabulary.curve_m[chosen])
+    steps_m = np.diff(vocabulary.curve_m.astype(np.float64), axis=1)
     heading_rad = np.arctan2(steps_m[..., 1], steps_m[..., 0])
     turn_deg = np.degrees(np.unwrap(heading_rad, axis=1)[:, -1])
     return {
         **_origins(origin),
-        "dead": codebook.num_map_tokens - len(used),
+        "dead": vocabulary.num_map_tokens - len(used),
         "held_out_pieces": len(held_out_m),
         "held_out_error_m": _spread(np.linalg.norm(away_m, axis=-1).mean(axis=-1)),
-        **_describe_shapes(space, codebook.curve_m, np.array([1, -1], dtype=np.float32)),
+        **_describe_shapes(space, vocabulary.curve_m, np.array([1, -1], dtype=np.float32)),
         "length_m": _range(np.linalg.norm(steps_m, axis=-1).sum(axis=-1)),
         **_turns(turn_deg),
     }
@@ -131,31 +131,34 @@ def _origins(origin: np.ndarray) -> dict[str, int]:
 def _use(
     kind: int, num_motion_tokens: int, validation_split: Matches, familiar: Matches
 ) -> dict[str, int]:
-    parts = [matches.move[matches.kind == kind] for matches in (validation_split, familiar)]
+    parts = [
+        matches.motion_token[matches.agent_type == kind]
+        for matches in (validation_split, familiar)
+    ]
     used = len(np.unique(np.concatenate(parts)))
     return {"dead": num_motion_tokens - used, "held_out_tokens": len(parts[0])}
 
 
-def _moving_error(codebook: MotionVocabulary, matches: Matches, kind: int) -> np.ndarray:
-    end_m = np.hypot(*codebook.end_pose[kind, :, :2].T)
-    moving = (matches.kind == kind) & (end_m[matches.move] > MOVING_M)
+def _moving_error(vocabulary: MotionVocabulary, matches: Matches, kind: int) -> np.ndarray:
+    end_m = np.hypot(*vocabulary.end_pose[kind, :, :2].T)
+    moving = (matches.agent_type == kind) & (end_m[matches.motion_token] > MOVING_M)
     return matches.error_m[moving]
 
 
 def _describe_shapes(space: Space, items: Items, mirror: np.ndarray) -> dict[str, Any]:
     """Say how close rows are to each other, and to the mirror images of others."""
     points_m, mirrored_m = space.points_m(items), space.points_m(items * mirror)
-    gaps_m = np.array([np.partition(gap_m(points_m, one), 1)[1] for one in points_m])
-    mirror_m = np.array([gap_m(points_m, one).min() for one in mirrored_m])
+    gaps_m = np.array([np.partition(mean_gap_m(points_m, one), 1)[1] for one in points_m])
+    mirror_m = np.array([mean_gap_m(points_m, one).min() for one in mirrored_m])
     return {"nearest_gap_m": _range(gaps_m), "mirror_gap_m": _range(mirror_m)}
 
 
-def _describe_motion(
+def _describe_kinematics(
     path: np.ndarray, kind: int, settings: VocabSettings
 ) -> dict[str, Any]:
     end = path[:, -1].astype(np.float64)
     speed_mps = np.hypot(end[:, 0], end[:, 1]) * np.sign(end[:, 0]) / CLOCK.token_s
-    beyond = ~within(path, kind, limits_of(settings))
+    beyond = ~keeps_limits(path, kind, motion_limits(settings))
     return {
         "speed_mps": _range(speed_mps),
         **_turns(np.degrees(end[:, 2])),

@@ -30,7 +30,7 @@ class Space(Protocol):
         """Tell which items may be centres."""
 
 
-def lay_disks(
+def find_disks(
     space: Space,
     items: Items,
     order: Int64[np.ndarray, " item"],
@@ -51,7 +51,7 @@ def lay_disks(
         taken: Centres that there are already.
         average: Let means stand for disks; else seeds do.
     """
-    pool = _Pool(space.points_m(items))
+    pool = _SortedItems(space.points_m(items))
     laid_m = np.empty((len(taken) + count, *pool.points_m.shape[1:]))
     laid_m[: len(taken)] = space.points_m(taken)
     free = np.ones(len(items), dtype=bool)
@@ -69,7 +69,7 @@ def lay_disks(
         used = len(taken) + len(centres)
         centre = items[seed]
         if average:
-            centre = _stand_in(space, members, laid_m[:used], tolerance_m)
+            centre = _disk_centre(space, members, laid_m[:used], tolerance_m)
         laid_m[used] = space.points_m(centre[None])[0]
         free[disk] = False
         free[pool.near(laid_m[used], tolerance_m)] = False
@@ -77,7 +77,7 @@ def lay_disks(
     return np.array(centres, dtype=np.float32).reshape(-1, *items.shape[1:])
 
 
-def gap_m(
+def mean_gap_m(
     points_m: Float64[np.ndarray, "*rows point 2"], point_m: Float64[np.ndarray, "point 2"]
 ) -> Float64[np.ndarray, "*rows"]:
     """Return how far items are from one: the mean distance of their points."""
@@ -85,7 +85,7 @@ def gap_m(
     return np.sqrt(away_m[..., 0] ** 2 + away_m[..., 1] ** 2).mean(axis=-1)
 
 
-class _Pool:
+class _SortedItems:
     """Items sorted along one axis, so that only a strip of them need be measured.
 
     The centroids of two items are never farther apart than the items are.
@@ -107,16 +107,16 @@ class _Pool:
             self.along_m.searchsorted(middle_m - reach_m),
             self.along_m.searchsorted(middle_m + reach_m, side="right"),
         )
-        return self.row[strip][gap_m(self._sorted_m[strip], point_m) <= within_m]
+        return self.row[strip][mean_gap_m(self._sorted_m[strip], point_m) <= within_m]
 
 
-def _stand_in(
+def _disk_centre(
     space: Space, members: Items, laid_m: np.ndarray, tolerance_m: float
 ) -> Items:
     """Return the mean of a disk if it may be a centre, else the member nearest to it."""
     mean = space.mean(members)
     mean_m = space.points_m(mean[None])[0]
-    if space.allowed(mean[None])[0] and (gap_m(laid_m, mean_m) > tolerance_m).all():
+    if space.allowed(mean[None])[0] and (mean_gap_m(laid_m, mean_m) > tolerance_m).all():
         return mean
-    nearest = gap_m(space.points_m(members), mean_m).argmin()
+    nearest = mean_gap_m(space.points_m(members), mean_m).argmin()
     return members[nearest]

@@ -1,6 +1,6 @@
 """Moves made by rule: even motion along arcs, for what few logs do not show.
 
-A codebook must be able to follow any road user, or the chain of moves runs away from the
+A vocabulary must be able to follow any road user, or the chain of moves runs away from the
 log. Where logs hold no move nearby, a fan of arcs within the limits stands in.
 """
 
@@ -10,10 +10,14 @@ from jaxtyping import Float32
 from infgen.clock import CLOCK
 from infgen.geometry import rotate
 from infgen.scene import AgentType
-from infgen.tokens.clustering.physical_limits import MAX_REVERSE_MPS, MotionLimits, within
+from infgen.tokens.clustering.physical_limits import (
+    MAX_REVERSE_MPS,
+    MotionLimits,
+    keeps_limits,
+)
 from infgen.tokens.vocabulary import BOX_LW_M
 
-TIGHTEST_TURN_M = (4.0, 0.0, 1.0)
+MIN_TURN_RADIUS_M = (4.0, 0.0, 1.0)
 """Smallest radius of an arc, by kind; a pedestrian turns on the spot."""
 
 PIVOT_M = (1.4, 0.0, 0.5)
@@ -22,17 +26,17 @@ PIVOT_M = (1.4, 0.0, 0.5)
 REVERSE_MPS = (4.0, 1.5, 1.0)
 """How fast a fan goes backwards."""
 
-GRIP_MPS2 = 8.0
+MAX_LATERAL_MPS2 = 8.0
 """Sideways acceleration that tyres hold."""
 
-STROLL_MPS = 1.5
+SIDESTEP_MPS = 1.5
 """How fast a pedestrian goes in a direction that it does not face."""
 
 COMFORT_MPS2, COMFORT_RAD_S = 3.0, 1.0
 """Sideways acceleration and yaw rate that are still ordinary."""
 
 
-def fan(
+def make_fan(
     kind: int, limits: MotionLimits, spacing_m: float
 ) -> Float32[np.ndarray, "move 6 3"]:
     """Make arcs of all lengths and turns of a kind, the most ordinary first.
@@ -46,15 +50,15 @@ def fan(
     effort = _effort(length_m, turn_rad, float(limits.speed_mps[kind]))
     path = _arcs(length_m, turn_rad, PIVOT_M[kind])
     if kind == AgentType.PEDESTRIAN:
-        path, effort = _with_strolls(path, effort)
+        path, effort = _with_sidesteps(path, effort)
     order = np.lexsort((*path[:, -1].T, effort))
     path = path[order]
-    return path[within(path, kind, limits)]
+    return path[keeps_limits(path, kind, limits)]
 
 
-def _with_strolls(path: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _with_sidesteps(path: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Add slow moves aside, whatever way a pedestrian faces."""
-    slow = np.hypot(path[:, -1, 0], path[:, -1, 1]) <= STROLL_MPS * CLOCK.token_s
+    slow = np.hypot(path[:, -1, 0], path[:, -1, 1]) <= SIDESTEP_MPS * CLOCK.token_s
     slow &= path[:, -1, 0] > 0
     paths, efforts = [path], [effort]
     for eighths in (1, -1, 2, -2, 3, -3):
@@ -78,8 +82,8 @@ def _grid(
     ahead = int(float(limits.speed_mps[kind]) * CLOCK.token_s / spacing_m)
     length_m = np.arange(-back, ahead + 1) * spacing_m
     length_m, turn_rad = (x.ravel() for x in np.meshgrid(length_m, turn_rad))
-    wide = np.abs(length_m) >= TIGHTEST_TURN_M[kind] * np.abs(turn_rad)
-    wide &= np.abs(length_m * turn_rad) <= GRIP_MPS2 * CLOCK.token_s**2
+    wide = np.abs(length_m) >= MIN_TURN_RADIUS_M[kind] * np.abs(turn_rad)
+    wide &= np.abs(length_m * turn_rad) <= MAX_LATERAL_MPS2 * CLOCK.token_s**2
     return length_m[wide], turn_rad[wide]
 
 

@@ -1,4 +1,4 @@
-"""Samples of map pieces: what the map codebook is made from and measured on."""
+"""Samples of map pieces: what the map vocabulary is made from and measured on."""
 
 from dataclasses import dataclass
 
@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float32, UInt64
 
 from infgen.scene import Scene
-from infgen.tokens.clustering.sample_keys import item_keys, smallest
-from infgen.tokens.map import road_pieces
+from infgen.tokens.clustering.sample_keys import item_keys, smallest_keys
+from infgen.tokens.map import cut_map_tokens
 
 
 @dataclass(frozen=True, slots=True)
-class Curves:
+class MapSamples:
     """Pieces of map lines, each in the frame of its own pose.
 
     Attributes:
@@ -23,17 +23,17 @@ class Curves:
     curve_m: Float32[np.ndarray, "curve 11 2"]
 
 
-NO_CURVES = Curves(np.empty(0, np.uint64), np.empty((0, 11, 2), np.float32))
+NO_MAP_SAMPLES = MapSamples(np.empty(0, np.uint64), np.empty((0, 11, 2), np.float32))
 
 
-def scene_curves(scene: Scene) -> Curves:
+def scene_map_samples(scene: Scene) -> MapSamples:
     """Cut all pieces out of a scene's map."""
-    curve_m = road_pieces(scene.road_map).curve_m
-    return Curves(item_keys(scene.scenario_id, np.arange(len(curve_m))), curve_m)
+    curve_m = cut_map_tokens(scene.road_map).curve_m
+    return MapSamples(item_keys(scene.scenario_id, np.arange(len(curve_m))), curve_m)
 
 
-def sample_curves(parts: list[Curves], count: int) -> Curves:
+def merge_map_samples(parts: list[MapSamples], count: int) -> MapSamples:
     """Merge curves and keep at most so many, whatever their order."""
     key = np.concatenate([part.key for part in parts])
-    rows = smallest(key, count)
-    return Curves(key[rows], np.concatenate([part.curve_m for part in parts])[rows])
+    rows = smallest_keys(key, count)
+    return MapSamples(key[rows], np.concatenate([part.curve_m for part in parts])[rows])

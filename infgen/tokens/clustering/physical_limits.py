@@ -1,8 +1,8 @@
 """What a road user can do in half a second, and what is only noise of the log.
 
-The codebook holds no move beyond these limits. Speed, acceleration and turn are bounded at
-every 0.1 s step; acceleration as a vector. All three bounds are convex, so a mean of moves
-within them is within them.
+The vocabulary holds no move beyond these limits. Speed, acceleration and turn are bounded
+at every 0.1 s step; acceleration as a vector. All three bounds are convex, so a mean of
+moves within them is within them.
 """
 
 from dataclasses import dataclass
@@ -21,16 +21,17 @@ PEDESTRIAN_MAX_YAW_RATE_RAD_S = 2 * np.pi
 MAX_REVERSE_MPS = (6.0, 2.0, 1.5)
 """Who goes backwards faster is logged with a wrong heading (row: ``AgentType``)."""
 
-JUMP = 4.0
+JUMP_FACTOR = 4.0
 """A step that changes velocity by so many times the limit is a jump of the log, not noise
 that may be smoothed."""
 
-SLIP_M, LONGEST_PIVOT_M = 0.3, (3.0, 0.0, 1.0)
-"""Wheels turn a body about the rear axle, at most ``LONGEST_PIVOT_M`` behind its centre,
-which swings out; beyond that the centre goes sideways by no more than ``SLIP_M``. A
+MAX_SIDE_SLIP_M, MAX_PIVOT_M = 0.3, (3.0, 0.0, 1.0)
+"""Wheels turn a body about the rear axle, at most ``MAX_PIVOT_M`` behind its centre,
+which swings out; beyond that the centre goes sideways by no more than ``MAX_SIDE_SLIP_M``.
+A
 pedestrian may step aside."""
 
-_INSIDE, _EASED = 1 - 1e-3, 1 - 2e-3
+_INSIDE, _SMOOTHED = 1 - 1e-3, 1 - 2e-3
 """Moves keep this far inside the limits, so that no rounding brings them outside."""
 
 
@@ -49,7 +50,7 @@ class MotionLimits:
     yaw_rate_rad_s: Float32[np.ndarray, "3"]
 
 
-def limits_of(settings: VocabSettings) -> MotionLimits:
+def motion_limits(settings: VocabSettings) -> MotionLimits:
     """Take the limits from the settings."""
     speed_mps = [
         settings.vehicle_max_speed_mps,
@@ -64,7 +65,7 @@ def limits_of(settings: VocabSettings) -> MotionLimits:
     )
 
 
-def within(
+def keeps_limits(
     path: Float32[np.ndarray, "move 6 3"], kind: int, limits: MotionLimits
 ) -> Bool[np.ndarray, " move"]:
     """Tell which moves keep to the limits of a kind at every step."""
@@ -73,29 +74,29 @@ def within(
         (speed_mps <= limits.speed_mps[kind] * _INSIDE)
         & (accel_mps2 <= limits.accel_mps2[kind] * _INSIDE)
         & (yaw_rad_s <= limits.yaw_rate_rad_s[kind] * _INSIDE)
-        & _goes_straight(path, kind)
+        & _follows_heading(path, kind)
     )
 
 
 def plausible(
     path: Float32[np.ndarray, "move 6 3"], kind: int, limits: MotionLimits
 ) -> Bool[np.ndarray, " move"]:
-    """Tell which logged moves are possible but for jitter, which ``ease`` takes away."""
+    """Tell which logged moves are possible but for jitter, which ``smooth`` takes away."""
     speed_mps, accel_mps2, _ = _rates(path)
     step_m = np.diff(path[..., :2], axis=1)
     change_mps = np.linalg.norm(step_m[:, -1] - step_m[:, 0], axis=-1) / CLOCK.step_s
     mean_accel_mps2 = change_mps / (CLOCK.token_s - CLOCK.step_s)
     mean_yaw_rad_s = np.abs(path[:, -1, 2]) / CLOCK.token_s
     return (
-        (speed_mps <= limits.speed_mps[kind] * _EASED)
-        & (accel_mps2 <= limits.accel_mps2[kind] * JUMP)
-        & (mean_accel_mps2 <= limits.accel_mps2[kind] * _EASED)
-        & (mean_yaw_rad_s <= limits.yaw_rate_rad_s[kind] * _EASED)
-        & _goes_straight(path, kind)
+        (speed_mps <= limits.speed_mps[kind] * _SMOOTHED)
+        & (accel_mps2 <= limits.accel_mps2[kind] * JUMP_FACTOR)
+        & (mean_accel_mps2 <= limits.accel_mps2[kind] * _SMOOTHED)
+        & (mean_yaw_rad_s <= limits.yaw_rate_rad_s[kind] * _SMOOTHED)
+        & _follows_heading(path, kind)
     )
 
 
-def ease(
+def smooth(
     path: Float32[np.ndarray, "move 6 3"], kind: int, limits: MotionLimits
 ) -> Float32[np.ndarray, "move 6 3"]:
     """Draw plausible moves towards even motion, as far as the limits ask; ends stay.
@@ -110,8 +111,8 @@ def ease(
 
     _, accel_mps2, yaw_rad_s = _rates(path)
     mean_yaw_rad_s = np.abs(path[:, -1, 2]) / CLOCK.token_s
-    most_mps2 = limits.accel_mps2[kind] * _EASED
-    spare_rad_s = limits.yaw_rate_rad_s[kind] * _EASED - mean_yaw_rad_s
+    most_mps2 = limits.accel_mps2[kind] * _SMOOTHED
+    spare_rad_s = limits.yaw_rate_rad_s[kind] * _SMOOTHED - mean_yaw_rad_s
     kept_xy = most_mps2 / np.maximum(accel_mps2, most_mps2)
     kept_turn = spare_rad_s / np.maximum(yaw_rad_s - mean_yaw_rad_s, spare_rad_s)
     kept = np.stack([kept_xy, kept_xy, kept_turn], axis=-1)[:, None]
@@ -132,7 +133,7 @@ def _rates(path: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
 
 
-def _goes_straight(path: np.ndarray, kind: int) -> np.ndarray:
+def _follows_heading(path: np.ndarray, kind: int) -> np.ndarray:
     """Tell which moves go where the agent points, as far as its kind must."""
     turn_rad = path[:, -1, 2]
     end_m = rotate(path[:, -1, :2], -turn_rad / 2)  # seen along the mean heading
@@ -140,6 +141,6 @@ def _goes_straight(path: np.ndarray, kind: int) -> np.ndarray:
     straight = forward_m >= -MAX_REVERSE_MPS[kind] * CLOCK.token_s
     if kind == AgentType.PEDESTRIAN:
         return straight
-    swing_m = 2 * LONGEST_PIVOT_M[kind] * np.sin(turn_rad / 2)
-    straight &= left_m <= np.maximum(swing_m, 0) + SLIP_M
-    return straight & (left_m >= np.minimum(swing_m, 0) - SLIP_M)
+    swing_m = 2 * MAX_PIVOT_M[kind] * np.sin(turn_rad / 2)
+    straight &= left_m <= np.maximum(swing_m, 0) + MAX_SIDE_SLIP_M
+    return straight & (left_m >= np.minimum(swing_m, 0) - MAX_SIDE_SLIP_M)

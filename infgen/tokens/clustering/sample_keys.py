@@ -25,7 +25,9 @@ def item_keys(name: str, *numbers: Int[np.ndarray, " item"]) -> UInt64[np.ndarra
     return keys
 
 
-def smallest(keys: UInt64[np.ndarray, " item"], count: int) -> Int64[np.ndarray, " sample"]:
+def smallest_keys(
+    keys: UInt64[np.ndarray, " item"], count: int
+) -> Int64[np.ndarray, " sample"]:
     """Return rows of the smallest keys, ascending; of equal keys the first row only."""
     rows = np.unique(keys, return_index=True)[1]
     return rows[:count]

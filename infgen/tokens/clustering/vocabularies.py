@@ -1,6 +1,6 @@
-"""From samples of logs to the two codebooks.
+"""From samples of logs to the two vocabularies.
 
-Logged items fill a codebook first. Where they do not suffice, their mirror images follow,
+Logged items fill a vocabulary first. Where they do not suffice, their mirror images follow,
 then shapes made by rule, at last ever finer differences. ``Origin`` tells which is which.
 """
 
@@ -12,31 +12,40 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8
 
 from infgen.geometry import box_corners
-from infgen.tokens.clustering.kdisks import Items, Space, gap_m, lay_disks
-from infgen.tokens.clustering.made_map_samples import line_arcs
-from infgen.tokens.clustering.made_motion_samples import fan
-from infgen.tokens.clustering.motion_samples import NUM_KINDS, Segments
-from infgen.tokens.clustering.physical_limits import MotionLimits, limits_of, within
+from infgen.tokens.clustering.kdisks import Items, Space, find_disks, mean_gap_m
+from infgen.tokens.clustering.made_map_samples import make_arcs
+from infgen.tokens.clustering.made_motion_samples import make_fan
+from infgen.tokens.clustering.motion_samples import NUM_AGENT_TYPES, MotionSamples
+from infgen.tokens.clustering.physical_limits import (
+    MotionLimits,
+    keeps_limits,
+    motion_limits,
+)
 from infgen.tokens.clustering.settings import VocabSettings
-from infgen.tokens.vocabulary import BOX_LW_M, ROAD_SAMPLES, MapVocabulary, MotionVocabulary
+from infgen.tokens.vocabulary import (
+    BOX_LW_M,
+    MAP_SAMPLE_POINTS,
+    MapVocabulary,
+    MotionVocabulary,
+)
 
-ANCHOR_M = 0.5
+MADE_ANCHOR_M = 0.5
 """Where logs show no move within this distance of a possible one, one is made."""
-ANCHOR_SHARE = 1 / 8
-"""Of a codebook, at most, goes to such moves before logged ones have had their turn."""
+MAX_ANCHOR_SHARE = 1 / 8
+"""Of a vocabulary, at most, goes to such moves before logged ones have had their turn."""
 RARE_SHARE = 1 / 4
-"""Of a codebook is kept for what common moves or shapes leave uncovered ..."""
-RARE_MOVES, RARE_ROADS = 2.0, 3.0
+"""Of a vocabulary is kept for what common moves or shapes leave uncovered ..."""
+RARE_MOTION_FACTOR, RARE_MAP_FACTOR = 2.0, 3.0
 """... by disks so many times the tolerance. Better cover all roughly than most finely."""
-COARSEST = 8
+COARSEST_FACTOR = 8
 """Made shapes are laid coarsely first (so many tolerances apart), then ever finer."""
 
-LEAST_ROAD_TOLERANCE_M, MOST_ROAD_TOLERANCE_M = 0.01, 0.64
+MIN_MAP_TOLERANCE_M, MAX_MAP_TOLERANCE_M = 0.01, 0.64
 _BISECTIONS = 8
 
 
 class Origin(IntEnum):
-    """Where a row of a codebook comes from."""
+    """Where a row of a vocabulary comes from."""
 
     LOGGED = 0
     MIRRORED = 1
@@ -44,15 +53,15 @@ class Origin(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class MoveSpace:
+class MotionSpace:
     """Moves of one kind: as far apart as the corners of its box at their ends."""
 
-    kind: int
+    agent_type: int
     limits: MotionLimits
 
     def points_m(self, items: Items) -> Float64[np.ndarray, "move 4 2"]:
         """Return the box corners at the ends of moves."""
-        return box_corners(items[:, -1].astype(np.float64), BOX_LW_M[self.kind])
+        return box_corners(items[:, -1].astype(np.float64), BOX_LW_M[self.agent_type])
 
     def mean(self, items: Items) -> Float32[np.ndarray, "6 3"]:
         """Return the mean of moves; of headings the direction of the mean vector."""
@@ -63,16 +72,16 @@ class MoveSpace:
 
     def allowed(self, items: Items) -> Bool[np.ndarray, " move"]:
         """Tell which moves keep to the limits."""
-        return within(items, self.kind, self.limits)
+        return keeps_limits(items, self.agent_type, self.limits)
 
 
 @dataclass(frozen=True, slots=True)
-class RoadSpace:
+class MapSpace:
     """Pieces of map lines: as far apart as their middle and last points."""
 
     def points_m(self, items: Items) -> Float64[np.ndarray, "road 2 2"]:
         """Return the points that pieces are matched by, but for the first."""
-        return items[:, list(ROAD_SAMPLES[1:])].astype(np.float64)
+        return items[:, list(MAP_SAMPLE_POINTS[1:])].astype(np.float64)
 
     def mean(self, items: Items) -> Float32[np.ndarray, "11 2"]:
         """Return the mean of pieces. As theirs do, its first interval lies along +x."""
@@ -84,8 +93,8 @@ class RoadSpace:
 
 
 @dataclass(slots=True)
-class _Shelf:
-    """A codebook while it is filled."""
+class _VocabularyBuilder:
+    """A vocabulary while it is filled."""
 
     space: Space
     count: int
@@ -107,7 +116,7 @@ class _Shelf:
         spare: int = 0,
     ) -> None:
         """Lay disks on items until only ``spare`` rows are free. No order: as they come."""
-        laid = lay_disks(
+        laid = find_disks(
             self.space,
             items,
             np.arange(len(items)) if order is None else order,
@@ -146,7 +155,7 @@ class _Shelf:
         """
         self.lay(logged, order, tolerance_m, origin=Origin.LOGGED)
         self.lay(mirrored, order[: len(mirrored)], tolerance_m, origin=Origin.MIRRORED)
-        apart_m = tolerance_m * COARSEST
+        apart_m = tolerance_m * COARSEST_FACTOR
         while self.room:
             self.lay(made(apart_m / 2), None, apart_m, origin=Origin.MADE)
             apart_m /= 2
@@ -155,89 +164,94 @@ class _Shelf:
                 self.lay(mirrored, order[: len(mirrored)], apart_m, origin=Origin.MIRRORED)
 
 
-def cluster_moves(
-    segments: Segments, settings: VocabSettings
+def cluster_motion(
+    segments: MotionSamples, settings: VocabSettings
 ) -> tuple[MotionVocabulary, Int8[np.ndarray, "3 move"]]:
-    """Make the motion codebook from segments of logs (which may be none).
+    """Make the motion vocabulary from segments of logs (which may be none).
 
     Returns:
-        The codebook, and the ``Origin`` of its moves.
+        The vocabulary, and the ``Origin`` of its moves.
     """
     kinds = [
-        _cluster_kind(segments.of_kind(kind), kind, settings) for kind in range(NUM_KINDS)
+        _cluster_agent_type(segments.of_agent_type(kind), kind, settings)
+        for kind in range(NUM_AGENT_TYPES)
     ]
-    origin = np.array([shelf.origin for shelf in kinds], dtype=np.int8)
-    path = np.stack([shelf.rows for shelf in kinds])
+    origin = np.array([builder.origin for builder in kinds], dtype=np.int8)
+    path = np.stack([builder.rows for builder in kinds])
     return MotionVocabulary(BOX_LW_M, path, origin == Origin.LOGGED), origin
 
 
-def cluster_roads(
+def cluster_map(
     curve_m: Float32[np.ndarray, "piece 11 2"], settings: VocabSettings
 ) -> tuple[MapVocabulary, Int8[np.ndarray, " road"], float]:
-    """Make the map codebook from pieces of lines (which may be none).
+    """Make the map vocabulary from pieces of lines (which may be none).
 
     Returns:
-        The codebook, the ``Origin`` of its shapes, and the tolerance it was made with.
+        The vocabulary, the ``Origin`` of its shapes, and the tolerance it was made with.
     """
-    logged, space = _distinct(curve_m), RoadSpace()
+    logged, space = _distinct(curve_m), MapSpace()
     order = np.random.default_rng(settings.seed).permutation(len(logged))
     tolerance_m = settings.map_tolerance_m
     if tolerance_m == 0:
-        tolerance_m = _road_tolerance(space, logged, order, settings.num_map_tokens)
-    shelf = _Shelf(space, settings.num_map_tokens, logged[:0])
-    shelf.cover(logged, order, tolerance_m, RARE_ROADS)
+        tolerance_m = _search_tolerance(space, logged, order, settings.num_map_tokens)
+    builder = _VocabularyBuilder(space, settings.num_map_tokens, logged[:0])
+    builder.cover(logged, order, tolerance_m, RARE_MAP_FACTOR)
     mirrored = logged * np.array([1, -1], np.float32) if settings.mirror else logged[:0]
-    shelf.fill(logged, order, tolerance_m, mirrored, line_arcs)
-    origin = np.array(shelf.origin, dtype=np.int8)
-    return MapVocabulary(shelf.rows, origin == Origin.LOGGED), origin, tolerance_m
+    builder.fill(logged, order, tolerance_m, mirrored, make_arcs)
+    origin = np.array(builder.origin, dtype=np.int8)
+    return MapVocabulary(builder.rows, origin == Origin.LOGGED), origin, tolerance_m
 
 
-def _cluster_kind(
+def _cluster_agent_type(
     path: Float32[np.ndarray, "segment 6 3"], kind: int, settings: VocabSettings
-) -> _Shelf:
-    """Fill one kind's codebook; its first row stands still."""
-    limits = limits_of(settings)
-    space, logged = MoveSpace(kind, limits), _distinct(path)
+) -> _VocabularyBuilder:
+    """Fill one kind's vocabulary; its first row stands still."""
+    limits = motion_limits(settings)
+    space, logged = MotionSpace(kind, limits), _distinct(path)
     order = np.random.default_rng((settings.seed, kind)).permutation(len(logged))
     mirrored = logged * np.array([1, -1, -1], np.float32)
     mirrored = mirrored if settings.mirror else mirrored[:0]
 
     still = np.zeros((1, *path.shape[1:]), np.float32)
-    shelf = _Shelf(space, settings.num_motion_tokens, still, [Origin.MADE])
-    anchors = _anchors(space, logged, int(settings.num_motion_tokens * ANCHOR_SHARE))
+    builder = _VocabularyBuilder(space, settings.num_motion_tokens, still, [Origin.MADE])
+    anchors = _anchors(space, logged, int(settings.num_motion_tokens * MAX_ANCHOR_SHARE))
     tolerance_m = settings.tolerance_m
-    shelf.cover(logged, order, tolerance_m, RARE_MOVES, spare=len(anchors))
-    shelf.lay(anchors, None, tolerance_m, origin=Origin.MADE)
-    shelf.fill(
-        logged, order, tolerance_m, mirrored, lambda apart_m: fan(kind, limits, apart_m)
+    builder.cover(logged, order, tolerance_m, RARE_MOTION_FACTOR, spare=len(anchors))
+    builder.lay(anchors, None, tolerance_m, origin=Origin.MADE)
+    builder.fill(
+        logged,
+        order,
+        tolerance_m,
+        mirrored,
+        lambda apart_m: make_fan(kind, limits, apart_m),
     )
-    return shelf
+    return builder
 
 
-def _anchors(space: MoveSpace, logged: Items, most: int) -> Items:
+def _anchors(space: MotionSpace, logged: Items, most: int) -> Items:
     """Make the most ordinary of the moves that logs show nothing like."""
-    made = fan(space.kind, space.limits, ANCHOR_M / 4)
+    made = make_fan(space.agent_type, space.limits, MADE_ANCHOR_M / 4)
     still = np.zeros((1, *made.shape[1:]), np.float32)
     order = np.arange(len(made))
-    sparse = lay_disks(space, made, order, ANCHOR_M, len(made), still, average=False)
+    sparse = find_disks(space, made, order, MADE_ANCHOR_M, len(made), still, average=False)
     logged_m = space.points_m(logged)
     lonely = [
-        not (gap_m(logged_m, point_m) <= ANCHOR_M).any()
+        not (mean_gap_m(logged_m, point_m) <= MADE_ANCHOR_M).any()
         for point_m in space.points_m(sparse)
     ]
     return sparse[np.array(lonely, dtype=bool)][:most]
 
 
-def _road_tolerance(
-    space: RoadSpace, logged: Items, order: np.ndarray, count: int
+def _search_tolerance(
+    space: MapSpace, logged: Items, order: np.ndarray, count: int
 ) -> float:
     """Search the least tolerance at which so many disks cover all pieces."""
-    low_m, high_m = LEAST_ROAD_TOLERANCE_M, MOST_ROAD_TOLERANCE_M
+    low_m, high_m = MIN_MAP_TOLERANCE_M, MAX_MAP_TOLERANCE_M
 
     def suffices(tolerance_m: float) -> bool:
-        shelf = _Shelf(space, count + 1, logged[:0])
-        shelf.cover(logged, order, tolerance_m, RARE_ROADS)
-        return shelf.room > 0
+        builder = _VocabularyBuilder(space, count + 1, logged[:0])
+        builder.cover(logged, order, tolerance_m, RARE_MAP_FACTOR)
+        return builder.room > 0
 
     if suffices(low_m):
         return low_m

@@ -1,4 +1,4 @@
-"""The codebooks on one page: every move and every shape drawn, and their figures in tables.
+"""The vocabularies on one page: every token drawn, and statistics in tables.
 
 The page is self-contained: no scripts, fonts or pictures from elsewhere.
 """
@@ -45,7 +45,7 @@ def codebook_page(
     """Write the page (HTML) of a vocabulary report.
 
     Args:
-        report: What stage ``build-vocab`` says of the codebooks (its ``report.json``).
+        report: What stage ``build-vocab`` says of the vocabularies (its ``report.json``).
         motion: The moves.
         move_origin: ``Origin`` of each.
         roads: The shapes of map pieces.
@@ -83,7 +83,7 @@ def codebook_page(
 
 
 def _table(columns: Mapping[str, Mapping[str, Any]]) -> str:
-    """Lay figures out: one row each, one column per codebook."""
+    """Lay figures out: one row each, one column per vocabulary."""
     names = list(next(iter(columns.values())))
     head = "".join(f"<th>{escape(name)}</th>" for name in columns)
     rows = []

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int64
 
 from infgen.scene import (
-    FeatureKind,
+    FeatureType,
     LaneType,
     RoadEdgeType,
     RoadLineType,
@@ -53,10 +53,10 @@ _LINES = {
 }
 _EDGES = {RoadEdgeType.MEDIAN: RoadLook.MEDIAN}
 _PLAIN = {
-    FeatureKind.CROSSWALK: RoadLook.CROSSWALK,
-    FeatureKind.SPEED_BUMP: RoadLook.SPEED_BUMP,
-    FeatureKind.DRIVEWAY: RoadLook.DRIVEWAY,
-    FeatureKind.STOP_SIGN: RoadLook.STOP_SIGN,
+    FeatureType.CROSSWALK: RoadLook.CROSSWALK,
+    FeatureType.SPEED_BUMP: RoadLook.SPEED_BUMP,
+    FeatureType.DRIVEWAY: RoadLook.DRIVEWAY,
+    FeatureType.STOP_SIGN: RoadLook.STOP_SIGN,
 }
 STRIPE_M = 0.6
 """Width of a stripe of a crosswalk, and about the gap to the next."""
@@ -102,7 +102,7 @@ def draw_map(road_map: RoadMap) -> DrawnMap:
     """Sort a map's features by their looks, and leave out points on straight stretches."""
     looks = [
         look_of(int(kind), int(type_))
-        for kind, type_ in zip(road_map.feature_kind, road_map.feature_type, strict=True)
+        for kind, type_ in zip(road_map.feature_type, road_map.feature_subtype, strict=True)
     ]
     lines = [
         (look, bool(road_map.interpolating[row]), thin(part, TOLERANCE_M))
@@ -146,13 +146,13 @@ def zebra(
 
 def look_of(kind: int, type_: int) -> RoadLook | None:
     """Return what a feature looks like; None for kinds that are not drawn."""
-    if kind == FeatureKind.LANE:
+    if kind == FeatureType.LANE:
         return _LANES.get(LaneType(type_), RoadLook.LANE)
-    if kind == FeatureKind.ROAD_LINE:
+    if kind == FeatureType.ROAD_LINE:
         return _LINES.get(RoadLineType(type_), RoadLook.WHITE_BROKEN)
-    if kind == FeatureKind.ROAD_EDGE:
+    if kind == FeatureType.ROAD_EDGE:
         return _EDGES.get(RoadEdgeType(type_), RoadLook.EDGE)
-    return _PLAIN.get(FeatureKind(kind))
+    return _PLAIN.get(FeatureType(kind))
 
 
 def thin(

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32
 from infgen.clock import CLOCK
 from infgen.geometry import box_corners
 from infgen.rollout.rollout import Rollout
-from infgen.scene import FeatureKind, RoadMap, Scene
+from infgen.scene import FeatureType, RoadMap, Scene
 
 REACH_M = 60.0
 """From the ego to the edge of a view."""
@@ -26,12 +26,12 @@ _NOTCH = 0.35
 EGO, INITIAL, INSERTED = "ego", "initial", "inserted"
 _LEGEND = {EGO: "ego", INITIAL: "there at the start", INSERTED: "came in later"}
 _LOOKS = {
-    FeatureKind.CROSSWALK: "zebra",
-    FeatureKind.SPEED_BUMP: "zebra",
-    FeatureKind.DRIVEWAY: "zebra",
-    FeatureKind.LANE: "lane",
-    FeatureKind.ROAD_LINE: "paint",
-    FeatureKind.ROAD_EDGE: "edge",
+    FeatureType.CROSSWALK: "zebra",
+    FeatureType.SPEED_BUMP: "zebra",
+    FeatureType.DRIVEWAY: "zebra",
+    FeatureType.LANE: "lane",
+    FeatureType.ROAD_LINE: "paint",
+    FeatureType.ROAD_EDGE: "edge",
 }
 """How kinds of features are drawn, from the bottom up. Stop signs are not."""
 
@@ -128,7 +128,7 @@ def _roads(road_map: RoadMap, centre_m: Float32[np.ndarray, "2"]) -> str:
     near = np.asarray((np.abs(points_px - VIEW_PX / 2) < VIEW_PX * 0.6).all(axis=1))
     paths: dict[str, list[str]] = {look: [] for look in _LOOKS.values()}
     for feature in range(road_map.num_features):
-        kind = FeatureKind(road_map.feature_kind[feature])
+        kind = FeatureType(road_map.feature_type[feature])
         part = slice(*road_map.point_offsets[feature : feature + 2].tolist())
         if kind in _LOOKS and near[part].any():
             # An outline cut short would be another outline.

@@ -128,7 +128,14 @@ def show_log(scene: Scene) -> Showing:
     size = (tracks.size_lwh_m[..., :2] * valid[..., None]).sum(axis=1) / seen
     pose = np.concatenate([tracks.xyz_m[..., :2], tracks.heading_rad[..., None]], axis=-1)
     return _showing(
-        LOG, scene.ego, tracks.id, tracks.kind, role, size.astype(np.float32), pose, valid
+        LOG,
+        scene.ego,
+        tracks.id,
+        tracks.agent_type,
+        role,
+        size.astype(np.float32),
+        pose,
+        valid,
     )
 
 

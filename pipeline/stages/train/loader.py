@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from infgen.model.batching.batch import Batch, Limits, collate
-from infgen.model.batching.perturbation import Noise
+from infgen.model.batching.perturbation import Perturbation
 from infgen.model.tensors import map_tensors
 from infgen.tokens.scene_tokens import SceneTokens
 from pipeline.stages.tokenize import open_tokens
@@ -93,7 +93,7 @@ class Recipe(Dataset[list[Batch]]):
     order: Order
     parts: int = 1
     own: range = range(1)
-    noise: Noise | None = None
+    noise: Perturbation | None = None
 
     def __getitem__(self, step: int) -> list[Batch]:
         """Make the own parts of the batch of one step."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from infgen.model.batching.perturbation import Noise, make_noise
+from infgen.model.batching.perturbation import Perturbation, make_perturbation
 from pipeline.engine import signals
 from pipeline.engine.signals import Stopped
 from pipeline.engine.stage import Progress
@@ -69,10 +69,12 @@ def train(
         return Trained(found, run.figures())
 
 
-def _noise(course: Course, training: TrainingState) -> Noise | None:
+def _noise(course: Course, training: TrainingState) -> Perturbation | None:
     """How scenes are disturbed to learn from; held-out ones never are."""
     network = training.network
-    return make_noise(course.train, network.motion_codebook(), network.road_codebook())
+    return make_perturbation(
+        course.train, network.motion_vocabulary(), network.map_vocabulary()
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Stage ``train``: token shards and codebooks to weights.
+"""Stage ``train``: token shards and vocabularies to weights.
 
 One unit, in the driver's process. It saves a checkpoint every so many steps and goes on
 from the last one; a run that was killed ends with the same bytes as one that was not.
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from pipeline.stages.train.setup import Course
     from pipeline.storage.checkpoint import TrainingState
 
-CODEBOOKS = ("motion.zarr", "roads.zarr")
+VOCABULARIES = ("motion.zarr", "roads.zarr")
 OUTPUTS = (WEIGHTS, DESCRIPTION, "train.jsonl")
 DONE = "trained.json"
 """Below ``run``: all else is written, and no checkpoint is needed any more."""
@@ -80,8 +80,8 @@ def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
     return [
         Unit(
             name="weights",
-            inputs={**keys, "codebooks": inputs.content("build-vocab", *CODEBOOKS)},
-            task={**folders, **starts, "codebooks": str(inputs.folder("build-vocab"))},
+            inputs={**keys, "vocabularies": inputs.content("build-vocab", *VOCABULARIES)},
+            task={**folders, **starts, "vocabularies": str(inputs.folder("build-vocab"))},
         )
     ]
 
@@ -169,7 +169,7 @@ def _prepare(
         folder=target,
         start=Path(task[INITIAL_WEIGHTS]) if INITIAL_WEIGHTS in task else None,
     )
-    return course, begin(course, *load_vocabularies(Path(task["codebooks"])))
+    return course, begin(course, *load_vocabularies(Path(task["vocabularies"])))
 
 
 def _say_nothing(done: float, total: float, note: str = "") -> None:

@@ -11,15 +11,15 @@ from infgen.metrics.long_term.reference import count_log, log_probabilities
 from infgen.metrics.long_term.table import Against, LogCounts, make_row
 from infgen.metrics.traffic import LOGGED, from_log
 from infgen.metrics.windows import cut_windows
-from infgen.scene import FeatureKind, Tracks
-from infgen.spatial.road_edges import edges_of
+from infgen.scene import FeatureType, Tracks
+from infgen.spatial.road_edges import scene_road_edges
 
 PAPER, CORRECTED = range(2)
 
 
 def binned(scene, as_logged=True, radius_m=75.0):
     traffic = from_log(scene, TokenSettings())
-    return bin_traffic(traffic, edges_of(scene), radius_m, as_logged=as_logged)
+    return bin_traffic(traffic, scene_road_edges(scene), radius_m, as_logged=as_logged)
 
 
 def bins(one, feature, protocol=CORRECTED):
@@ -85,7 +85,7 @@ def _longer(tracks: Tracks, by_m: float, wider_m: float = 0.0) -> Tracks:
 
 
 def test_a_scene_without_road_edges_has_no_map_values(drive, build_map):
-    scene = drive(road_map=build_map([(1, FeatureKind.STOP_SIGN, 0, np.zeros((1, 2)))]))
+    scene = drive(road_map=build_map([(1, FeatureType.STOP_SIGN, 0, np.zeros((1, 2)))]))
     one = binned(scene)
 
     for feature in ("distance_to_road_edge", "offroad_indication"):

@@ -16,7 +16,7 @@ from infgen.metrics.long_term.tune_radius import (
 )
 from infgen.metrics.traffic import from_log, from_rollout
 from infgen.metrics.windows import cut_windows
-from infgen.spatial.road_edges import edges_of
+from infgen.spatial.road_edges import scene_road_edges
 from tests.pipeline.stages.test_score import as_rollout
 
 
@@ -41,7 +41,7 @@ def driving(scene):
 @pytest.fixture
 def against(scene):
     binned = bin_traffic(
-        from_log(scene, TokenSettings()), edges_of(scene), 75.0, as_logged=True
+        from_log(scene, TokenSettings()), scene_road_edges(scene), 75.0, as_logged=True
     )
     return against_counts(count_log(binned, cut_windows(80, 8.0, 0.5)))
 
@@ -54,7 +54,7 @@ def test_a_radius_scores_as_the_score_stage_would_score_it(
 
     for radius_m, value in found.items():
         lived = from_rollout(live_within(driving, radius_m))
-        binned = bin_traffic(lived, edges_of(scene), 75.0, as_logged=False)
+        binned = bin_traffic(lived, scene_road_edges(scene), 75.0, as_logged=False)
         row = make_row(binned, against)
         assert value == pytest.approx(row.numbers[f"{protocol.name}/placement"])
 
@@ -62,7 +62,7 @@ def test_a_radius_scores_as_the_score_stage_would_score_it(
 def test_the_radius_that_made_the_reference_is_found_again(scene, driving):
     windows = cut_windows(80, 8.0, 0.5)
     lived = from_rollout(live_within(driving, 40.0))
-    binned = bin_traffic(lived, edges_of(scene), 75.0, as_logged=False)
+    binned = bin_traffic(lived, scene_road_edges(scene), 75.0, as_logged=False)
     against = against_counts(count_simulated(binned, windows))
 
     found = placement_by_radius([driving], against, CORRECTED, (20.0, 40.0, 200.0))

@@ -11,10 +11,15 @@ from infgen.model.batching.batch import collate, collate_roads, to_device
 from infgen.model.batching.crop import cut_window, hide_far
 from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.batching.padding import NOBODY
-from infgen.model.batching.perturbation import make_noise
+from infgen.model.batching.perturbation import make_perturbation
 from infgen.tokens.grid import decode_cell, encode_cell, from_grid, make_grid, to_grid
-from infgen.tokens.motion_tokens import advance, make_move_table, nearest_moves
-from infgen.tokens.scene_tokens import FIRST_MOVE, NO_CELL, NO_MOVE, Presence
+from infgen.tokens.motion_tokens import advance, make_match_table, nearest_motion_tokens
+from infgen.tokens.scene_tokens import (
+    FIRST_MOTION_TOKEN,
+    NO_CELL,
+    NO_MOTION_TOKEN,
+    Presence,
+)
 from infgen.tokens.signals import REMEMBERED
 
 
@@ -71,16 +76,16 @@ def test_only_the_roads_nearest_to_the_egos_path_are_kept_in_order(record, limit
     roads = collate([scene], replace(limits, roads=10), 0).roads
 
     path = scene.pose[0, :, :2]
-    away_m = np.linalg.norm(scene.road_pose[:, None, :2] - path, axis=-1).min(axis=1)
+    away_m = np.linalg.norm(scene.map_pose[:, None, :2] - path, axis=-1).min(axis=1)
     kept = np.sort(np.argsort(away_m)[:10])
-    assert torch.equal(roads.pose[0], torch.from_numpy(scene.road_pose[kept]))
+    assert torch.equal(roads.pose[0], torch.from_numpy(scene.map_pose[kept]))
 
 
 def test_a_road_token_follows_the_one_before_it_on_the_same_line(record, limits):
     scene = record(0, roads=8)
     line = np.array([0, 0, 0, 1, 1, 2, 3, 3], dtype=np.int32)
 
-    roads = collate([replace(scene, road_line=line)], limits, 0).roads
+    roads = collate([replace(scene, map_polyline=line)], limits, 0).roads
 
     assert roads.follows[0].tolist() == [False, True, True, False, True, False, False, True]
 
@@ -92,7 +97,7 @@ def test_padding_is_absent_and_unreal(record, limits):
 
     assert not batch.agents.visible[0, 4:].any()
     assert not batch.agents.visible[0, :, 3:].any()
-    assert (batch.agents.move[0, 4:] == NO_MOVE).all()
+    assert (batch.agents.move[0, 4:] == NO_MOTION_TOKEN).all()
     assert batch.roads.real.sum(dim=1).tolist() == [10, 60]
     assert not batch.entries.asked[0, 4:].any()
 
@@ -135,7 +140,9 @@ def test_all_others_have_no_turn_and_those_outside_the_grid_an_endless_one(recor
     scene = record(8, tokens=4, lives=[(0, 3), (2, 3)], spread_m=20.0)
     far = replace(
         scene,
-        entry_cell=np.where(scene.entry_agent == 2, -1, scene.entry_cell).astype("i2"),
+        insertion_cell=np.where(
+            scene.insertion_agent == 2, -1, scene.insertion_cell
+        ).astype("i2"),
     )
 
     turn = collate([far], limits, 0).agents.turn[0]
@@ -168,17 +175,17 @@ def test_details_decode_to_where_the_agent_is(
 
 
 @pytest.fixture(scope="module")
-def noise(codebooks):
-    return make_noise(
-        TrainSettings(motion_noise_neighbours=6, map_noise_neighbours=4), *codebooks()
+def noise(vocabularies):
+    return make_perturbation(
+        TrainSettings(motion_noise_neighbours=6, map_noise_neighbours=4), *vocabularies()
     )
 
 
 def with_a_gap(scene):
     """The scene with row 1 unseen for two tokens, then going on."""
-    observed, move = scene.observed.copy(), scene.move.copy()
-    observed[1, 3:5], move[1, 3:5] = False, NO_MOVE
-    return replace(scene, observed=observed, move=move)
+    observed, move = scene.observed.copy(), scene.motion_token.copy()
+    observed[1, 3:5], move[1, 3:5] = False, NO_MOTION_TOKEN
+    return replace(scene, observed=observed, motion_token=move)
 
 
 @pytest.fixture(scope="module")
@@ -190,10 +197,10 @@ def pair(record, limits, noise):
     return collate(scenes, limits, 7), collate(scenes, limits, 7, noise)
 
 
-def test_noise_without_a_choice_leaves_a_batch_as_it_is(record, limits, codebooks):
+def test_noise_without_a_choice_leaves_a_batch_as_it_is(record, limits, vocabularies):
     scenes = [with_a_gap(record(3, agents=12, tokens=9)), record(4)]
-    none = make_noise(
-        TrainSettings(motion_noise_neighbours=1, map_noise_neighbours=1), *codebooks()
+    none = make_perturbation(
+        TrainSettings(motion_noise_neighbours=1, map_noise_neighbours=1), *vocabularies()
     )
 
     plain, noisy = collate(scenes, limits, 7), collate(scenes, limits, 7, none)
@@ -230,18 +237,18 @@ def test_noise_moves_the_ego_but_nobody_who_is_absent_entering_or_unseen(pair):
     assert (plain.agents.presence[still] == Presence.PRESENT).any()  # The gap.
 
 
-def test_noisy_agents_go_where_their_moves_lead_and_learn_to_come_back(pair, codebooks):
+def test_noisy_agents_go_where_their_moves_lead_and_learn_to_come_back(pair, vocabularies):
     plain, noisy = pair
-    codebook, _ = codebooks()
-    table = make_move_table(codebook)
+    vocabulary, _ = vocabularies()
+    table = make_match_table(vocabulary)
     scene, token, row = noisy.agents.observed.nonzero(as_tuple=True)
     kind = noisy.agents.kind[scene, row].numpy().astype(np.int8)
     before = noisy.agents.pose[scene, token - 1, row].numpy()
     wanted = plain.agents.pose[scene, token, row].numpy()
 
     move = noisy.agents.move[scene, token, row].numpy().astype(np.int16)
-    ends = advance(before, kind, move, codebook)
-    label = nearest_moves(wanted, before, kind, table)
+    ends = advance(before, kind, move, vocabulary)
+    label = nearest_motion_tokens(wanted, before, kind, table)
 
     np.testing.assert_allclose(noisy.agents.pose[scene, token, row], ends, atol=1e-4)
     np.testing.assert_array_equal(noisy.agents.label[scene, token, row].numpy(), label)
@@ -365,8 +372,8 @@ def test_who_is_there_when_a_window_begins_enters_then(window):
     scene, part = window
     row = row_in(part, scene, 1)
 
-    assert part.presence[row, 0] == Presence.ENTERING
-    assert part.move[row, 0] == FIRST_MOVE
+    assert part.presence[row, 0] == Presence.INSERTED
+    assert part.move[row, 0] == FIRST_MOTION_TOKEN
     assert not part.observed[row, 0]
     assert (part.presence[row, 1:] == Presence.PRESENT).all()
     np.testing.assert_array_equal(part.pose[row], scene.pose[1, 3:])
@@ -384,7 +391,7 @@ def test_who_leaves_as_a_window_begins_or_before_is_not_in_it(window):
 
 def test_newcomers_of_a_window_keep_their_tokens_less_its_start(window):
     scene, part = window
-    entered = dict(zip(part.entry_row.tolist(), part.entry_token.tolist(), strict=True))
+    entered = dict(zip(part.entry_row.tolist(), part.insertion_token.tolist(), strict=True))
 
     assert entered == {row_in(part, scene, 2): 0, row_in(part, scene, 5): 2}
 
@@ -396,7 +403,7 @@ def test_who_is_in_a_gap_when_a_window_begins_enters_after_it(record):
 
     part = cut_window(replace(scene, observed=observed), 3, 18, 99, 99)
 
-    wanted = [Presence.ABSENT] * 2 + [Presence.ENTERING] + [Presence.PRESENT] * 4
+    wanted = [Presence.ABSENT] * 2 + [Presence.INSERTED] + [Presence.PRESENT] * 4
     assert part.presence[1].tolist() == wanted
 
 
@@ -433,7 +440,7 @@ def test_who_is_beyond_the_rim_at_first_enters_once_it_has_come_within(coming):
     # Within at the end of token 2, so observed within from token 3 on.
     assert part.presence[near].tolist() == [0, 0, 0, 2, 1, 1, 1, 1]
     assert part.observed[near].tolist() == [False] * 4 + [True] * 4
-    assert part.move[near, 3] == part.label[near, 3] == FIRST_MOVE
+    assert part.move[near, 3] == part.label[near, 3] == FIRST_MOTION_TOKEN
     assert not part.presence[never].any()
     assert not part.presence[leaver].any()  # It would enter as it leaves.
     assert part.presence[late].tolist() == [0] * 6 + [2, 1]
@@ -444,11 +451,11 @@ def test_who_is_beyond_the_rim_at_first_enters_once_it_has_come_within(coming):
 def test_entries_are_listed_where_they_now_are(coming):
     part, (near, _, _, late) = hidden(coming)
 
-    listed = list(zip(part.entry_token.tolist(), part.entry_row.tolist(), strict=True))
+    listed = list(zip(part.insertion_token.tolist(), part.entry_row.tolist(), strict=True))
 
     assert listed == [(0, 0), (3, near), (6, late)]
     np.testing.assert_array_equal(
-        part.entry_cell, part.cell[part.entry_row, part.entry_token]
+        part.insertion_cell, part.cell[part.entry_row, part.insertion_token]
     )
 
 

@@ -1,7 +1,7 @@
 """Agents led astray, and the moves that lead them back.
 
-The codebook moves by decimetres straight ahead, and the agents by a metre each half second,
-so every expected number can be done in the head.
+The vocabulary moves by decimetres straight ahead, and the agents by a metre each half
+second, so every expected number can be done in the head.
 """
 
 import numpy as np
@@ -12,13 +12,13 @@ from pydantic import ValidationError
 
 from infgen.config import TrainSettings
 from infgen.model.batching.perturbation import (
-    Noise,
-    exchange_roads,
-    lead_astray,
-    make_noise,
+    Perturbation,
+    make_perturbation,
+    perturb_map,
+    perturb_motion,
 )
-from infgen.tokens.motion_tokens import advance, make_move_table, nearest_moves
-from infgen.tokens.scene_tokens import NO_MOVE
+from infgen.tokens.motion_tokens import advance, make_match_table, nearest_motion_tokens
+from infgen.tokens.scene_tokens import NO_MOTION_TOKEN
 from infgen.tokens.vocabulary import BOX_LW_M, MapVocabulary, MotionVocabulary
 
 ITSELF = np.arange(9, dtype=np.int16)[:, None]
@@ -42,15 +42,15 @@ def fan_moves():
     return MotionVocabulary(BOX_LW_M, path, np.ones(path.shape[:2], bool))
 
 
-def noise_of(codebook, moves, share=1.0, drift=0.0):
-    return Noise(make_move_table(codebook), moves, share, drift, ITSELF)
+def noise_of(vocabulary, moves, share=1.0, drift=0.0):
+    return Perturbation(make_match_table(vocabulary), moves, share, drift, ITSELF)
 
 
-def five_metre_drives(codebook, agents=400, tokens=18):
+def five_metre_drives(vocabulary, agents=400, tokens=18):
     kind, pose, move, moving = metre_drives(agents, tokens)
     pose[..., 0] *= 5
-    straight = np.hypot(codebook.end_pose[0, :, 0] - 5, codebook.end_pose[0, :, 1])
-    straight += np.abs(codebook.end_pose[0, :, 2])
+    straight = np.hypot(vocabulary.end_pose[0, :, 0] - 5, vocabulary.end_pose[0, :, 1])
+    straight += np.abs(vocabulary.end_pose[0, :, 2])
     move[:, 1:] = straight.argmin()
     return kind, pose, move, moving
 
@@ -61,17 +61,17 @@ def metre_drives(agents=4, tokens=18):
     pose[..., 0] = np.arange(tokens)
     pose[..., 1] = 5.0 * np.arange(agents)[:, None]
     move = np.full((agents, tokens), 10, np.int16)
-    move[:, 0] = NO_MOVE
+    move[:, 0] = NO_MOTION_TOKEN
     moving = np.ones((agents, tokens), bool)
     moving[:, 0] = False
     return np.zeros(agents, np.int8), pose, move, moving
 
 
-def random_drives(codebook, seed, agents=20, tokens=10):
+def random_drives(vocabulary, seed, agents=20, tokens=10):
     """Agents of all kinds on random moves, with gaps after which they start elsewhere."""
     random = np.random.default_rng(seed)
     kind = random.integers(3, size=agents).astype(np.int8)
-    move = random.integers(codebook.num_motion_tokens, size=(agents, tokens)).astype(
+    move = random.integers(vocabulary.num_motion_tokens, size=(agents, tokens)).astype(
         np.int16
     )
     moving = random.random((agents, tokens)) < 0.8
@@ -79,13 +79,13 @@ def random_drives(codebook, seed, agents=20, tokens=10):
     pose = random.normal(size=(agents, tokens, 3)).astype(np.float32)
     for token in range(1, tokens):
         rows = np.flatnonzero(moving[:, token])
-        ends = advance(pose[rows, token - 1], kind[rows], move[rows, token], codebook)
+        ends = advance(pose[rows, token - 1], kind[rows], move[rows, token], vocabulary)
         pose[rows, token] = ends
-    return kind, pose, np.where(moving, move, NO_MOVE).astype(np.int16), moving
+    return kind, pose, np.where(moving, move, NO_MOTION_TOKEN).astype(np.int16), moving
 
 
 def stray(drives, noise, seed=0):
-    return lead_astray(*drives, noise, np.random.default_rng(seed))
+    return perturb_motion(*drives, noise, np.random.default_rng(seed))
 
 
 def test_agents_stray_by_a_step_of_the_codebook_and_no_farther():
@@ -115,18 +115,18 @@ def test_the_move_to_learn_makes_good_what_the_last_one_missed():
 @given(st.integers(0, 2**32), st.sampled_from([1, 2, 5, 31]))
 @settings(max_examples=25)
 def test_poses_follow_moves_and_labels_are_the_nearest_moves(seed, few):
-    codebook = straight_moves()
-    noise = noise_of(codebook, few)
-    kind, pose, move, moving = random_drives(codebook, seed)
+    vocabulary = straight_moves()
+    noise = noise_of(vocabulary, few)
+    kind, pose, move, moving = random_drives(vocabulary, seed)
 
-    strays = lead_astray(kind, pose, move, moving, noise, np.random.default_rng(seed))
+    strays = perturb_motion(kind, pose, move, moving, noise, np.random.default_rng(seed))
 
     for token in range(1, pose.shape[1]):
         rows = np.flatnonzero(moving[:, token])
         before, kinds = strays.pose[rows, token - 1], kind[rows]
-        ends = advance(before, kinds, strays.move[rows, token], codebook)
+        ends = advance(before, kinds, strays.move[rows, token], vocabulary)
         np.testing.assert_allclose(strays.pose[rows, token], ends, atol=1e-5)
-        best = nearest_moves(pose[rows, token], before, kinds, noise.table)
+        best = nearest_motion_tokens(pose[rows, token], before, kinds, noise.table)
         np.testing.assert_array_equal(strays.label[rows, token], best)
 
 
@@ -169,10 +169,10 @@ def test_only_a_share_of_the_moves_is_drawn():
 def test_moves_that_end_far_off_are_not_taken():
     # Moves of whole metres: all but the nearest end a metre off.
     drives = metre_drives()
-    codebook = straight_moves(step_m=1.0, count=5)
+    vocabulary = straight_moves(step_m=1.0, count=5)
     drives[2][:, 1:] = 1
 
-    strays = stray(drives, noise_of(codebook, 3))
+    strays = stray(drives, noise_of(vocabulary, 3))
 
     np.testing.assert_array_equal(strays.move, drives[2])
 
@@ -181,20 +181,20 @@ def test_moves_that_end_far_off_are_not_taken():
 def test_the_slow_stray_less_and_who_stands_not_at_all(way_m, off_m):
     kind, pose, move, moving = metre_drives(agents=20, tokens=4)
     pose[..., 0] *= way_m
-    codebook = straight_moves(step_m=0.3, count=120)
+    vocabulary = straight_moves(step_m=0.3, count=120)
     move[:, 1:] = round(way_m / 0.3)
 
-    strays = stray((kind, pose, move, moving), noise_of(codebook, 20))
+    strays = stray((kind, pose, move, moving), noise_of(vocabulary, 20))
 
     farthest_m = np.abs(strays.pose[..., 0] - pose[..., 0]).max()
     assert farthest_m == pytest.approx(off_m, abs=1e-3)
 
 
 def test_a_share_of_the_drivers_drifts_for_seconds_and_learns_the_way_back():
-    codebook = fan_moves()
-    drives = five_metre_drives(codebook)
+    vocabulary = fan_moves()
+    drives = five_metre_drives(vocabulary)
 
-    strays = stray(drives, noise_of(codebook, 1, drift=0.5))
+    strays = stray(drives, noise_of(vocabulary, 1, drift=0.5))
 
     aside_m = strays.pose[..., 1] - drives[1][..., 1]
     drifts = np.abs(aside_m).max(axis=1) > 0.2
@@ -206,7 +206,7 @@ def test_a_share_of_the_drivers_drifts_for_seconds_and_learns_the_way_back():
     kept = (settled_m[:, 1:] * settled_m[:, :-1]).mean() / (settled_m**2).mean()
     assert 0.7 < kept < 0.85
     # Whoever is far to one side is to go to the other.
-    back_m = codebook.end_pose[0, strays.label[drifts, 7:], 1]
+    back_m = vocabulary.end_pose[0, strays.label[drifts, 7:], 1]
     turned_rad = strays.pose[drifts, 6:-1, 2]
     across_m = 5 * np.sin(turned_rad) + back_m * np.cos(turned_rad)
     far = np.abs(settled_m[:, :-1]) > 0.5
@@ -239,11 +239,13 @@ def test_nobody_is_led_nowhere():
 
 
 def test_settings_that_ask_for_no_noise_make_none(metre_moves, bent_roads):
-    assert make_noise(TrainSettings(), metre_moves, bent_roads) is None
+    assert make_perturbation(TrainSettings(), metre_moves, bent_roads) is None
 
 
 def test_road_tokens_are_drawn_from_the_nearest_shapes(metre_moves, bent_roads):
-    noise = make_noise(TrainSettings(map_noise_neighbours=3), metre_moves, bent_roads)
+    noise = make_perturbation(
+        TrainSettings(map_noise_neighbours=3), metre_moves, bent_roads
+    )
 
     # Arcs that end 0, 5, 10, 20, 40 degrees to the left, then 5, 10, 20, 40 to the right.
     near = [set(row) for row in noise.near_roads.tolist()]
@@ -256,12 +258,14 @@ def test_road_tokens_are_drawn_from_the_nearest_shapes(metre_moves, bent_roads):
 def test_road_tokens_that_are_fixed_stay_and_others_become_what_is_near(
     metre_moves, bent_roads
 ):
-    noise = make_noise(TrainSettings(map_noise_neighbours=3), metre_moves, bent_roads)
+    noise = make_perturbation(
+        TrainSettings(map_noise_neighbours=3), metre_moves, bent_roads
+    )
     random = np.random.default_rng(0)
     token = random.integers(9, size=900).astype(np.int16)
     fixed = random.random(900) < 0.3
 
-    drawn = exchange_roads(token, fixed, noise, random)
+    drawn = perturb_map(token, fixed, noise, random)
 
     np.testing.assert_array_equal(drawn[fixed], token[fixed])
     assert 0.25 < (drawn == token)[~fixed].mean() < 0.42
@@ -272,13 +276,13 @@ def test_shapes_that_are_alike_stand_for_themselves_first(metre_moves):
     curve_m = np.zeros((2, 11, 2), np.float32)
     twins = MapVocabulary(curve_m, np.ones(2, bool))
 
-    noise = make_noise(TrainSettings(map_noise_neighbours=1), metre_moves, twins)
+    noise = make_perturbation(TrainSettings(map_noise_neighbours=1), metre_moves, twins)
 
     assert noise.near_roads.tolist() == [[0], [1]]
 
 
 def test_of_more_tokens_than_the_codebook_has_all_are_drawn_from(metre_moves, bent_roads):
-    noise = make_noise(
+    noise = make_perturbation(
         TrainSettings(motion_noise_neighbours=99, map_noise_neighbours=99),
         metre_moves,
         bent_roads,
@@ -297,7 +301,9 @@ def test_agents_are_led_astray_in_one_way_only(noise):
 
 
 def test_drift_needs_no_other_noise(metre_moves, bent_roads):
-    noise = make_noise(TrainSettings(lateral_drift_share=0.5), metre_moves, bent_roads)
+    noise = make_perturbation(
+        TrainSettings(lateral_drift_share=0.5), metre_moves, bent_roads
+    )
 
     assert (noise.moves, noise.drift) == (1, 0.5)
 

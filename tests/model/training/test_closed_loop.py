@@ -12,8 +12,13 @@ from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.training.closed_loop import close_loop
 from infgen.model.training.losses import losses, total
 from infgen.tokens.grid import decode_cell, encode_cell, from_grid, make_grid, to_grid
-from infgen.tokens.motion_tokens import advance, follow, make_move_table, nearest_moves
-from infgen.tokens.scene_tokens import NO_CELL, NO_MOVE, Presence
+from infgen.tokens.motion_tokens import (
+    advance,
+    follow,
+    make_match_table,
+    nearest_motion_tokens,
+)
+from infgen.tokens.scene_tokens import NO_CELL, NO_MOTION_TOKEN, Presence
 
 NUM_MOVES = 24
 
@@ -27,7 +32,7 @@ def tensors(batch):
 def with_a_gap(scene):
     """The scene with row 1 unseen for two tokens, then going on."""
     observed, move = scene.observed.copy(), scene.move.copy()
-    observed[1, 3:5], move[1, 3:5] = False, NO_MOVE
+    observed[1, 3:5], move[1, 3:5] = False, NO_MOTION_TOKEN
     return replace(scene, observed=observed, move=move)
 
 
@@ -80,8 +85,10 @@ def test_with_all_moves_to_choose_from_a_batch_written_exactly_is_unchanged(
         assert torch.equal(one, two), name
 
 
-def test_with_all_moves_to_choose_from_agents_follow_the_log(network, blurred, codebooks):
-    table = make_move_table(codebooks()[0])
+def test_with_all_moves_to_choose_from_agents_follow_the_log(
+    network, blurred, vocabularies
+):
+    table = make_match_table(vocabularies()[0])
     agents, truth = close_loop(network, blurred, 10_000).agents, blurred.agents
     kind = truth.kind.numpy().astype(np.int8).ravel()
 
@@ -102,11 +109,11 @@ def test_with_all_moves_to_choose_from_agents_follow_the_log(network, blurred, c
 
 @pytest.mark.parametrize("top", [1, 3])
 def test_each_move_is_the_nearest_of_the_networks_most_likely(
-    network, logged, codebooks, top
+    network, logged, vocabularies, top
 ):
     played = close_loop(network, logged, top)
     scene, token, row = moves_made(played)
-    codebook = codebooks()[0]
+    vocabulary = vocabularies()[0]
     with torch.no_grad():
         motion = network(played).motion
     logits = motion.rows.spread(motion.move_logits)[scene, token - 1, row]
@@ -119,15 +126,19 @@ def test_each_move_is_the_nearest_of_the_networks_most_likely(
 
     for at, choice in enumerate(likely):
         few = replace(
-            codebook, path=codebook.path[:, np.sort(choice)], real=codebook.real[:, choice]
+            vocabulary,
+            path=vocabulary.path[:, np.sort(choice)],
+            real=vocabulary.real[:, choice],
         )
         one = slice(at, at + 1)
-        best = nearest_moves(truth[one], before[one], kind[one], make_move_table(few))
+        best = nearest_motion_tokens(
+            truth[one], before[one], kind[one], make_match_table(few)
+        )
         assert found[at] == np.sort(choice)[best[0]]
 
 
-def test_poses_follow_moves_and_labels_lead_back_to_the_log(logged, played, codebooks):
-    codebook = codebooks()[0]
+def test_poses_follow_moves_and_labels_lead_back_to_the_log(logged, played, vocabularies):
+    vocabulary = vocabularies()[0]
     scene, token, row = moves_made(played)
     agents = played.agents
     kind = agents.kind[scene, row].numpy().astype(np.int8)
@@ -135,11 +146,11 @@ def test_poses_follow_moves_and_labels_lead_back_to_the_log(logged, played, code
     truth = logged.agents.pose[scene, token, row].numpy()
 
     def end(move):
-        return advance(before, kind, move.numpy().astype(np.int16), codebook)
+        return advance(before, kind, move.numpy().astype(np.int16), vocabulary)
 
     move, label = agents.move[scene, token, row], agents.label[scene, token, row]
     np.testing.assert_allclose(agents.pose[scene, token, row], end(move), atol=1e-4)
-    best = nearest_moves(truth, before, kind, make_move_table(codebook))
+    best = nearest_motion_tokens(truth, before, kind, make_match_table(vocabulary))
     np.testing.assert_array_equal(label, best)
     away_m = np.linalg.norm((end(move) - truth)[:, :2], axis=1)
     after_m = np.linalg.norm((end(label) - truth)[:, :2], axis=1)

@@ -10,14 +10,14 @@ import torch
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
 from infgen.model.training.losses import figures, losses, motion_mask, stay_mask, total
-from infgen.tokens.scene_tokens import FIRST_MOVE, NO_MOVE, Presence
+from infgen.tokens.scene_tokens import FIRST_MOTION_TOKEN, NO_MOTION_TOKEN, Presence
 
 LETTERS = {
-    ".": (Presence.ABSENT, False, NO_MOVE),
-    "E": (Presence.ENTERING, False, FIRST_MOVE),
+    ".": (Presence.ABSENT, False, NO_MOTION_TOKEN),
+    "E": (Presence.INSERTED, False, FIRST_MOTION_TOKEN),
     "p": (Presence.PRESENT, True, 0),
-    "-": (Presence.PRESENT, False, NO_MOVE),  # A gap in the log.
-    "L": (Presence.LEAVING, True, 0),
+    "-": (Presence.PRESENT, False, NO_MOTION_TOKEN),  # A gap in the log.
+    "L": (Presence.REMOVED, True, 0),
 }
 
 
@@ -141,7 +141,9 @@ def test_newcomers_outside_the_grid_are_not_asked_for(network, record, limits, s
     far = replace(
         scene,
         cell=np.where(np.arange(2)[:, None] == 1, -1, scene.cell).astype(np.int16),
-        entry_cell=np.where(scene.entry_agent == 1, -1, scene.entry_cell).astype(np.int16),
+        insertion_cell=np.where(
+            scene.insertion_agent == 1, -1, scene.insertion_cell
+        ).astype(np.int16),
     )
 
     _, _, terms = terms_of(network, [far], limits, settings)

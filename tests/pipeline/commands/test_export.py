@@ -245,9 +245,9 @@ def test_agents_that_no_model_plays_are_there_and_told_of(scenes, tmp_path):
     scene = scenes[0]
     shown = np.flatnonzero(scene.tracks.valid[:, scene.now])
     row = int(np.setdiff1d(shown, [scene.ego, *scene.predict_row])[0])
-    kind = scene.tracks.kind.copy()
+    kind = scene.tracks.agent_type.copy()
     kind[row] = AgentType.OTHER
-    scene = replace(scene, tracks=replace(scene.tracks, kind=kind))
+    scene = replace(scene, tracks=replace(scene.tracks, agent_type=kind))
     write_tfrecord(tmp_path / "logs.tfrecord", [encode_scenario(scene)])
     rollouts = [without(one, int(scene.tracks.id[row])) for one in many(scene)]
     order = Order(

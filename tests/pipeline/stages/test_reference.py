@@ -11,7 +11,7 @@ from infgen.metrics.long_term.binned import bin_traffic
 from infgen.metrics.long_term.reference import add_up, count_log
 from infgen.metrics.traffic import from_log
 from infgen.metrics.windows import cut_windows
-from infgen.spatial.road_edges import edges_of
+from infgen.spatial.road_edges import scene_road_edges
 from pipeline.stages import reference
 from pipeline.stages.reference_files import (
     read_against,
@@ -50,7 +50,7 @@ def counted(scenes):
     found = []
     for scene in scenes:
         binned = bin_traffic(
-            from_log(scene, TokenSettings()), edges_of(scene), 75.0, as_logged=True
+            from_log(scene, TokenSettings()), scene_road_edges(scene), 75.0, as_logged=True
         )
         found.append(count_log(binned, cut_windows(binned.bins.shape[-1], 8.0, 0.5)))
     return add_up(found)

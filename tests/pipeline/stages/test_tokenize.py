@@ -26,7 +26,7 @@ class Finished:
     """Inputs of the stage: what earlier stages left on disk."""
 
     scenes: list[FinishedUnit]
-    codebooks: Path
+    vocabularies: Path
     sources: tuple = ()
     asked: list = field(default_factory=list)
 
@@ -34,11 +34,11 @@ class Finished:
         return {"ingest": self.scenes}[name]
 
     def folder(self, name):
-        return {"build-vocab": self.codebooks}[name]
+        return {"build-vocab": self.vocabularies}[name]
 
     def content(self, name, *names):
         self.asked.append((name, names))
-        return "codebooks-as-they-are"
+        return "vocabularies-as-they-are"
 
     def key(self, name):
         raise AssertionError("a key changes more often than what the stage reads")
@@ -49,7 +49,7 @@ def no_progress(done, total, note=""):
 
 
 @pytest.fixture
-def codebooks(tmp_path, metre_moves, bent_roads):
+def vocabularies(tmp_path, metre_moves, bent_roads):
     folder = tmp_path / "vocab"
     folder.mkdir()
     for name, book, schema in (
@@ -83,9 +83,9 @@ def ingested(tmp_path, scenes):
 
 
 @pytest.fixture
-def tokenized(tmp_path, ingested, codebooks):
+def tokenized(tmp_path, ingested, vocabularies):
     """Both units, done."""
-    inputs = Finished(ingested, codebooks)
+    inputs = Finished(ingested, vocabularies)
     return [
         _do(unit, tmp_path / "tokens" / unit.name) for unit in stage.plan(inputs, SETTINGS)
     ]
@@ -98,16 +98,16 @@ def _do(unit: Unit, target: Path) -> FinishedUnit:
 
 
 def test_there_is_one_unit_per_file_and_it_hangs_on_scenes_and_codebooks(
-    ingested, codebooks
+    ingested, vocabularies
 ):
-    inputs = Finished(ingested, codebooks)
+    inputs = Finished(ingested, vocabularies)
 
     units = stage.plan(inputs, SETTINGS)
 
     assert [unit.name for unit in units] == ["training.tfrecord-0", "validation.tfrecord-0"]
     assert units[0].inputs == {
         "scenes": "key of training.tfrecord-0",
-        "codebooks": "codebooks-as-they-are",
+        "vocabularies": "vocabularies-as-they-are",
     }
     assert inputs.asked == [("build-vocab", ("motion.zarr", "roads.zarr"))]
     json.dumps(units[0].task)
@@ -156,13 +156,13 @@ def test_the_index_says_where_each_scene_is_and_how_large(tokenized):
         assert row["agents"] == tokens.num_agents
         assert row["tokens"] == tokens.num_tokens
         assert row["roads"] == tokens.num_map_tokens
-        assert row["words"] == len(tokens.word)
-        assert row["entries"] == len(tokens.entry_agent)
+        assert row["words"] == len(tokens.sequence_type)
+        assert row["entries"] == len(tokens.insertion_agent)
 
 
-def test_many_scenes_make_several_groups(tmp_path, ingested, codebooks, monkeypatch):
+def test_many_scenes_make_several_groups(tmp_path, ingested, vocabularies, monkeypatch):
     monkeypatch.setattr(stage, "SCENES_PER_GROUP", 1)
-    (unit, _) = stage.plan(Finished(ingested, codebooks), SETTINGS)
+    (unit, _) = stage.plan(Finished(ingested, vocabularies), SETTINGS)
 
     done = _do(unit, tmp_path / "small")
 
@@ -173,8 +173,10 @@ def test_many_scenes_make_several_groups(tmp_path, ingested, codebooks, monkeypa
     assert index["row"].to_list() == [0, 0]
 
 
-def test_doing_a_unit_again_writes_the_same_bytes(tmp_path, ingested, codebooks, tokenized):
-    (unit, _) = stage.plan(Finished(ingested, codebooks), SETTINGS)
+def test_doing_a_unit_again_writes_the_same_bytes(
+    tmp_path, ingested, vocabularies, tokenized
+):
+    (unit, _) = stage.plan(Finished(ingested, vocabularies), SETTINGS)
 
     again = _do(unit, tmp_path / "again")
 
@@ -186,10 +188,10 @@ def test_doing_a_unit_again_writes_the_same_bytes(tmp_path, ingested, codebooks,
     assert again.report == tokenized[0].report
 
 
-def test_an_empty_file_gives_an_empty_unit(tmp_path, codebooks):
+def test_an_empty_file_gives_an_empty_unit(tmp_path, vocabularies):
     (tmp_path / "none").mkdir()
     empty = FinishedUnit("none.tfrecord", "key", tmp_path / "none", {"scenes": 0})
-    (unit,) = stage.plan(Finished([empty], codebooks), SETTINGS)
+    (unit,) = stage.plan(Finished([empty], vocabularies), SETTINGS)
 
     done = _do(unit, tmp_path / "out")
 
@@ -199,13 +201,13 @@ def test_an_empty_file_gives_an_empty_unit(tmp_path, codebooks):
 
 
 def test_the_stage_joins_the_tables_and_adds_up_split_by_split(
-    tmp_path, ingested, codebooks, tokenized
+    tmp_path, ingested, vocabularies, tokenized
 ):
     target = tmp_path / "stage"
     target.mkdir()
 
     report = stage.finish(
-        Finished(ingested, codebooks), tokenized, target, SETTINGS, no_progress
+        Finished(ingested, vocabularies), tokenized, target, SETTINGS, no_progress
     )
 
     assert report["scenes"] == 3
@@ -220,10 +222,10 @@ def test_the_stage_joins_the_tables_and_adds_up_split_by_split(
     assert figures["validation"]["share_entering_after_now"] == 0.0
 
 
-def test_a_stage_without_files_finishes(tmp_path, codebooks):
+def test_a_stage_without_files_finishes(tmp_path, vocabularies):
     target = tmp_path / "stage"
     target.mkdir()
 
-    report = stage.finish(Finished([], codebooks), [], target, SETTINGS, no_progress)
+    report = stage.finish(Finished([], vocabularies), [], target, SETTINGS, no_progress)
 
     assert report == {"scenes": 0, "refused": 0, "words": 0}

@@ -236,10 +236,10 @@ def test_samples_of_a_file_are_bounded(tmp_path, traffic):
     assert report["learn"] + report["held-out"] == 40
     segments = vocabulary._read(
         tmp_path / "learn" / "segments.zarr",
-        vocabulary.Segments,
+        vocabulary.MotionSamples,
         vocabulary.SEGMENTS_SCHEMA,
     )
-    assert (np.bincount(segments[0].kind) <= 10).all()
+    assert (np.bincount(segments[0].agent_type) <= 10).all()
     paths = vocabulary._read(
         tmp_path / "learn" / "paths.zarr", vocabulary.KeyedPaths, vocabulary.PATHS_SCHEMA
     )

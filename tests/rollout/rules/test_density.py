@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from infgen.rollout.rules.density import Fullness, pieces_of
-from infgen.scene import FeatureKind
+from infgen.scene import FeatureType
 from tests.conftest import LANE_ID
 from tests.rollout.rules.test_collision import everyone
 from tests.rollout.rules.test_off_road import scene_of, street
@@ -44,7 +44,7 @@ def test_where_a_map_ends_there_are_to_be_fewer(ego_x_m, expected):
 def test_every_rollout_is_on_its_own_map(start):
     """The lanes of the second are 10 m long, and there are three others around its ego."""
     lane = np.column_stack([METRES, 0 * METRES])
-    short = scene_of([(LANE_ID, FeatureKind.LANE, 0, lane)])
+    short = scene_of([(LANE_ID, FeatureType.LANE, 0, lane)])
     short = replace(short, scenario_id="short")
     now = everyone((0, 0, 0), (10, 0, 0), (12, 0, 0), (14, 0, 0)).take(np.array([0, 0]))
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from infgen.rollout.population import Population
 from infgen.rollout.rules.off_road import LANE_M, Kerbs, find_departures
-from infgen.scene import AgentType, FeatureKind
+from infgen.scene import AgentType, FeatureType
 from tests.conftest import EDGE_ID, LANE_ID, make_map, make_scene
 from tests.rollout.rules.test_collision import everyone, ways
 
@@ -20,9 +20,9 @@ def street(*more, lane_y_m=0.0):
     """A street with both of its edges, and more lines."""
     x = np.arange(-100.0, 101.0)
     lines = [
-        (LANE_ID, FeatureKind.LANE, 0, np.column_stack([x, 0 * x + lane_y_m])),
-        (EDGE_ID, FeatureKind.ROAD_EDGE, 0, np.column_stack([x, 0 * x - 3])),
-        (EDGE_ID + 1, FeatureKind.ROAD_EDGE, 0, np.column_stack([-x, 0 * x + 3])),
+        (LANE_ID, FeatureType.LANE, 0, np.column_stack([x, 0 * x + lane_y_m])),
+        (EDGE_ID, FeatureType.ROAD_EDGE, 0, np.column_stack([x, 0 * x - 3])),
+        (EDGE_ID + 1, FeatureType.ROAD_EDGE, 0, np.column_stack([-x, 0 * x + 3])),
         *more,
     ]
     return scene_of(lines)
@@ -64,7 +64,7 @@ def test_what_was_looked_at_is_not_looked_at_again():
 def test_a_bridge_over_the_lane_does_not_take_the_road_away():
     """Its edge crosses at x = 0 with its own road on the side of -x."""
     y = np.arange(-20.0, 21.0)
-    bridge = (EDGE_ID + 2, FeatureKind.ROAD_EDGE, 0, np.column_stack([0 * y, y]))
+    bridge = (EDGE_ID + 2, FeatureType.ROAD_EDGE, 0, np.column_stack([0 * y, y]))
     kerbs = Kerbs(street(bridge))
 
     on_the_lane, beside_it, farther = off_m(kerbs, (0.5, 0.5), (0.5, 1.5), (0.5, 2.0))
@@ -76,14 +76,14 @@ def test_a_bridge_over_the_lane_does_not_take_the_road_away():
 
 def test_without_edges_everywhere_is_road():
     x = np.arange(-10.0, 11.0)
-    lane = (LANE_ID, FeatureKind.LANE, 0, np.column_stack([x, 0 * x]))
+    lane = (LANE_ID, FeatureType.LANE, 0, np.column_stack([x, 0 * x]))
 
     assert off_m(Kerbs(scene_of([lane])), (0, 50)) == [-np.inf]
 
 
 def test_without_lanes_edges_decide():
     x = np.arange(-10.0, 11.0)
-    edge = (EDGE_ID, FeatureKind.ROAD_EDGE, 0, np.column_stack([x, 0 * x]))
+    edge = (EDGE_ID, FeatureType.ROAD_EDGE, 0, np.column_stack([x, 0 * x]))
 
     assert off_m(Kerbs(scene_of([edge])), (0, -2), (0, 2)) == [2, -2]
 

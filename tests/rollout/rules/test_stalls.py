@@ -83,7 +83,7 @@ def test_who_has_taken_the_place_of_another_begins_anew():
 
 def test_who_leaves_and_who_is_not_there_do_not():
     nobody = everyone((0, 0, 0), (20, 0, 0))
-    nobody.life[0, 0], nobody.presence[0, 1] = NOBODY, Presence.LEAVING
+    nobody.life[0, 0], nobody.presence[0, 1] = NOBODY, Presence.REMOVED
 
     assert ask(patience(), nobody, range(LONG + 1))[-1] == [False, False]
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from infgen.tokens.clustering.kdisks import gap_m, lay_disks
+from infgen.tokens.clustering.kdisks import find_disks, mean_gap_m
 
 
 class Plane:
@@ -30,7 +30,7 @@ def lay(items, tolerance_m, count=10**6, taken=(), order=None, space=None, **mor
     items = np.asarray(items, np.float32).reshape(-1, 2)
     taken = np.asarray(taken, np.float32).reshape(-1, 2)
     order = np.arange(len(items)) if order is None else order
-    return lay_disks(
+    return find_disks(
         space or Plane(), items, order, float(tolerance_m), count, taken, **more
     )
 
@@ -83,7 +83,7 @@ def test_no_items_give_no_centres_and_no_room_gives_none_either():
 
 def test_far_is_the_mean_distance_of_points():
     square = np.array([[[0.0, 0], [0, 4]], [[3, 0], [0, 0]]])
-    np.testing.assert_allclose(gap_m(square, np.zeros((2, 2))), [2.0, 1.5])
+    np.testing.assert_allclose(mean_gap_m(square, np.zeros((2, 2))), [2.0, 1.5])
 
 
 @settings(max_examples=60)

@@ -6,20 +6,20 @@ import pytest
 from infgen.config import VocabSettings
 from infgen.scene import AgentType
 from infgen.tokens.clustering.motion_samples import (
-    NO_SEGMENTS,
-    Segments,
+    NO_MOTION_SAMPLES,
+    MotionSamples,
     corner_gap_m,
-    sample_segments,
-    scene_segments,
+    merge_motion_samples,
+    scene_motion_samples,
 )
-from infgen.tokens.clustering.physical_limits import limits_of, within
+from infgen.tokens.clustering.physical_limits import keeps_limits, motion_limits
 
-LIMITS = limits_of(VocabSettings())
+LIMITS = motion_limits(VocabSettings())
 STILL_M = 0.05
 
 
 def segments_of(scene):
-    return scene_segments(scene, LIMITS, STILL_M)
+    return scene_motion_samples(scene, LIMITS, STILL_M)
 
 
 def with_tracks(scene, **changes):
@@ -28,8 +28,8 @@ def with_tracks(scene, **changes):
 
 def test_a_drive_of_nine_seconds_gives_eighteen_equal_moves(drive):
     found = segments_of(drive(speed_mps=10.0))
-    assert found.num_segments == 18
-    assert (found.kind == AgentType.VEHICLE).all()
+    assert found.num_samples == 18
+    assert (found.agent_type == AgentType.VEHICLE).all()
     straight = np.column_stack([np.arange(6), np.zeros(6), np.zeros(6)])
     np.testing.assert_allclose(found.path, np.broadcast_to(straight, (18, 6, 3)), atol=1e-4)
 
@@ -46,7 +46,7 @@ def test_moves_start_only_where_all_six_steps_are_seen(drive):
     valid = scene.tracks.valid.copy()
     valid[0, 22] = False  # within the move of steps 20 to 25
     valid[0, 40] = False  # the end of one and the start of another
-    assert segments_of(with_tracks(scene, valid=valid)).num_segments == 18 - 1 - 2
+    assert segments_of(with_tracks(scene, valid=valid)).num_samples == 18 - 1 - 2
 
 
 @pytest.mark.parametrize(
@@ -56,20 +56,20 @@ def test_agents_seen_briefly_give_no_moves_but_in_short_logs(drive, steps, seen,
     scene = drive(steps=steps, now=5)
     valid = np.zeros_like(scene.tracks.valid)
     valid[0, :seen] = True
-    assert segments_of(with_tracks(scene, valid=valid)).num_segments == moves
+    assert segments_of(with_tracks(scene, valid=valid)).num_samples == moves
 
 
 def test_logs_of_any_length_are_cut(drive):
-    assert segments_of(drive(steps=198)).num_segments == 39
-    assert segments_of(drive(steps=5, now=1)).num_segments == 0
+    assert segments_of(drive(steps=198)).num_samples == 39
+    assert segments_of(drive(steps=5, now=1)).num_samples == 0
 
 
 def test_who_stands_still_gives_no_moves(parked):
-    assert segments_of(parked()).num_segments == 0
+    assert segments_of(parked()).num_samples == 0
 
 
 def test_other_agents_give_no_moves(drive):
-    assert segments_of(drive(kind=AgentType.OTHER)).num_segments == 0
+    assert segments_of(drive(kind=AgentType.OTHER)).num_samples == 0
 
 
 def test_a_teleport_gives_no_move(drive):
@@ -77,7 +77,7 @@ def test_a_teleport_gives_no_move(drive):
     xyz_m = scene.tracks.xyz_m.copy()
     xyz_m[0, 43:, 0] += 30.0
     found = segments_of(with_tracks(scene, xyz_m=xyz_m))
-    assert found.num_segments == 17
+    assert found.num_samples == 17
     np.testing.assert_allclose(found.path[:, -1, 0], 2.5, atol=1e-3)
 
 
@@ -86,7 +86,7 @@ def test_headings_that_flip_are_mended_before_moves_are_cut(drive):
     heading_rad = scene.tracks.heading_rad.copy()
     heading_rad[0, 30:50] = np.pi
     found = segments_of(with_tracks(scene, heading_rad=heading_rad))
-    assert found.num_segments == 18
+    assert found.num_samples == 18
     np.testing.assert_allclose(found.path[..., 2], 0, atol=1e-6)
 
 
@@ -94,14 +94,14 @@ def test_every_move_of_a_noisy_log_is_within_the_limits(drive):
     scene = drive(speed_mps=12.0, kind=AgentType.CYCLIST)
     noise = np.random.default_rng(0).normal(0, 0.03, scene.tracks.xyz_m.shape)
     found = segments_of(with_tracks(scene, xyz_m=scene.tracks.xyz_m + np.float32(noise)))
-    assert found.num_segments > 9
-    assert within(found.path, AgentType.CYCLIST, LIMITS).all()
+    assert found.num_samples > 9
+    assert keeps_limits(found.path, AgentType.CYCLIST, LIMITS).all()
 
 
 def test_keys_name_scene_track_and_start(crossing):
     scene = crossing()
     found, again = segments_of(scene), segments_of(scene)
-    assert len(np.unique(found.key)) == found.num_segments
+    assert len(np.unique(found.key)) == found.num_samples
     np.testing.assert_array_equal(found.key, again.key)
     other = segments_of(dataclasses.replace(scene, scenario_id="another"))
     assert not np.isin(found.key, other.key).any()
@@ -112,11 +112,11 @@ def test_a_sample_holds_so_many_of_each_kind_whatever_the_order_of_its_parts(cro
         segments_of(dataclasses.replace(crossing(), scenario_id=str(number)))
         for number in range(6)
     ]
-    sample = sample_segments(parts, 20)
-    np.testing.assert_array_equal(np.bincount(sample.kind), [20, 20, 20])
-    halves = [sample_segments(parts[3:], 20), sample_segments(parts[:3], 20)]
-    again = sample_segments(halves, 20)
-    for field in dataclasses.fields(Segments):
+    sample = merge_motion_samples(parts, 20)
+    np.testing.assert_array_equal(np.bincount(sample.agent_type), [20, 20, 20])
+    halves = [merge_motion_samples(parts[3:], 20), merge_motion_samples(parts[:3], 20)]
+    again = merge_motion_samples(halves, 20)
+    for field in dataclasses.fields(MotionSamples):
         np.testing.assert_array_equal(
             getattr(again, field.name), getattr(sample, field.name)
         )
@@ -124,7 +124,7 @@ def test_a_sample_holds_so_many_of_each_kind_whatever_the_order_of_its_parts(cro
 
 def test_a_scene_that_is_met_twice_counts_once(drive):
     found = segments_of(drive())
-    assert sample_segments([found, found, NO_SEGMENTS], 1000).num_segments == 18
+    assert merge_motion_samples([found, found, NO_MOTION_SAMPLES], 1000).num_samples == 18
 
 
 def test_box_corners_are_as_far_apart_as_the_box_has_moved():
@@ -139,7 +139,7 @@ def test_box_corners_are_as_far_apart_as_the_box_has_moved():
 
 def test_paths_of_a_kind_are_seen_from_their_start(crossing):
     found = segments_of(crossing())
-    walked = found.of_kind(AgentType.PEDESTRIAN)
+    walked = found.of_agent_type(AgentType.PEDESTRIAN)
     assert len(walked) == 12
     np.testing.assert_allclose(walked[:, -1, 0], 0.7, atol=1e-4)
     assert not walked[:, 0].any()

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infgen.tokens.clustering.sample_keys import item_keys, name_key, smallest
+from infgen.tokens.clustering.sample_keys import item_keys, name_key, smallest_keys
 
 
 def test_keys_tell_items_apart_by_name_and_every_number():
@@ -27,7 +27,7 @@ def test_an_items_key_does_not_depend_on_the_items_beside_it():
 
 
 def test_the_sample_of_a_thousand_keys_is_spread_over_all_of_them():
-    rows = smallest(item_keys("scene", np.arange(100_000)), 1000)
+    rows = smallest_keys(item_keys("scene", np.arange(100_000)), 1000)
     counts = np.bincount(rows // 10_000, minlength=10)
     assert counts.min() > 60
     assert counts.max() < 140
@@ -36,9 +36,11 @@ def test_the_sample_of_a_thousand_keys_is_spread_over_all_of_them():
 @given(st.lists(st.integers(0, 2**64 - 1), max_size=60), st.integers(0, 70), st.randoms())
 def test_a_sample_of_samples_is_a_sample_of_the_whole(keys, count, random):
     keys = np.array(keys, dtype=np.uint64)
-    whole = keys[smallest(keys, count)]
+    whole = keys[smallest_keys(keys, count)]
     shuffled = keys[random.sample(range(len(keys)), len(keys))]
     half = len(keys) // 2
-    parts = [part[smallest(part, count)] for part in (shuffled[:half], shuffled[half:])]
+    parts = [
+        part[smallest_keys(part, count)] for part in (shuffled[:half], shuffled[half:])
+    ]
     merged = np.concatenate(parts)
-    np.testing.assert_array_equal(merged[smallest(merged, count)], whole)
+    np.testing.assert_array_equal(merged[smallest_keys(merged, count)], whole)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from infgen.config import VocabSettings
-from infgen.tokens.clustering.coverage import Matches, describe_moves, describe_roads
+from infgen.tokens.clustering.coverage import Matches, describe_map, describe_motion
 from infgen.tokens.clustering.vocabularies import Origin
 from infgen.views.charts.vocabularies import codebook_page
 
@@ -23,10 +23,10 @@ def page(metre_moves, bent_roads):
         "validation_split": "0 scenes of split <none>",
         "tolerance_m": 0.05,
         "road_tolerance_m": 0.1,
-        "motion": describe_moves(
+        "motion": describe_motion(
             metre_moves, move_origin, NOTHING, NOTHING, VocabSettings()
         ),
-        "roads": describe_roads(bent_roads, road_origin, curves, curves),
+        "roads": describe_map(bent_roads, road_origin, curves, curves),
     }
     return codebook_page(report, metre_moves, move_origin, bent_roads, road_origin)
 

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from infgen.scene import FeatureKind, LaneType, RoadEdgeType, RoadLineType, SignalState
+from infgen.scene import FeatureType, LaneType, RoadEdgeType, RoadLineType, SignalState
 from infgen.tokens.scene_tokens import SignalClass
 from infgen.views.scene.drawn_map import (
     RoadLook,
@@ -82,13 +82,13 @@ def test_a_crosswalk_with_more_corners_stays_whole():
 @pytest.mark.parametrize(
     ("kind", "type_", "look"),
     [
-        (FeatureKind.LANE, LaneType.UNDEFINED, RoadLook.LANE),
-        (FeatureKind.LANE, LaneType.BIKE_LANE, RoadLook.BIKE_LANE),
-        (FeatureKind.ROAD_LINE, RoadLineType.UNKNOWN, RoadLook.WHITE_BROKEN),
-        (FeatureKind.ROAD_LINE, RoadLineType.PASSING_DOUBLE_YELLOW, RoadLook.YELLOW_DOUBLE),
-        (FeatureKind.ROAD_EDGE, RoadEdgeType.MEDIAN, RoadLook.MEDIAN),
-        (FeatureKind.ROAD_EDGE, RoadEdgeType.UNKNOWN, RoadLook.EDGE),
-        (FeatureKind.STOP_SIGN, 0, RoadLook.STOP_SIGN),
+        (FeatureType.LANE, LaneType.UNDEFINED, RoadLook.LANE),
+        (FeatureType.LANE, LaneType.BIKE_LANE, RoadLook.BIKE_LANE),
+        (FeatureType.ROAD_LINE, RoadLineType.UNKNOWN, RoadLook.WHITE_BROKEN),
+        (FeatureType.ROAD_LINE, RoadLineType.PASSING_DOUBLE_YELLOW, RoadLook.YELLOW_DOUBLE),
+        (FeatureType.ROAD_EDGE, RoadEdgeType.MEDIAN, RoadLook.MEDIAN),
+        (FeatureType.ROAD_EDGE, RoadEdgeType.UNKNOWN, RoadLook.EDGE),
+        (FeatureType.STOP_SIGN, 0, RoadLook.STOP_SIGN),
     ],
 )
 def test_features_look_like_what_they_are(kind, type_, look):
@@ -97,11 +97,11 @@ def test_features_look_like_what_they_are(kind, type_, look):
 
 def test_every_kind_and_type_has_a_look():
     types = {
-        FeatureKind.LANE: LaneType,
-        FeatureKind.ROAD_LINE: RoadLineType,
-        FeatureKind.ROAD_EDGE: RoadEdgeType,
+        FeatureType.LANE: LaneType,
+        FeatureType.ROAD_LINE: RoadLineType,
+        FeatureType.ROAD_EDGE: RoadEdgeType,
     }
-    for kind in FeatureKind:
+    for kind in FeatureType:
         for type_ in types.get(kind, [0]):
             assert look_of(kind, type_) is not None
 
@@ -111,9 +111,9 @@ def test_lines_lie_from_the_bottom_up(build_map):
     drawn = draw_map(
         build_map(
             [
-                (7, FeatureKind.STOP_SIGN, 0, np.array([[1.0, 2.0]])),
-                (8, FeatureKind.ROAD_EDGE, 1, bend),
-                (9, FeatureKind.LANE, 2, bend + 1),
+                (7, FeatureType.STOP_SIGN, 0, np.array([[1.0, 2.0]])),
+                (8, FeatureType.ROAD_EDGE, 1, bend),
+                (9, FeatureType.LANE, 2, bend + 1),
             ]
         )
     )

@@ -4,7 +4,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from infgen.scene import AgentType, FeatureKind, RoadLineType, SignalState
+from infgen.scene import AgentType, FeatureType, RoadLineType, SignalState
 from infgen.views.scene.agent_marks import Crowd
 from infgen.views.scene.drawn_map import draw_map, find_lights
 from infgen.views.scene.map_marks import dashes, light_marks, map_marks, within
@@ -163,10 +163,10 @@ def test_roads_lie_under_paint_and_edges(build_map):
     drawn = draw_map(
         build_map(
             [
-                (1, FeatureKind.ROAD_EDGE, 1, street - 2),
-                (2, FeatureKind.ROAD_LINE, RoadLineType.SOLID_SINGLE_YELLOW, street + 1),
-                (3, FeatureKind.LANE, 2, street),
-                (4, FeatureKind.STOP_SIGN, 0, street[:1]),
+                (1, FeatureType.ROAD_EDGE, 1, street - 2),
+                (2, FeatureType.ROAD_LINE, RoadLineType.SOLID_SINGLE_YELLOW, street + 1),
+                (3, FeatureType.LANE, 2, street),
+                (4, FeatureType.STOP_SIGN, 0, street[:1]),
             ]
         )
     )

@@ -257,7 +257,7 @@ def _tracks(
     world_m = np.where(valid[..., None], xyz_m, 0.0)
     return Tracks(
         id=np.arange(1, len(kept) + 1, dtype=np.int32),
-        kind=actors.kind[kept].astype(np.int8),
+        agent_type=actors.kind[kept].astype(np.int8),
         xyz_m=(world_m - origin_xyz_m).astype(np.float32),
         heading_rad=_where(valid, _rounded(heading_rad, _GRID_RAD)),
         velocity_mps=_where(valid, velocity_mps),

@@ -19,12 +19,12 @@ def to_predict(
     long_seen = tracks.valid[:, now] & (tracks.valid[:, now:].mean(axis=1) > 0.6)
     able = np.flatnonzero(others & long_seen)
     speed_mps = np.linalg.norm(tracks.velocity_mps[able], axis=-1).mean(axis=1)
-    _, first = np.unique(tracks.kind[able], return_index=True)
+    _, first = np.unique(tracks.agent_type[able], return_index=True)
     foremost = np.isin(np.arange(len(able)), first)
     order = np.lexsort((able, -speed_mps, ~foremost))
     chosen = np.sort(able[order][:MAX_PREDICT])
     turned_rad = np.ptp(np.where(tracks.valid, np.unwrap(tracks.heading_rad), 0.0), axis=1)
-    hard = (tracks.kind != AgentType.VEHICLE) | (turned_rad > 0.5)
+    hard = (tracks.agent_type != AgentType.VEHICLE) | (turned_rad > 0.5)
     return chosen.astype(np.int32), np.where(hard[chosen], 2, 1).astype(np.int8)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from infgen.geometry import SQUARE_ROWS, boxes_overlap, squares_of
+from infgen.geometry import SQUARES_PER_COLUMN, boxes_overlap, grid_squares
 
 Boxes = Float64[np.ndarray, "_ 6"]
 
@@ -30,12 +30,12 @@ def clear_way(
     size_lw_m: Float64[np.ndarray, "body 2"],
 ) -> Boxes:
     """Take away parked cars that stand in the way of somebody, wherever they come by."""
-    cells = squares_of(parked[:, :2], _CELL_M)
-    number = squares_of(pose[:, :2], _CELL_M)
+    cells = grid_squares(parked[:, :2], _CELL_M)
+    number = grid_squares(pose[:, :2], _CELL_M)
     order = np.argsort(number, kind="stable")
     number = number[order]
     # Three runs of consecutive numbers hold all nine squares around one.
-    columns = cells[:, None] + SQUARE_ROWS * np.array([-1, 0, 1])
+    columns = cells[:, None] + SQUARES_PER_COLUMN * np.array([-1, 0, 1])
     start = np.searchsorted(number, columns - 1, side="left")
     stop = np.searchsorted(number, columns + 1, side="right")
     met = np.zeros(len(parked), bool)

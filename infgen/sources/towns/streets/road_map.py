@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Bool
 
 from infgen.scene import (
-    FeatureKind,
+    FeatureType,
     LaneType,
-    LinkKind,
+    LinkType,
     RoadMap,
     Side,
 )
@@ -56,7 +56,7 @@ class _Tables:
         self.sign: list[tuple[int, int]] = []
 
     def add(
-        self, kind: FeatureKind, xy_m: Points, of: int = 0, limit_mps: float = 0.0
+        self, kind: FeatureType, xy_m: Points, of: int = 0, limit_mps: float = 0.0
     ) -> int:
         """Add a feature; return its id."""
         self.features.append((kind, of, limit_mps / MPS_PER_MPH))
@@ -76,20 +76,20 @@ def draw_map(network: Network, furniture: Furniture) -> tuple[RoadMap, dict[str,
     for connector in network.connectors:
         tables.ids[connector.name] = _add_connector(tables, connector, network)
     line_ids = [
-        tables.add(FeatureKind.ROAD_LINE, resample(line.xy_m, SPACING_M), line.kind)
+        tables.add(FeatureType.ROAD_LINE, resample(line.xy_m, SPACING_M), line.kind)
         for line in furniture.lines
     ]
     for kerb in furniture.kerbs:
-        tables.add(FeatureKind.ROAD_EDGE, resample(kerb.xy_m, SPACING_M), kerb.kind)
+        tables.add(FeatureType.ROAD_EDGE, resample(kerb.xy_m, SPACING_M), kerb.kind)
     for outlines, kind in (
-        (furniture.crosswalks, FeatureKind.CROSSWALK),
-        (furniture.driveways, FeatureKind.DRIVEWAY),
-        (furniture.bumps, FeatureKind.SPEED_BUMP),
+        (furniture.crosswalks, FeatureType.CROSSWALK),
+        (furniture.driveways, FeatureType.DRIVEWAY),
+        (furniture.bumps, FeatureType.SPEED_BUMP),
     ):
         for outline_m in outlines:
             tables.add(kind, outline_m)
     for sign in furniture.signs:
-        sign_id = tables.add(FeatureKind.STOP_SIGN, sign.xy_m[None])
+        sign_id = tables.add(FeatureType.STOP_SIGN, sign.xy_m[None])
         tables.sign += [(sign_id, tables.ids[name]) for name in sign.connectors]
     _link(tables, network)
     _set_beside(tables, network, furniture.lines, line_ids)
@@ -99,7 +99,7 @@ def draw_map(network: Network, furniture: Furniture) -> tuple[RoadMap, dict[str,
 def _add_lane(tables: _Tables, lane: Lane) -> int:
     cycled = lane.use is Use.CYCLISTS
     return tables.add(
-        FeatureKind.LANE,
+        FeatureType.LANE,
         resample(lane.xy_m, SPACING_M),
         LaneType.BIKE_LANE if cycled else LaneType.SURFACE_STREET,
         0.0 if cycled else lane.limit_mps,
@@ -112,7 +112,7 @@ def _add_connector(tables: _Tables, connector: Connector, network: Network) -> i
     # Lanes end and ways across begin at the same point, whatever netconvert rounded.
     xy_m = np.concatenate([ends[0].xy_m[-1:], connector.xy_m, ends[1].xy_m[:1]])
     return tables.add(
-        FeatureKind.LANE,
+        FeatureType.LANE,
         resample(xy_m, SPACING_M),
         LaneType.BIKE_LANE if cycled else LaneType.SURFACE_STREET,
         0.0 if cycled else min(lane.limit_mps for lane in ends),
@@ -126,10 +126,10 @@ def _link(tables: _Tables, network: Network) -> None:
         way = tables.ids[each.name]
         start, end = tables.ids[each.start], tables.ids[each.end]
         for lane, kind, other in (
-            (start, LinkKind.EXIT, way),
-            (way, LinkKind.ENTRY, start),
-            (way, LinkKind.EXIT, end),
-            (end, LinkKind.ENTRY, way),
+            (start, LinkType.EXIT, way),
+            (way, LinkType.ENTRY, start),
+            (way, LinkType.EXIT, end),
+            (end, LinkType.ENTRY, way),
         ):
             found.setdefault((lane, kind), []).append(other)
     tables.link = [
@@ -197,14 +197,14 @@ def _road_map(tables: _Tables) -> RoadMap:
     signs = np.array(tables.sign, np.int64).reshape(-1, 2)
     return RoadMap(
         feature_id=np.arange(1, count + 1, dtype=np.int64),
-        feature_kind=np.array(kinds, np.int8),
-        feature_type=np.array(types, np.int8),
+        feature_type=np.array(kinds, np.int8),
+        feature_subtype=np.array(types, np.int8),
         speed_limit_mph=np.round(np.array(limits_mph), 0).astype(np.float32),
         interpolating=np.zeros(count, bool),
         point_offsets=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
         xyz_m=np.pad(points_m, ((0, 0), (0, 1))).astype(np.float32),
         link_lane_id=links[:, 0],
-        link_kind=links[:, 1].astype(np.int8),
+        link_type=links[:, 1].astype(np.int8),
         link_other_id=links[:, 2],
         neighbour_lane_id=beside[:, 0],
         neighbour_side=beside[:, 1].astype(np.int8),

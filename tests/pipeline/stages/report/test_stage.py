@@ -93,7 +93,7 @@ def cruise(scene: Scene, index: int) -> Rollout:
         now=scene.now,
         ego=int(np.flatnonzero(rows == scene.ego)[0]),
         id=np.append(tracks.id[rows[:-1]], tracks.id.max() + 1).astype(np.int32),
-        kind=tracks.kind[rows],
+        kind=tracks.agent_type[rows],
         size_lwh_m=tracks.size_lwh_m[rows, scene.now],
         xyz_m=np.where(valid[..., None], xyz_m, 0).astype(np.float32),
         heading_rad=np.where(valid, heading_rad, 0).astype(np.float32),

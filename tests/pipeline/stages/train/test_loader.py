@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from infgen.model.batching.perturbation import make_noise
+from infgen.model.batching.perturbation import make_perturbation
 from infgen.model.tensors import map_tensors
 from pipeline.stages.train.loader import (
     TokenScenes,
@@ -69,7 +69,7 @@ def test_noise_is_the_same_whoever_makes_it_and_never_in_held_out_scenes(
     course, books, workers
 ):
     recipe = course.recipe(Team())
-    noise = make_noise(replace(course.train, motion_noise_neighbours=3), *books)
+    noise = make_perturbation(replace(course.train, motion_noise_neighbours=3), *books)
     noisy = replace(recipe, noise=noise)
 
     made = list(train_batches(noisy, range(3), workers))

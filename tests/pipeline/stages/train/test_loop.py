@@ -71,7 +71,7 @@ def test_noise_is_learned_from_if_it_is_asked_for(course, books, quiet, monkeypa
     train(replace(course, train=how), begin(course, *books), quiet)
 
     assert given[0].moves == 3
-    assert given[0].table.codebook.num_motion_tokens == books[0].num_motion_tokens
+    assert given[0].table.vocabulary.num_motion_tokens == books[0].num_motion_tokens
 
 
 def test_no_scenes_to_train_on_is_said(course, books, quiet):

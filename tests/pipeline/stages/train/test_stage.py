@@ -319,8 +319,8 @@ def test_weights_are_all_that_loading_needs(whole, train_settings, metre_moves, 
     network = load_network(whole[0])
 
     assert not network.training
-    np.testing.assert_array_equal(network.motion_codebook().path, metre_moves.path)
-    np.testing.assert_array_equal(network.road_codebook().curve_m, bent_roads.curve_m)
+    np.testing.assert_array_equal(network.motion_vocabulary().path, metre_moves.path)
+    np.testing.assert_array_equal(network.map_vocabulary().curve_m, bent_roads.curve_m)
     assert network.settings == train_settings["model"]
     assert network.grid_settings == train_settings["tokenize"]
 
@@ -393,7 +393,7 @@ def test_the_plan_is_one_unit_of_the_two_splits(train_settings):
     training = [f"{tokens}training.tfrecord-0", f"{tokens}training.tfrecord-1"]
     assert unit.task["scenes"] == training
     assert unit.task["validation_split"] == [f"{tokens}validation.tfrecord-0"]
-    assert unit.inputs["codebooks"] == "build-vocab-motion.zarr-roads.zarr"
+    assert unit.inputs["vocabularies"] == "build-vocab-motion.zarr-roads.zarr"
     assert unit.inputs["scenes/training.tfrecord-1"] == "key-training.tfrecord-1"
     assert STAGE.resumes
     assert STAGE.in_driver

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from infgen.geometry import to_world
-from infgen.scene import AgentType, FeatureKind, SignalState
+from infgen.scene import AgentType, FeatureType, SignalState
 from infgen.sources.towns.recording.scenes import NOW, Place, record
 from infgen.sources.towns.recording.signals import SEEN_M, draw_signals
 from infgen.sources.towns.recording.viewpoints import View, draw_views
@@ -117,7 +117,7 @@ def test_nobody_records_near_the_rim_of_the_town(town):
 def test_everyone_in_sight_is_in_the_scene_the_ego_last(scene):
     assert scene.tracks.num_agents == 4
     assert scene.ego == 3
-    assert sorted(scene.tracks.kind) == [0, 0, 0, AgentType.PEDESTRIAN]
+    assert sorted(scene.tracks.agent_type) == [0, 0, 0, AgentType.PEDESTRIAN]
     assert scene.tracks.valid[scene.ego].all()
 
 
@@ -145,11 +145,11 @@ def test_cars_that_stand_do_not_tremble_and_people_do(scene):
     for row in range(3):
         xy_m = tracks.xyz_m[row, tracks.valid[row], :2]
         moved_m = np.ptp(xy_m, axis=0).max()
-        assert (moved_m > 0.01) == (tracks.kind[row] == AgentType.PEDESTRIAN)
+        assert (moved_m > 0.01) == (tracks.agent_type[row] == AgentType.PEDESTRIAN)
 
 
 def test_the_map_is_of_the_same_place(scene):
-    lanes = scene.road_map.rows(FeatureKind.LANE)
+    lanes = scene.road_map.rows(FeatureType.LANE)
     points_m = np.concatenate([scene.road_map.points(int(row)) for row in lanes])
     from_ego_m = points_m[:, :2] - scene.tracks.xyz_m[scene.ego, NOW, :2]
 

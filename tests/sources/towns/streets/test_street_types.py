@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from infgen.scene import FeatureKind, LaneType, LinkKind, RoadEdgeType, RoadLineType
+from infgen.scene import FeatureType, LaneType, LinkType, RoadEdgeType, RoadLineType
 from infgen.sources.towns.streets.markings import (
     draw_bumps,
     draw_crosswalks,
@@ -126,17 +126,17 @@ def test_reverse_of_a_street_is_its_other_direction():
 
 def test_the_map_has_every_lane_and_way_across(crossing, town_map):
     road_map, ids = town_map
-    lanes = road_map.rows(FeatureKind.LANE)
+    lanes = road_map.rows(FeatureType.LANE)
 
     assert len(lanes) == len(crossing.lanes) + len(crossing.connectors) == 12 + 14
-    assert set(road_map.feature_type[lanes]) == {LaneType.SURFACE_STREET}
+    assert set(road_map.feature_subtype[lanes]) == {LaneType.SURFACE_STREET}
     limits_mph = {road_map.speed_limit_mph[ids[f"e{link}f_2"] - 1] for link in (0, 1)}
     assert limits_mph == {45.0, 25.0}
 
 
 def test_exits_begin_where_a_lane_ends_and_are_entries_of_each_other(town_map):
     road_map, _ = town_map
-    exits = road_map.link_kind == LinkKind.EXIT
+    exits = road_map.link_type == LinkType.EXIT
     pairs = list(
         zip(road_map.link_lane_id[exits], road_map.link_other_id[exits], strict=True)
     )
