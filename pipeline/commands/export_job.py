@@ -149,7 +149,7 @@ class Steps:
         """Count scenes as done. Here a request to stop arrives."""
         self.done += count
         tell_export(self._tell, "progress", done=self.done, total=self.total, note="")
-        signals.check()
+        signals.raise_if_stopped()
 
 
 def tell_export(tell: Callable[[Event], None], event: str, **more: Any) -> None:

@@ -172,10 +172,10 @@ def _pack(shards: Sequence[Path], order: Order) -> None:
                 member.size, member.mode = shard.stat().st_size, 0o644
                 with shard.open("rb") as data:
                     archive.addfile(member, data)
-                signals.check()
+                signals.raise_if_stopped()
         file.flush()
         os.fsync(file.fileno())
-    with signals.whole():
+    with signals.uninterrupted():
         partial.replace(order.out)
         sync_folder(order.out.absolute().parent)
         shutil.rmtree(order.partial)

@@ -184,7 +184,7 @@ def _make_pieces(
                 "note": "",
             }
         )
-        signals.check()
+        signals.raise_if_stopped()
 
 
 def _by_processes(

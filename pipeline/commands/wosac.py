@@ -112,7 +112,7 @@ def score_futures(
     tell({**about, "event": "work-started", "units": 1, "made": 0, "what": "scenes"})
     tell({**about, "done": 0, "total": 1, "note": ""})
     for done, (share, future) in enumerate(futures, start=1):
-        signals.check()
+        signals.raise_if_stopped()
         found = _score(logs, future, metric, scores)
         if isinstance(found, Refused):
             refused.append(found)

@@ -1,4 +1,4 @@
-"""Finding made folders by the start of their keys, and telling two apart."""
+"""Finding artefacts by the start of their keys, and comparing two of them."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -35,7 +35,7 @@ def find(root: Root, key: str) -> Path:
 
 
 def describe(folder: Path) -> dict[str, Any]:
-    """Return all that a made folder says of itself."""
+    """Return manifest and run record of an artefact."""
     return {
         "folder": str(folder),
         **read_manifest(folder),
@@ -44,7 +44,7 @@ def describe(folder: Path) -> dict[str, Any]:
 
 
 def differences(one: Path, other: Path) -> Iterator[tuple[str, Any, Any]]:
-    """List where two made folders differ, as (what, in one, in the other)."""
+    """List the differences of two artefacts, as (entry, value in one, in the other)."""
     first, second = read_manifest(one), read_manifest(other)
     for part in PARTS:
         yield from _differences(part, _named(first.get(part)), _named(second.get(part)))

@@ -1,6 +1,6 @@
-"""Writing so that a reader sees all of it or none of it, whenever the writer is killed.
+"""Atomic writes: a reader sees a whole file or folder or none, whenever a writer is killed.
 
-Everything is on disk (synced) before it gets the name that readers look for.
+Everything is synced to disk before it gets its final name.
 """
 
 import json
@@ -15,7 +15,7 @@ from typing import Any
 from pipeline.engine import signals
 
 MANIFEST = "manifest.json"
-"""Written last; a folder that has one is whole."""
+"""Written last: a folder that has one is complete."""
 PARTIAL = ".partial"
 """Ending of the names of files and folders that are still being written."""
 TRASH = "trash."
@@ -23,24 +23,24 @@ TRASH = "trash."
 
 
 class StoreError(ValueError):
-    """Something on disk that is missing, damaged or not what was expected."""
+    """A file or folder that is missing, damaged or of another schema."""
 
 
 @contextmanager
 def publish(target: Path, *, resume: bool = False) -> Iterator[Path]:
-    """Give a folder to write in, and make it ``target`` only once all is written.
+    """Give a temporary folder to write in, and rename it to ``target`` at the end.
 
-    A reader sees the whole folder or none of it; everything is on disk before the name is.
-    Where two do the same work at once, the first to finish wins and the other's is dropped.
+    A reader sees the whole folder or none of it. Where two processes do the same work, the
+    first to finish wins and the other's folder is removed.
 
     Args:
-        target: Where the folder shall stand.
-        resume: Keep what an earlier, killed try left, instead of starting empty, but for
-            files that were half written. There must be one writer then.
+        target: Final path of the folder.
+        resume: Start from what a killed attempt left, without its half-written files. Only
+            one process may write then.
 
     Raises:
-        StoreError: if the folder was removed meanwhile, or another that is not sealed
-            stands in its place.
+        StoreError: if the folder was removed meanwhile, or another without a manifest is
+            in its place.
     """
     mark = "" if resume else f".{uuid.uuid4().hex[:8]}"
     partial = target.with_name(f"{target.name}{mark}{PARTIAL}")
@@ -51,7 +51,7 @@ def publish(target: Path, *, resume: bool = False) -> Iterator[Path]:
     try:
         yield partial
         sync_tree(partial)
-        with signals.whole():
+        with signals.uninterrupted():
             _check_not_replaced(handle, partial)
             _rename_unless_finished(partial, target)
     finally:
@@ -67,10 +67,10 @@ def _remove_partial_files(folder: Path) -> None:
 
 
 def _check_not_replaced(handle: int, partial: Path) -> None:
-    """Make sure that all of a folder was written by who began it.
+    """Check that the folder is still the one that this process made.
 
-    Another run may have removed it; what is written next makes it anew, with a part of the
-    files. While the first is open, no other folder is taken for it.
+    Another run may have removed it, and later writes may have made a new one with a part of
+    the files. The open handle keeps its inode from being reused.
     """
     own = False
     with suppress(FileNotFoundError):
@@ -88,16 +88,16 @@ def _rename_unless_finished(partial: Path, target: Path) -> None:
         if not (target / MANIFEST).is_file():
             if not (partial / MANIFEST).is_file():
                 raise StoreError(f"{target} is in the way; move it elsewhere") from error
-            remove_folder(target)  # A kill left it half removed.
+            remove_folder(target)  # A killed process left it half removed.
             partial.rename(target)
     sync_folder(target.parent)
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder: its name at once, what it holds as far as that can be.
+    """Remove a folder: rename it at once, then delete its contents as far as possible.
 
-    So a kill leaves no half of it under its name, and who still writes in it has lost it.
-    What cannot be removed now is trash, for the next run to clear.
+    A killed process so leaves no half of it under its name, and processes that still write
+    in it no longer reach it. What cannot be deleted is left to the next run.
     """
     trash = folder.with_name(f"{TRASH}{uuid.uuid4().hex[:8]}{PARTIAL}")
     with suppress(FileNotFoundError):
@@ -106,9 +106,9 @@ def remove_folder(folder: Path) -> None:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a small file whole or not at all, and sync it."""
+    """Write a small file atomically, and sync it."""
     partial = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}{PARTIAL}")
-    with signals.whole():
+    with signals.uninterrupted():
         with partial.open("wb") as file:
             file.write(data)
             file.flush()
@@ -118,12 +118,12 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON whole or not at all, keys sorted, so equal values are equal bytes."""
+    """Write JSON atomically, with sorted keys: equal values are equal bytes."""
     write_file(path, (json.dumps(value, indent=1, sort_keys=True) + "\n").encode())
 
 
 def sync_tree(root: Path) -> None:
-    """Put every file and folder below, and the folder itself, on disk."""
+    """Sync a folder and all files and folders below it to disk."""
     for folder, _, files in os.walk(root):
         for name in files:
             handle = os.open(os.path.join(folder, name), os.O_RDONLY)
@@ -135,7 +135,7 @@ def sync_tree(root: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Put a folder's own entries on disk."""
+    """Sync the entries of a folder to disk."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

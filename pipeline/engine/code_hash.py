@@ -1,8 +1,7 @@
 """Hash of the code that decides the bytes of an artefact.
 
-That is the modules a stage names, and whatever these import of the library, and so on: a
-list of all would be wrong after the next import. Modules of settings do not count, since
-settings are in every key by their values.
+Hashed are the modules that a stage names and all modules of ``infgen`` that these import,
+directly or not. Modules of settings are left out: settings are in every key by value.
 """
 
 import ast
@@ -15,8 +14,8 @@ from pathlib import Path
 from pipeline.engine.atomic import StoreError
 
 LIBRARY = "infgen"
-SETTINGS = ("settings", "config", "coerce")
-"""How the names of modules of settings end."""
+SETTINGS = ("settings", "config")
+"""Endings of the names of settings modules."""
 
 
 def code_hash(modules: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""What happens in a run, told to a log file and to whoever listens."""
+"""Events of a run, written to a log file and passed to listeners."""
 
 import json
 import os
@@ -11,31 +11,31 @@ from typing import Any, Protocol, runtime_checkable
 from pipeline.engine.layout import Root
 
 Event = Mapping[str, Any]
-"""``event`` says which; the rest are its figures.
+"""``event`` is its name; the other entries are its figures.
 
 ``run-started``, ``stage-cached``, ``stage-started`` (units, made), ``unit-done``,
 ``unit-failed`` (error, trace), ``finish-started``, ``progress`` (done, total, note; logged
-where nothing was for some seconds), ``worker-full`` (worker, memory_gib: restarted, as it
-fills its memory), ``worker-lost`` (worker, units that begin again), ``workers-missing``
+only after some seconds without another event), ``worker-full`` (worker, memory_gib:
+restarted as it exceeds its memory), ``worker-lost`` (worker, units that start again), ``workers-missing``
 (timeout_min), ``stage-done`` (report), ``stage-failed``, ``stage-skipped``, ``run-ended``
 or ``run-stopped`` (why). Around the runs of a preset: ``leg-started`` (leg, number, legs),
 ``leg-failed`` (leg, why).
 """
 
 QUIET_S = 5.0
-"""How long a log may be silent before progress is told there too, for who watches it."""
+"""Progress is logged after so long without another event, for ``infgen status --watch``."""
 
 
 @runtime_checkable
 class Listener(Protocol):
-    """Whoever wants to know, e.g. the screen."""
+    """Receives events, e.g. the screen."""
 
     def __call__(self, event: Event) -> None:
-        """Take note of one event."""
+        """Handle one event."""
 
 
 class Events:
-    """Tells every event to the listeners, and to a JSON-lines file below ``logs/``."""
+    """Passes every event to the listeners and appends it to a JSON-lines file in ``logs/``."""
 
     def __init__(self, root: Root, listeners: tuple[Listener, ...] = ()) -> None:
         self.log = root.logs / f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{os.getpid()}.jsonl"
@@ -43,7 +43,7 @@ class Events:
         self._wrote_at = time.monotonic()
 
     def emit(self, event: str, **figures: Any) -> None:
-        """Tell one event. A line of the log is written whole and at once."""
+        """Emit one event. Each line of the log is one write."""
         about = {"event": event, **figures}
         if event != "progress" or time.monotonic() - self._wrote_at >= QUIET_S:
             self._write(about)

@@ -1,4 +1,4 @@
-"""Finding and removing what no remembered request needs any more."""
+"""Finding and removing artefacts that no stored request needs."""
 
 import time
 from collections.abc import Collection, Iterator
@@ -20,9 +20,9 @@ class Garbage:
     """A folder that nothing needs.
 
     Attributes:
-        path: Where it is.
-        bytes: What it takes.
-        why: What it is.
+        path: The folder.
+        bytes: Its size.
+        why: What it holds.
     """
 
     path: Path
@@ -31,13 +31,13 @@ class Garbage:
 
 
 def find_garbage(root: Root, initial_weights: Collection[str] = ()) -> list[Garbage]:
-    """List what the latest stages of every profile, and their units, do not need.
+    """List the folders that the latest stages of every profile do not need.
 
-    Units of an unfinished stage are kept: the next run goes on from them.
+    Units of an unfinished stage are kept: the next run continues from them.
 
     Args:
         root: Of the experiment.
-        initial_weights: Keys and folders of weights that are needed besides.
+        initial_weights: Keys and folders of weights to keep too.
     """
     found = []
     for stage in root.stages():
@@ -57,7 +57,7 @@ def remove_garbage(root: Root, initial_weights: Collection[str] = ()) -> list[Ga
 
     Args:
         root: Of the experiment.
-        initial_weights: Keys and folders of weights that are needed besides.
+        initial_weights: Keys and folders of weights to keep too.
 
     Raises:
         LockedError: if a run is making one of them.

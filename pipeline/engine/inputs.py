@@ -1,4 +1,4 @@
-"""What a stage sees of the stages before it: finished units and folders, nothing else."""
+"""Finished units and folders of the stages that a stage reads."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from pipeline.engine.stage import FinishedUnit, Source
 
 @dataclass(frozen=True, slots=True)
 class FinishedInputs:
-    """The ``Inputs`` of one stage. To ask for a stage not among its deps is an error."""
+    """The ``Inputs`` of one stage. Reading a stage that is not in its deps is an error."""
 
     root: Root
     planned: PlannedStage
@@ -81,5 +81,5 @@ def _below(files: Iterable[str], names: Sequence[str]) -> list[str]:
 
 
 def inputs_finished(plan: Plan, planned: PlannedStage) -> bool:
-    """Whether all stages that one reads are finished, so that its work can be cut."""
+    """Whether all input stages are finished, so that the work can be split into units."""
     return all(plan.root.is_finished(name, key) for name, key in planned.inputs.items())

@@ -1,13 +1,13 @@
-"""Where everything lies below the root folder of an experiment.
+"""Files and folders below the root folder of an experiment.
 
 ::
 
-    store/<stage>/<key>/         a made stage: what its ``finish`` wrote, manifest.json
-    store/<stage>/units/<key>/   a made unit: what its ``work`` wrote, manifest.json
+    store/<stage>/<key>/         a finished stage: outputs of its ``finish``, manifest.json
+    store/<stage>/units/<key>/   a finished unit: outputs of its ``work``, manifest.json
     store/<stage>/lock           held while the stage is being made
-    store/<stage>/attempt.json   units of the last try, and which of them failed
-    latest/<stage>, report       links to the folders made or found last
-    refs/<profile>.json          the last request under a profile, and the keys it led to
+    store/<stage>/attempt.json   units of the last attempt, and which of them failed
+    latest/<stage>, report       links to the folders of the last run
+    refs/<profile>.json          the last request under a profile, and its keys
     logs/<time>-<pid>.jsonl      one line per event of a run
     cache/fingerprints.json      identities of source files
 
@@ -29,7 +29,7 @@ from pipeline.engine.atomic import MANIFEST, PARTIAL, StoreError, sync_folder
 RUN = "run.json"
 """Beside the manifest: what differs from run to run ..."""
 RUN_FOLDER = "run"
-"""... and, in this folder, more of that: no file in it is in the manifest."""
+"""Folder of further files that differ from run to run; the manifest leaves them out."""
 KEY_DIGITS = 16
 STAGE_SCHEMA, UNIT_SCHEMA = "infgen.stage/2", "infgen.unit/2"
 _OLD_SCHEMAS = ("infgen.stage/1", "infgen.unit/1", "infgen.comparison/1")
@@ -47,12 +47,12 @@ class Root:
 
     @property
     def store(self) -> Path:
-        """Folder of everything made."""
+        """Folder of all artefacts."""
         return self.path / "store"
 
     @property
     def latest(self) -> Path:
-        """Folder of links to what was made or found last."""
+        """Folder of links to the artefacts of the last run."""
         return self.path / "latest"
 
     @property
@@ -62,16 +62,16 @@ class Root:
 
     @property
     def refs(self) -> Path:
-        """Folder of remembered requests."""
+        """Folder of stored requests."""
         return self.path / "refs"
 
     @property
     def fingerprints(self) -> Path:
-        """File of remembered identities of source files."""
+        """Cache of fingerprints of source files."""
         return self.path / "cache" / "fingerprints.json"
 
     def stage(self, stage: str) -> Path:
-        """Folder of all that one stage ever made."""
+        """Folder of all artefacts of a stage."""
         return self.store / stage
 
     def folder(self, stage: str, key: str) -> Path:
@@ -91,21 +91,21 @@ class Root:
         return self.stage(stage) / "lock"
 
     def attempt(self, stage: str) -> Path:
-        """Record of a stage's last try."""
+        """Record of a stage's last attempt."""
         return self.stage(stage) / "attempt.json"
 
     def is_finished(self, stage: str, key: str) -> bool:
-        """Whether a stage is whole on disk."""
+        """Whether a stage is complete on disk."""
         return (self.folder(stage, key) / MANIFEST).is_file()
 
     def stages(self) -> list[str]:
-        """Names of all stages that were ever begun here."""
+        """Names of all stages that were ever begun in this root."""
         if not self.store.is_dir():
             return []
         return sorted(path.name for path in self.store.iterdir() if path.is_dir())
 
     def made(self) -> Iterator[tuple[str, Path]]:
-        """Every whole folder here, stages and units, as (stage, folder)."""
+        """Every complete folder of a stage or unit, as (stage, folder)."""
         for stage in self.stages():
             for parent in (self.stage(stage), self.units(stage)):
                 for manifest in sorted(parent.glob(f"*/{MANIFEST}")):
@@ -113,25 +113,25 @@ class Root:
                         yield stage, manifest.parent
 
     def point(self, stage: str, key: str) -> None:
-        """Make ``latest/<stage>`` (and ``report``) lead to a made folder."""
+        """Make ``latest/<stage>`` (and ``report``) link to a finished folder."""
         folder = self.folder(stage, key)
         link(self.latest / stage, folder)
         if stage == "report":
             link(self.path / "report", folder)
 
     def latest_folder(self, stage: str) -> Path | None:
-        """Return the folder that ``latest/<stage>`` leads to, if it is whole."""
+        """Return the folder that ``latest/<stage>`` links to, if it is complete."""
         folder = (self.latest / stage).resolve()
         return folder if (folder / MANIFEST).is_file() else None
 
 
 def find_root(folder: Path, *, made: bool = False) -> Root:
-    """Take a folder that a command names as a root.
+    """Return the root at a folder that a command names.
 
     Args:
-        folder: As it was named.
-        made: Whether something must have been made there: a misspelt root that is empty
-            would pass for one without damage.
+        folder: The folder.
+        made: Whether it must hold artefacts: otherwise a misspelt root would look like an
+            undamaged one.
 
     Raises:
         ConfigError: if it is a file; if nothing was made there, but must have been; or if
@@ -169,10 +169,10 @@ def _refuse_old(root: Root) -> None:
 
 
 def link(name: Path, target: Path) -> None:
-    """Make a relative link, or lead it elsewhere, in one step.
+    """Make a relative link, or replace it, in one step.
 
     Raises:
-        StoreError: if something that is no link stands in its place.
+        StoreError: if there is a file or folder of that name.
     """
     name.parent.mkdir(parents=True, exist_ok=True)
     relative = os.path.relpath(target, name.parent)

@@ -1,4 +1,4 @@
-"""One run at a time per stage. A lock dies with its process: nothing to unlock by hand."""
+"""Locks: one run at a time per stage. The system releases a lock when its process ends."""
 
 import errno
 import fcntl
@@ -14,7 +14,7 @@ from typing import Any
 
 POLL_S = 0.1
 LOCK_TIMEOUT_S = 0.5
-"""How long a lock is tried before it counts as held: ``is_locked`` takes it briefly."""
+"""A lock counts as held after so long; ``is_locked`` takes it for a moment."""
 
 
 class LockedError(ValueError):
@@ -23,15 +23,15 @@ class LockedError(ValueError):
 
 @contextmanager
 def locked(path: Path, *, wait: bool = False) -> Iterator[None]:
-    """Hold a lock file for the length of the block.
+    """Hold a lock file during the block.
 
     Args:
         path: The file; it is never removed.
-        wait: Queue until it is free.
+        wait: Wait until it is free.
 
     Raises:
-        LockedError: if another run holds it and ``wait`` is off: its host, its process and
-            since when.
+        LockedError: if another run holds it and ``wait`` is off, naming host, process and
+            start.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
@@ -53,7 +53,7 @@ def is_locked(path: Path) -> bool:
     """Whether some process holds a lock."""
     if not path.is_file():
         return False
-    handle = os.open(path, os.O_RDONLY)  # Whoever may read may look.
+    handle = os.open(path, os.O_RDONLY)  # Works without write permission.
     try:
         return not _try_lock(handle, fcntl.LOCK_SH)
     finally:
@@ -61,7 +61,7 @@ def is_locked(path: Path) -> bool:
 
 
 def holder(path: Path) -> dict[str, Any]:
-    """Host, process and start of the run that holds a lock; empty if it cannot be told."""
+    """Host, process and start of the run that holds a lock; empty if unknown."""
     try:
         about = json.loads(path.read_bytes())
     except (OSError, ValueError):

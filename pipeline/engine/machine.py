@@ -1,4 +1,4 @@
-"""What kind of machine this is, for the record. Reads files only."""
+"""Description of this machine for the run record. Reads files only."""
 
 import os
 import platform
@@ -35,5 +35,5 @@ def _models(path: Path) -> Iterator[str]:
     """Names of the models that a file of the kernel lists."""
     try:
         yield from _MODEL.findall(path.read_text())
-    except OSError:  # Another system than Linux.
+    except OSError:  # Not Linux.
         return

@@ -1,7 +1,7 @@
-"""What a made folder says of itself: how it came about, and every file with its checksum.
+"""Manifests: how a folder was made, and every file in it with its checksum.
 
-``manifest.json`` holds nothing that differs between two runs of the same work; times and
-the machine are in ``run.json`` beside it.
+``manifest.json`` is the same in every run of the same work. Times and the machine are in
+``run.json`` beside it.
 """
 
 import platform
@@ -22,12 +22,12 @@ from pipeline.engine.stage import Report
 
 BLOCK_BYTES = 1 << 22
 PACKAGES = ("infgen", "numpy", "polars", "torch", "zarr")
-"""Packages whose versions are recorded: those that may decide bytes."""
+"""Packages whose versions are recorded, as they may change the bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """When and where something was made, and what of its report varies between runs."""
+    """When and where a folder was made, and the part of its report that varies."""
 
     started: str
     seconds: float
@@ -46,7 +46,7 @@ class Run:
 
 
 def split_report(report: Report) -> tuple[Report, Report]:
-    """Split a report into what is the same each time, and what is not (below ``run``)."""
+    """Split a report into its reproducible part and the part under ``run``."""
     same = {name: value for name, value in sorted(report.items()) if name != "run"}
     return same, dict(report.get("run", {}))
 
@@ -98,7 +98,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _remedy(folder: Path) -> str:
-    """Say how a damaged stage, or one of its units, comes right; nothing of others."""
+    """Name the command that makes a damaged stage or unit again; empty for other folders."""
     stage = folder.resolve().parent
     stage = stage.parent if stage.name == "units" else stage
     root = Root(stage.parent.parent)
@@ -108,10 +108,14 @@ def _remedy(folder: Path) -> str:
 
 
 def verify(root: Root, *, full: bool) -> Iterator[str]:
-    """Name every damage below a root: sizes only, or also checksums.
+    """Find damaged, missing and unexpected files below a root.
+
+    Args:
+        root: Of the experiment.
+        full: Whether to compare checksums too, not only sizes.
 
     Yields:
-        One line per damaged, missing or unexpected file, and per unit lost.
+        One line per file, and per missing unit.
     """
     for stage, folder in root.made():
         try:
@@ -146,7 +150,7 @@ def _damage(
 
 @cache
 def package_versions() -> Mapping[str, str]:
-    """Versions of Python and of the packages that may decide bytes."""
+    """Versions of Python and of the packages that may change the bytes."""
     versions = {"python": platform.python_version()}
     for name in PACKAGES:
         try:

@@ -1,7 +1,8 @@
-"""What is to be made, under which keys. Knows this before anything has been made.
+"""Plans: which stages to make, and under which keys, before anything is made.
 
-The key of a stage is the hash of all that decides its bytes: the stage and its version,
-its settings, the keys of the stages it reads, and the fingerprints of its source files.
+The key of a stage is the hash of everything that decides its bytes: the stage and its
+version, its settings, the keys of the stages it reads, and the fingerprints of its source
+files.
 """
 
 import hashlib
@@ -20,7 +21,7 @@ SOURCES = "sources"
 
 
 class PlanError(ValueError):
-    """A graph of stages that cannot be, or a stage that does not keep its word."""
+    """An impossible graph of stages, or a stage that breaks its contract."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,7 @@ class StageEntry:
 
 @runtime_checkable
 class Choice(Protocol):
-    """What was asked for: settings by section, and source files."""
+    """Requested settings by section, and source files."""
 
     def build(self, section: str, kind: Any) -> Any:
         """Return the settings of a section, of the class that a stage names for it.
@@ -63,13 +64,13 @@ class Choice(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PlannedStage:
-    """One stage with everything settled.
+    """A stage with its settings, inputs, sources and key.
 
     Attributes:
         stage: Its code.
-        module: Where that is, for workers.
-        settings: What its functions get.
-        values: The same as plain values, by section; those that decide what comes out.
+        module: Module of that code, for workers.
+        settings: Settings that its functions get.
+        values: Those that decide the result, as plain values by section.
         inputs: Keys of the stages it reads.
         sources: Source files it reads.
         key: Its own key.
@@ -113,7 +114,7 @@ class Plan:
         return self.stages[name]
 
     def after(self, names: Iterable[str]) -> set[str]:
-        """Return these stages and all that read them, directly or not."""
+        """Return these stages and all that depend on them, directly or not."""
         found = set(names)
         for name, planned in self.stages.items():
             if found & planned.inputs.keys():
@@ -127,7 +128,7 @@ def make_plan(
     chosen: Choice,
     targets: Sequence[str],
 ) -> Plan:
-    """Settle the settings and keys of the targets and of all they need.
+    """Compute the settings and keys of the targets and of all stages they need.
 
     Raises:
         ConfigError: for a setting that does not exist or cannot have its value, or for
@@ -144,7 +145,7 @@ def make_plan(
 
 
 def stages_in_order(entries: Mapping[str, StageEntry], targets: Sequence[str]) -> list[str]:
-    """List the targets and all they read, each after what it reads.
+    """List the targets and all stages they depend on, each after its dependencies.
 
     Raises:
         PlanError: for a stage that does not exist, or stages that need each other.
@@ -240,7 +241,7 @@ def digest(value: Any) -> str:
 
 
 def without_locations(value: Any) -> Any:
-    """Replace every absolute path and URL in a JSON-able value by nothing."""
+    """Replace every absolute path and URL in a JSON-able value by None."""
     if isinstance(value, Mapping):
         return {name: without_locations(part) for name, part in value.items()}
     if isinstance(value, list | tuple):

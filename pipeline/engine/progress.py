@@ -1,4 +1,4 @@
-"""How far a stage is, how fast it goes, and how long it will take."""
+"""Progress of a stage: units or steps done, rate, and time left."""
 
 import time
 from collections import deque
@@ -10,24 +10,24 @@ from pipeline.engine.events import Event
 
 MAX_VALUE_LENGTH = 36
 RECENT_S = 120.0
-"""Rates are those of about the last two minutes."""
+"""Rates are averages over about this time."""
 MIN_SAMPLE_S = 1.0
 MIN_PROGRESS = 0.05
-"""Less of a unit says nothing of the rate: beginning takes longer than going on."""
+"""Below this part of a unit no rate is given: starting takes longer than continuing."""
 
 
 @dataclass
 class ProgressMeter:
-    """Reads the events of one stage.
+    """Measures the progress of one stage from its events.
 
-    Units count one each; what units under way say of themselves counts as parts of them. A
-    stage that is all one unit (training) is told in that unit's own steps.
+    Every finished unit counts one, and the progress of running units counts as fractions.
+    A stage with a single unit (training) is measured in that unit's own steps.
 
     Attributes:
         stage: Its name.
-        units: Units of its work.
+        units: Number of its units.
         before: Units that were made before this run.
-        what: What the steps of an only unit are.
+        what: Name of the steps of a single unit.
     """
 
     stage: str
@@ -47,7 +47,7 @@ class ProgressMeter:
         self._samples.append((self.clock(), 0.0))
 
     def take(self, event: Event) -> None:
-        """Note a unit's end, or how far it is."""
+        """Handle an event."""
         if event["event"] in ("unit-done", "unit-failed"):
             self._done += 1
             self._unit_progress, self.note = (0.0, 1.0), ""
@@ -61,7 +61,7 @@ class ProgressMeter:
         self._add_sample()
 
     def _add_sample(self) -> None:
-        """Note how much is done by now, and forget what no longer counts for the rate."""
+        """Add a sample of the progress, and drop those too old for the rate."""
         now, marks = self.clock(), self._samples
         if len(marks) > 1 and now - marks[-1][0] < MIN_SAMPLE_S:
             marks[-1] = (marks[-1][0], self._made)
@@ -72,7 +72,7 @@ class ProgressMeter:
 
     @property
     def in_steps(self) -> bool:
-        """Whether the stage is told in the steps of its only unit."""
+        """Whether progress is measured in the steps of a single unit."""
         return self.units - self.before <= 1 and self._first_step is not None
 
     @property
@@ -95,24 +95,24 @@ class ProgressMeter:
 
     @property
     def _made(self) -> float:
-        """What of ``done`` this run did itself."""
+        """The part of ``done`` that this run did."""
         return self.done - (self._first_step or 0.0 if self.in_steps else self.before)
 
     @property
     def per_s(self) -> float | None:
-        """Units, or steps, per second of late; None as long as next to nothing is done."""
+        """Units, or steps, per second, lately; None until enough is done."""
         since, before = self._samples[0]
         taken, made = self.clock() - since, self._made - before
         return made / taken if made >= MIN_PROGRESS and taken > 0 else None
 
     @property
     def remaining_s(self) -> float | None:
-        """Seconds to go at this rate."""
+        """Seconds left at this rate."""
         rate = self.per_s
         return max(0.0, self.total - self.done) / rate if rate else None
 
     def words(self) -> str:
-        """Say it in one line: ``12 of 27 units, 0.8/s, 0:19 left, note``."""
+        """Format in one line: ``12 of 27 units, 0.8/s, 0:19 left, note``."""
         if self.finishing:
             return self.remark
         what = self.what if self.in_steps else "units"
@@ -123,7 +123,7 @@ class ProgressMeter:
 
     @property
     def remark(self) -> str:
-        """What there is to say besides numbers."""
+        """Notes besides the numbers."""
         gathering = [f"gathering {self._fraction:.0%}"] if self.finishing else []
         return ", ".join([*gathering, *self._notes])
 
@@ -133,24 +133,24 @@ class ProgressMeter:
 
 
 def amount(count: float | int) -> str:
-    """Write how many: ``1.5``, ``12``, ``20000``."""
+    """Format a count: ``1.5``, ``12``, ``20000``."""
     return f"{count:.4g}" if count < 1000 else f"{count:.0f}"
 
 
 def rate(per_s: float) -> str:
-    """Write a rate as ``0.8/s``, or the slow ones as ``40 s each``."""
+    """Format a rate as ``0.8/s``, or a slow one as ``40 s each``."""
     return f"{per_s:.3g}/s" if per_s >= 0.1 else f"{1 / per_s:.3g} s each"
 
 
 def clock_time(seconds: float) -> str:
-    """Write a duration as ``0:07``, ``12:30`` or ``1:02:03``."""
+    """Format a duration as ``0:07``, ``12:30`` or ``1:02:03``."""
     minutes, second = divmod(round(seconds), 60)
     hour, minute = divmod(minutes, 60)
     return f"{hour}:{minute:02}:{second:02}" if hour else f"{minute}:{second:02}"
 
 
 def figures(report: dict[str, Any], most: int = 6) -> str:
-    """Write the plain figures of a report in one line."""
+    """Format the scalar figures of a report in one line."""
     plain = {
         name: value
         for name, value in report.items()

@@ -1,4 +1,4 @@
-"""Which module holds which stage. Imported one by one, as a plan needs them."""
+"""The module of each stage. Modules are imported one by one, as a plan needs them."""
 
 from importlib import import_module
 
@@ -15,7 +15,7 @@ MODULES = {
     "score": "pipeline.stages.score",
     "report": "pipeline.stages.report.stage",
 }
-"""In the order in which data takes its way."""
+"""In the order of the data."""
 
 
 def load_stage(module: str) -> Stage:

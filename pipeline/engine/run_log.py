@@ -1,4 +1,4 @@
-"""A run as its log tells of it, read while the run goes on writing."""
+"""The state of a run, read from its log while the run goes on."""
 
 import json
 from collections.abc import Iterator
@@ -11,9 +11,9 @@ from pipeline.engine.progress import ProgressMeter
 
 
 class LogTail:
-    """Reads what is new in a log since it was read last.
+    """Reads the lines of a log that are new since the last read.
 
-    A line that is not whole yet is left for the next time; one that is damaged is skipped.
+    An incomplete last line is left for the next read; a damaged line is skipped.
     """
 
     def __init__(self, path: Path) -> None:
@@ -21,7 +21,7 @@ class LogTail:
         self._offset = 0
 
     def read(self) -> Iterator[dict[str, Any]]:
-        """Yield the new events; none if the log is gone."""
+        """Yield the new events; none if the log does not exist."""
         try:
             with self.path.open("rb") as file:
                 file.seek(self._offset)
@@ -40,13 +40,13 @@ class LogTail:
 
 
 class RunLog:
-    """Follows one run: which stage it is at, how far, how fast, what failed.
+    """Follows one run: its current stage, progress, rate and failures.
 
     Attributes:
-        workers: Who does the units, as ``--dask`` said.
-        stage: The stage it is making; empty in between.
-        meter: How far that is.
-        failed: Units of it that failed in this run.
+        workers: Value of ``--dask``.
+        stage: The stage that is being made; empty between stages.
+        meter: Progress of that stage.
+        failed: Units of that stage that failed in this run.
     """
 
     def __init__(self, path: Path) -> None:
@@ -58,11 +58,11 @@ class RunLog:
         self.failed = 0
 
     def follow(self, now_s: float) -> None:
-        """Take in what is new; rates then count up to now (seconds of the epoch)."""
+        """Read new events; rates are then as of ``now_s`` (seconds of the epoch)."""
         for event in self._tail.read():
             self._now_s = _time_s(event, self._now_s)
             self._take(event)
-        # Clocks of two machines may differ; time does not run backwards here.
+        # Clocks of two machines may differ; time must not run backwards.
         self._now_s = max(now_s, self._now_s)
 
     def _take(self, event: Event) -> None:

@@ -1,8 +1,8 @@
-"""Making stages: what is whole stays, what is missing is made, and a kill loses little.
+"""Making stages: finished units and stages are kept, missing ones are made.
 
-The order on disk is what makes a kill harmless: a unit's files are synced, then its folder
-gets its name; only when all units have theirs does the stage's folder get one. Whatever
-else lies about is cleared, or gone on with, by the next run.
+A kill at any time loses the units in flight at most. A unit's files are synced before its
+folder gets its final name, and the stage's folder gets its name after all its units. The
+next run removes other folders or continues from them.
 """
 
 import time
@@ -41,19 +41,19 @@ from pipeline.engine.units import (
 )
 
 FINISH = "finish"
-"""Stands for a stage's own last step among its failed units."""
+"""Name of a stage's ``finish`` among its failed units."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """How to run; none of it decides bytes.
+    """How to run. No option changes the bytes of results.
 
     Attributes:
-        force: Stages to make again even if they are whole.
-        keep_going: After a failed unit go on with the others, and with stages that do not
-            need it.
-        wait: Queue behind a run that holds a lock.
-        strict_code: Make again what other code made.
+        force: Stages to make again even if they are finished.
+        keep_going: After a failed unit, do the other units, and the stages that do not
+            depend on it.
+        wait: Wait for a run that holds a lock.
+        strict_code: Make again what was made by different code.
         workers: Where the units are done (``--dask``).
     """
 
@@ -66,14 +66,14 @@ class RunOptions:
 
 @dataclass(frozen=True, slots=True)
 class StageResult:
-    """What became of one stage.
+    """Result of one stage.
 
     Attributes:
         stage: Its name.
-        state: ``skipped`` where a stage it needs failed.
+        state: ``skipped`` where a stage it depends on failed.
         key: Its key.
-        units: Units of its work.
-        made: Units that this run made.
+        units: Number of its units.
+        made: Number of units that this run made.
         seconds: Time it took.
         report: Its figures.
         errors: One line per failed unit, by name.
@@ -90,18 +90,18 @@ class StageResult:
 
     @property
     def words(self) -> str:
-        """Its key figures in one line."""
+        """Its main figures in one line."""
         return figures(self.report)
 
 
 def run(plan: Plan, run_options: RunOptions, events: Events) -> list[StageResult]:
-    """Make every planned stage that is not whole, each after those it reads.
+    """Make every planned stage that is not finished, each after those it reads.
 
     Raises:
         LockedError: if another run is making one of them.
         PlanError: if a stage breaks its contract.
         StoreError: if what a stage should read is damaged.
-        WorkersLostError: if the workers are gone, with what they had under way.
+        WorkersLostError: if the workers are gone, and the units in flight with them.
     """
     events.emit("run-started", stages=list(plan.stages), workers=run_options.workers.words)
     try:
@@ -140,7 +140,7 @@ def _made_with_other_code(plan: Plan, run_options: RunOptions) -> frozenset[str]
 
 @dataclass(frozen=True, slots=True)
 class _StageRun:
-    """One stage on its way."""
+    """Making one stage."""
 
     plan: Plan
     planned: PlannedStage
@@ -161,7 +161,7 @@ class _StageRun:
         return self.root.folder(self.name, self.planned.key)
 
     def find_or_make(self, workers: OpenWorkers) -> StageResult:
-        """Find the stage whole, or make it, alone."""
+        """Return the finished stage, or make it while holding its lock."""
         begun = time.monotonic()
         if self._is_whole():
             return self._cached()
@@ -203,7 +203,7 @@ class _StageRun:
         errors = {outcome.name: outcome.error for outcome in outcomes if outcome.error}
         report: Report = {}
         if not errors:
-            self._remove_leftovers()  # Of workers that died, too: others did their units.
+            self._remove_leftovers()  # Also after workers that died: others did their units.
             report, errors = self._finish(inputs, tasks)
         self._write_attempt(tasks, errors)
         made = sum(outcome.report is not None for outcome in outcomes)
@@ -256,12 +256,12 @@ class _StageRun:
     def _finish(
         self, inputs: FinishedInputs, tasks: Sequence[Task]
     ) -> tuple[Report, dict[str, str]]:
-        """Gather the units into the stage's folder; a failure becomes an error line."""
+        """Write the stage's folder from its units; return the report or the error."""
         begun = time.monotonic()
         self.events.emit("finish-started", stage=self.name)
         try:
             return self._write_stage(inputs, tasks), {}
-        except Exception as error:  # Recorded as a failed unit would be; others go on.
+        except Exception as error:  # Recorded like a failed unit; other stages go on.
             trace, seconds = traceback.format_exc(), time.monotonic() - begun
             outcome = failure(FINISH, error, trace, seconds)
             self._emit_outcome(outcome)
@@ -286,23 +286,23 @@ class _StageRun:
     def _progress(self) -> Progress:
         def tell(done: float | int, total: float | int, note: str = "") -> None:
             self.events.emit("progress", stage=self.name, done=done, total=total, note=note)
-            signals.check()
+            signals.raise_if_stopped()
 
         return tell
 
     def _write_attempt(self, tasks: Sequence[Task], failed: dict[str, str]) -> None:
-        """Say on disk what is under way, for ``status`` and ``gc``."""
+        """Record the units of this attempt for ``status`` and ``gc``."""
         units = {task.unit.name: task.about["key"] for task in tasks}
         about = {"key": self.planned.key, "units": units, "failed": failed}
         write_json(self.root.attempt(self.name), about)
 
     def _remove_outputs(self, tasks: Sequence[Task]) -> None:
-        """Remove what is to be made again, the stage before its units."""
+        """Remove what is to be made again: the stage, then its units."""
         for folder in (self.folder, *[task.target for task in tasks]):
             remove_folder(folder)
 
     def _remove_leftovers(self) -> None:
-        """Remove what killed runs left behind, but what this stage can go on from."""
+        """Remove what killed runs left, except what this stage can resume from."""
         stage = self.root.stage(self.name)
         for path in [*stage.glob("*"), *stage.glob("units/*")]:
             if path.name.endswith(PARTIAL):
@@ -314,13 +314,13 @@ class _StageRun:
 
 
 def _is_half_removed(path: Path) -> bool:
-    """Tell whether this is a folder that is in the way of what its name stands for."""
+    """Whether this is a stage's or unit's folder without a manifest."""
     has_key = len(path.name) == KEY_DIGITS and path.is_dir()
     return has_key and not (path / MANIFEST).is_file()
 
 
 def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
-        remove_folder(path)  # A worker of a run that is gone may still write there.
+        remove_folder(path)  # A worker of an earlier run may still write there.
     else:
         path.unlink(missing_ok=True)

@@ -1,9 +1,10 @@
 """Stopping on SIGTERM and SIGINT without leaving anything half done.
 
-The first signal raises ``Stopped`` at once, except inside ``whole()`` (a write that must
-be finished; it is raised at its end) and inside ``deferred()`` (work that saves its state;
-it is raised by the next ``check()``). A second signal raises at once inside ``deferred()``
-too.
+The first signal raises ``Stopped`` at once, except
+
+- inside ``uninterrupted()`` (a write that must be finished), where it is raised at the end;
+- inside ``deferred()`` (work that saves its state), where the next ``raise_if_stopped()``
+  raises it. A second signal raises at once there.
 """
 
 import signal
@@ -16,7 +17,7 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class Stopped(BaseException):
-    """The process was asked to stop. Not an ``Exception``: nothing shall swallow it.
+    """The process was asked to stop. No ``Exception``, so that no handler swallows it.
 
     Attributes:
         signal: Number of the signal; the exit code is 128 more.
@@ -29,10 +30,10 @@ class Stopped(BaseException):
 
 @dataclass
 class _State:
-    """Signals belong to the process, and so does this."""
+    """State of the process: signals arrive once for all of it."""
 
     pending: int = 0
-    whole: int = 0
+    uninterrupted: int = 0
     deferred: int = 0
 
 
@@ -41,58 +42,58 @@ _STATE = _State()
 
 @contextmanager
 def handling_signals() -> Iterator[None]:
-    """Turn SIGTERM and SIGINT into ``Stopped`` for the length of the block."""
-    before = {number: signal.signal(number, _note) for number in SIGNALS}
+    """Turn SIGTERM and SIGINT into ``Stopped`` during the block."""
+    before = {number: signal.signal(number, _on_signal) for number in SIGNALS}
     _STATE.pending = 0
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        if not (_STATE.whole or _STATE.deferred):
-            _STATE.pending = 0  # Who comes after is not asked to stop.
+        if not (_STATE.uninterrupted or _STATE.deferred):
+            _STATE.pending = 0  # The signal was not for later blocks.
 
 
 @contextmanager
-def whole() -> Iterator[None]:
-    """Put a signal off until the block is done."""
-    _STATE.whole += 1
+def uninterrupted() -> Iterator[None]:
+    """Delay signals until the end of the block."""
+    _STATE.uninterrupted += 1
     try:
         yield
     finally:
-        _STATE.whole -= 1
-    if _STATE.pending and not _STATE.whole and not _STATE.deferred:
+        _STATE.uninterrupted -= 1
+    if _STATE.pending and not _STATE.uninterrupted and not _STATE.deferred:
         raise Stopped(_STATE.pending)
 
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Leave it to the block to call ``check`` where it can stop well."""
+    """Delay a signal until the block calls ``raise_if_stopped``."""
     _STATE.deferred += 1
     try:
         yield
     finally:
         _STATE.deferred -= 1
-    check()
+    raise_if_stopped()
 
 
-def asked() -> int:
-    """Return the number of the signal that has come; 0 if none has."""
+def pending_signal() -> int:
+    """Return the number of the signal that has arrived; 0 if none has."""
     return _STATE.pending
 
 
-def check() -> None:
-    """Stop here if a signal has come.
+def raise_if_stopped() -> None:
+    """Raise ``Stopped`` if a signal has arrived.
 
     Raises:
         Stopped: if so.
     """
-    if _STATE.pending and not _STATE.whole:
+    if _STATE.pending and not _STATE.uninterrupted:
         raise Stopped(_STATE.pending)
 
 
-def _note(number: int, frame: FrameType | None) -> None:
-    again = bool(_STATE.pending)
+def _on_signal(number: int, frame: FrameType | None) -> None:
+    second = bool(_STATE.pending)
     _STATE.pending = number
-    if not _STATE.whole and (again or not _STATE.deferred):
+    if not _STATE.uninterrupted and (second or not _STATE.deferred):
         raise Stopped(number)

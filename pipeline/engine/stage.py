@@ -1,12 +1,12 @@
-"""What a stage is: how it cuts its work into units, does one, and gathers them.
+"""What a stage is: how it splits its work into units, does one, and collects them.
 
 The engine knows stages only through this file. A stage module, such as
 ``pipeline/stages/ingest.py``, ends in one ``STAGE = Stage(...)``;
 ``pipeline.engine.registry`` lists them.
 
-``infgen status`` and dry runs import every stage module, so a stage module imports torch,
-zarr, dask and polars inside its functions only, and ``plan`` uses none of them: it cuts by
-what the reports of its inputs say.
+``infgen status`` and dry runs import every stage module. A stage module therefore imports
+torch, zarr, dask and polars inside its functions only, and ``plan`` uses none of them: it
+splits the work by the reports of its inputs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 Report = dict[str, Any]
-"""Few, JSON-able figures of one unit or of a whole stage, the same each time it is made.
+"""A few JSON-able figures of a unit or a stage, the same each time it is made.
 
-Figures that vary from run to run (seconds, memory) go below the one key ``"run"``; they are
-kept apart from the artefact, which is byte-identical between runs. What ``finish`` finds
-out about single units goes below the key ``"units"``, by name: stages that read these units
-find it in their reports.
+Figures that vary from run to run (seconds, memory) go under the key ``"run"``. They are
+stored outside the artefact, which is byte-identical between runs. Figures that ``finish``
+computes for single units go under the key ``"units"``, by name; stages that read these
+units find them in the units' reports.
 """
 
 
@@ -41,16 +41,16 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A piece of a stage's work, done whole or not at all.
+    """A unit of a stage's work, finished or not there.
 
     Attributes:
-        name: Unique in its stage, and fit to be part of a file name.
-        inputs: Identities of what it reads, as ``{what: key or fingerprint}``.
-        task: What ``work`` needs besides its settings: small and JSON-able.
+        name: Unique in its stage; may be part of a file name.
+        inputs: Identities of what it reads, as ``{name: key or fingerprint}``.
+        task: Arguments of ``work`` besides its settings: small and JSON-able.
 
-    Name, inputs, task, and the stage's settings and version make the unit's key. Absolute
-    paths and URLs in the task are left out of it (the identities in ``inputs`` stand for
-    them), so that a root can be moved.
+    The unit's key is the hash of its name, inputs and task and of the stage's settings and
+    version. Absolute paths and URLs in the task are left out (``inputs`` identifies what
+    they hold), so that a root can be moved.
     """
 
     name: str
@@ -70,7 +70,7 @@ class FinishedUnit:
 
 @runtime_checkable
 class Inputs(Protocol):
-    """What a stage may ask of the stages before it."""
+    """What a stage reads of the stages before it."""
 
     @property
     def sources(self) -> Sequence[Source]:
@@ -86,21 +86,21 @@ class Inputs(Protocol):
         """Key of an input stage."""
 
     def content(self, stage: str, *names: str) -> str:
-        """Identity of what some files or folders in an input stage's folder hold.
+        """Fingerprint of some files or folders in an input stage's folder.
 
-        Unlike its key it stays the same when the stage was made anew with equal results, so
-        units that name it in their ``inputs`` are not made again for nothing.
+        Unlike the stage's key it stays the same when the stage is made again with equal
+        results. Units that name it in their ``inputs`` are then not made again.
         """
 
 
 @runtime_checkable
 class Progress(Protocol):
-    """Where long work inside one unit or ``finish`` says how far it is."""
+    """Called by long work inside one unit or ``finish`` to report progress."""
 
     def __call__(self, done: float, total: float, note: str = "") -> None:
-        """Report so much of so much done, e.g. 300 of 1000 steps.
+        """Report that ``done`` of ``total`` is done, e.g. 300 of 1000 steps.
 
-        In a stage that ``resumes`` this is also where SIGTERM arrives, as
+        In a stage that ``resumes``, SIGTERM also arrives here, as
         ``pipeline.engine.signals.Stopped``: save what is needed to go on, and raise it
         again.
         """
@@ -114,20 +114,20 @@ class Stage:
         name: As in ``stages.yaml`` and on the command line.
         version: Raised by hand when the code would write different bytes.
         settings: Settings dataclasses the stage reads, by section of ``stages.yaml``.
-            A stage with one section gets that dataclass as ``settings``; with several, a
-            dictionary of them by section.
-        plan: Cuts the work into units, from finished inputs. No disk writes.
-        work: Does one unit: writes everything below ``target``, which the engine publishes
-            whole; runs on any worker, several times if it must, and writes the same bytes
-            each time. Errors in the data are reported, not raised.
-        finish: Gathers the units into the stage's own folder ``target`` (index, tables).
-        reads: Finds what the stage's settings name that no other stage of the plan makes,
-            in the root folder of the experiment or elsewhere; it then counts as a source.
-        normalize: Sets what decides nothing here to its default, section by section, before
-            there is a key: what other settings make idle, or what is another stage's.
-        modules: Modules whose code decides the bytes, but what they import of the library;
-            the hash of all is recorded.
-        resumes: ``work`` finds what a killed try left below ``target`` and goes on from it.
+            With one section ``settings`` is that dataclass; with several, a dictionary of
+            them by section.
+        plan: Splits the work into units, from finished inputs. Writes nothing to disk.
+        work: Does one unit: writes everything below ``target``, which the engine then
+            publishes as a whole. Runs on any worker, possibly several times, and writes
+            the same bytes each time. Errors in the data are reported, not raised.
+        finish: Collects the units in the stage's own folder ``target`` (index, tables).
+        reads: Finds files that the stage's settings name and no other stage of the plan
+            makes, in the root folder of the experiment or elsewhere. They count as sources.
+        normalize: Sets settings without effect on this stage to their defaults before the key
+            is computed: those that other settings switch off, or that concern other stages.
+        modules: Modules whose code decides the bytes. With what they import of ``infgen``
+            they are hashed, and the hash is recorded.
+        resumes: ``work`` continues from what a killed attempt left below ``target``.
         in_driver: Units run in the driver's process, whatever the workers (training).
     """
 

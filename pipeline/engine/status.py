@@ -1,4 +1,4 @@
-"""How the stages on disk stand to what is asked for, and why."""
+"""State of every stage on disk compared with a plan, with reasons."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,17 +19,17 @@ MAX_NAMES = 3
 
 @dataclass(frozen=True, slots=True)
 class StageStatus:
-    """How one stage stands.
+    """State of one stage.
 
     Attributes:
         stage: Its name.
-        state: ``cached``: made as asked. ``stale``: made, but otherwise than asked.
-            ``missing``: never made. ``running``: being made now. ``failed``: the last try
-            to make it as asked failed.
-        why: Reasons, in words.
+        state: ``cached``: made under this key. ``stale``: made under another key only.
+            ``missing``: never made. ``running``: being made now. ``failed``: the last
+            attempt under this key failed.
+        why: The reasons.
         key: Its key.
-        units: Units of its work, where that can be told.
-        made: How many of them are made.
+        units: Number of its units, if known.
+        made: Number of finished units, if known.
     """
 
     stage: str
@@ -41,19 +41,19 @@ class StageStatus:
 
     @property
     def progress(self) -> str:
-        """Units made of all, as ``12/27``."""
+        """Finished and all units, as ``12/27``."""
         return "" if self.units is None else f"{self.made}/{self.units}"
 
 
 def stage_statuses(
     plan: Plan, made: Mapping[str, str], *, strict_code: bool = False
 ) -> list[StageStatus]:
-    """Tell how every planned stage stands.
+    """Return the state of every planned stage.
 
     Args:
-        plan: What is asked for.
-        made: Keys of the stages made last; what is stale is compared with these.
-        strict_code: Whether other code makes a stage stale.
+        plan: The plan.
+        made: Keys of the stages made last, with which stale stages are compared.
+        strict_code: Whether changed code makes a stage stale.
     """
     return [_stage_status(plan, name, made, strict_code) for name in plan.stages]
 
@@ -69,7 +69,7 @@ def _stage_status(
         return StageStatus(name, "cached", why, planned.key, units, units)
     try:
         total, done = count_units(plan, planned)
-    except PlanError as error:  # It cannot be cut as asked: the user must know, not stop.
+    except PlanError as error:  # Shown as the reason; the other stages are listed too.
         return StageStatus(name, "missing", str(error), planned.key, None, None)
     reasons = (
         [OTHER_CODE]
@@ -91,7 +91,7 @@ def _stage_status(
 
 
 def code_differs(plan: Plan, name: str) -> bool:
-    """Whether a stage was made as asked, but by code that has changed since."""
+    """Whether a stage is made, but its code has changed since."""
     folder = plan.root.folder(name, plan[name].key)
     if not (folder / MANIFEST).is_file():
         return False
@@ -99,7 +99,7 @@ def code_differs(plan: Plan, name: str) -> bool:
 
 
 def last_attempt(plan: Plan, name: str) -> Mapping[str, Any]:
-    """Return the record of the last try to make a stage as asked, if it did not end."""
+    """Return the record of an unfinished attempt under the planned key."""
     try:
         attempt = read_json(plan.root.attempt(name))
     except StoreError:
@@ -108,7 +108,7 @@ def last_attempt(plan: Plan, name: str) -> Mapping[str, Any]:
 
 
 def count_units(plan: Plan, planned: PlannedStage) -> tuple[int | None, int | None]:
-    """Count units, and those made; None where inputs must be made before this is known."""
+    """Count all and finished units; None while the inputs are not made."""
     if not inputs_finished(plan, planned):
         return None, None
     units = planned.stage.plan(FinishedInputs(plan.root, planned), planned.settings)
@@ -125,7 +125,7 @@ def _failures(failed: Mapping[str, str]) -> list[str]:
 def _last_manifest(
     plan: Plan, name: str, made: Mapping[str, str]
 ) -> Mapping[str, Any] | None:
-    """Manifest of the stage as it was made last: under this profile, or else at all."""
+    """Manifest of the stage as made last under this profile, or else at all."""
     root = plan.root
     if name in made and root.is_finished(name, made[name]):
         return read_manifest(root.folder(name, made[name]))
@@ -134,7 +134,7 @@ def _last_manifest(
 
 
 def stale_reasons(plan: Plan, name: str, old: Mapping[str, Any] | None) -> list[str]:
-    """Tell why a stage's key is not that of an old manifest; nothing if there is none."""
+    """List why a stage's key differs from that of an old manifest; empty without one."""
     if old is None:
         return []
     planned = plan[name]

@@ -1,4 +1,4 @@
-"""From units of a stage to tasks for workers, and what the manifests say of both."""
+"""Tasks for workers from units of a stage, and the manifests of units and stages."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -13,14 +13,16 @@ from pipeline.engine.units import Task
 
 
 def make_tasks(root: Root, planned: PlannedStage, units: Sequence[Unit]) -> list[Task]:
-    """Name the folder of every unit, and write down how it comes about.
+    """Give every unit its folder and its manifest without the report.
 
     Raises:
         PlanError: if two units have one name, or a name is no file name.
     """
     for name, count in Counter(unit.name for unit in units).items():
         if count > 1 or "/" in name or not name:
-            raise PlanError(f"stage {planned.name!r} cuts a bad or double unit {name!r}")
+            raise PlanError(
+                f"stage {planned.name!r} has a unit with a bad or repeated name {name!r}"
+            )
     common = _common(planned)
     return [_task(root, planned, unit, common) for unit in units]
 
@@ -40,7 +42,7 @@ def _task(root: Root, planned: PlannedStage, unit: Unit, common: dict[str, Any])
 
 
 def stage_manifest(planned: PlannedStage, tasks: Sequence[Task]) -> dict[str, Any]:
-    """Say how a stage comes about, once all its units are made: by name, with reports."""
+    """Build the manifest of a stage whose units are all made, without its own report."""
     ordered = sorted(tasks, key=lambda task: task.unit.name)
     return {
         "schema": STAGE_SCHEMA,
@@ -53,7 +55,7 @@ def stage_manifest(planned: PlannedStage, tasks: Sequence[Task]) -> dict[str, An
 
 
 def _common(planned: PlannedStage) -> dict[str, Any]:
-    """What the manifests of a stage and of its units have in common."""
+    """Entries that the manifests of a stage and of its units share."""
     stage = planned.stage
     return {
         "stage": stage.name,

@@ -1,4 +1,4 @@
-"""One unit of work, done whole: the same code in the driver's process and on any worker."""
+"""Doing one unit of work: the same code in the driver's process and on any worker."""
 
 import time
 import traceback
@@ -25,14 +25,14 @@ class WorkersLostError(OSError):
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A unit on its way to a worker: paths and small plain values only.
+    """A unit as it is sent to a worker: paths and small plain values only.
 
     Attributes:
-        module: Where the stage's code is.
-        unit: What to do.
+        module: Module of the stage's code.
+        unit: The unit.
         target: Folder to make.
         settings: The stage's settings.
-        about: What the manifest says besides the report.
+        about: The manifest without the report.
     """
 
     module: str
@@ -44,14 +44,14 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a unit.
+    """Result of a unit.
 
     Attributes:
-        name: Of the unit.
+        name: Name of the unit.
         report: Its figures; None if it failed.
         seconds: Time it took.
-        error: One line on why it failed.
-        trace: Where it failed.
+        error: Why it failed, in one line.
+        trace: Traceback of the failure.
     """
 
     name: str
@@ -62,12 +62,12 @@ class Outcome:
 
 
 Tell = Callable[..., None]
-"""``tell(event, **figures)``: of what happens to workers."""
+"""``tell(event, **figures)`` emits an event about workers."""
 
 
 @runtime_checkable
 class Executor(Protocol):
-    """Does tasks, and yields what became of each as it is known."""
+    """Does tasks and yields the outcome of each."""
 
     def run(
         self,
@@ -80,7 +80,7 @@ class Executor(Protocol):
 
 
 class InProcess:
-    """Does one task after the other, here."""
+    """Does one task after the other in this process."""
 
     def run(
         self,
@@ -98,15 +98,15 @@ class InProcess:
 
 @runtime_checkable
 class OpenWorkers(Protocol):
-    """Workers that are there while a run goes on."""
+    """Workers of a run that has begun."""
 
     def executor(self, *, here: bool) -> Executor:
-        """Return who does the units of a stage; ``here`` if it must be this process."""
+        """Return the executor of a stage's units; with ``here``, one in this process."""
 
 
 @runtime_checkable
 class Workers(Protocol):
-    """Where the units of a run are done (``--dask``).
+    """Which workers do the units of a run (``--dask``).
 
     Attributes:
         words: As on the command line.
@@ -117,48 +117,48 @@ class Workers(Protocol):
         """As on the command line."""
 
     def open(self) -> AbstractContextManager[OpenWorkers]:
-        """Have the workers for as long as the context lasts."""
+        """Start the workers; the context stops them."""
 
 
 class DriverWorkers:
-    """This process does every unit (``--dask none``)."""
+    """Does every unit in this process (``--dask none``)."""
 
     words = "none"
 
     def open(self) -> AbstractContextManager["DriverWorkers"]:
-        """Return what there is already."""
+        """Return itself: there is nothing to start."""
         return nullcontext(self)
 
     def executor(self, *, here: bool) -> Executor:
-        """Do units here, whatever the stage."""
+        """Return an executor in this process, whatever the stage."""
         return InProcess()
 
 
 def attempt(task: Task, progress: Progress) -> Outcome:
-    """Do a task; a failure becomes an outcome."""
+    """Do a task; turn an exception into a failed outcome."""
     begun = time.monotonic()
     try:
         return do(task, progress)
-    except Exception as error:  # Whatever a unit dies of, the others shall go on.
+    except Exception as error:  # Other units go on, whatever the error.
         seconds = time.monotonic() - begun
         return failure(task.unit.name, error, traceback.format_exc(), seconds)
 
 
 def failure(name: str, error: BaseException, trace: str, seconds: float) -> Outcome:
-    """Say in one line, and in full, why a unit failed."""
+    """Build the outcome of a failed unit: the error in one line, and its traceback."""
     line = f"{type(error).__name__}: {error}".splitlines()[0]
     return Outcome(name, None, seconds, line, trace)
 
 
 def do(task: Task, progress: Progress) -> Outcome:
-    """Do a task and publish its folder, manifest last. Safe to repeat after any crash."""
+    """Do a task and publish its folder, manifest last. May be repeated after any crash."""
     if (task.target / MANIFEST).is_file():
         return Outcome(task.unit.name, read_manifest(task.target)["report"], 0.0)
     stage = load_stage(task.module)
     started, begun = datetime.now(UTC).isoformat(timespec="seconds"), time.monotonic()
-    patience = signals.deferred() if stage.resumes else nullcontext()
-    # A stop that finds the work done waits until it has its name: it would be lost.
-    with patience, publish(task.target, resume=stage.resumes) as partial:
+    stops = signals.deferred() if stage.resumes else nullcontext()
+    # A signal after the work is done waits until the folder is published.
+    with stops, publish(task.target, resume=stage.resumes) as partial:
         report = stage.work(task.unit, partial, task.settings, progress)
         same, varying = split_report(report)
         seconds = time.monotonic() - begun

@@ -192,7 +192,7 @@ def _made(parts: list[Part], jobs: int) -> Iterator[Path]:
     if jobs == 1 or len(parts) < 2:
         for part in parts:
             yield write_part(part)
-            signals.check()
+            signals.raise_if_stopped()
         return
     # Each process starts anew: nothing of this one's state can decide what it makes.
     context = multiprocessing.get_context("spawn")

@@ -122,8 +122,8 @@ def _go_down(
     try:
         with closing(train_batches(recipe, steps, course.train.loader_workers)) as batches:
             for step, parts in zip(steps, batches, strict=True):
-                if team.any(stop is not None or signals.asked() > 0):
-                    stop = stop or Stopped(signals.asked() or SIGTERM)
+                if team.any(stop is not None or signals.pending_signal() > 0):
+                    stop = stop or Stopped(signals.pending_signal() or SIGTERM)
                     break
                 stepped = _step(descent, recipe, parts, step)
                 try:

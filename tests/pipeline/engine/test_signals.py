@@ -15,7 +15,7 @@ def send(number=signal.SIGTERM):
 def handling_signals():
     with signals.handling_signals():
         yield
-    assert signals._STATE.whole == signals._STATE.deferred == 0
+    assert signals._STATE.uninterrupted == signals._STATE.deferred == 0
 
 
 @pytest.mark.parametrize("number", signals.SIGNALS)
@@ -30,7 +30,7 @@ def test_a_write_is_finished_first():
     done = []
 
     def write():
-        with signals.whole():
+        with signals.uninterrupted():
             send()
             done.append("written")
         done.append("never")
@@ -44,8 +44,8 @@ def test_an_inner_write_does_not_end_the_outer_one():
     done = []
 
     def write():
-        with signals.whole():
-            with signals.whole():
+        with signals.uninterrupted():
+            with signals.uninterrupted():
                 send()
             done.append("outer")
 
@@ -61,7 +61,7 @@ def test_patient_work_stops_where_it_checks():
         with signals.deferred():
             send()
             done.append("went on")
-            signals.check()
+            signals.raise_if_stopped()
             done.append("never")
 
     with pytest.raises(Stopped):
@@ -98,10 +98,10 @@ def test_a_write_within_patient_work_leaves_the_stop_to_the_check():
 
     def work():
         with signals.deferred():
-            with signals.whole():
+            with signals.uninterrupted():
                 send()
             done.append("went on")
-            signals.check()
+            signals.raise_if_stopped()
 
     with pytest.raises(Stopped):
         work()
@@ -120,10 +120,10 @@ def test_a_stop_that_was_heard_is_over_with_the_block():
     with pytest.raises(Stopped), signals.handling_signals():
         send()
 
-    with signals.whole():
-        assert not signals.asked()
+    with signals.uninterrupted():
+        assert not signals.pending_signal()
 
 
 def test_without_a_signal_nothing_stops():
-    with signals.deferred(), signals.whole():
-        signals.check()
+    with signals.deferred(), signals.uninterrupted():
+        signals.raise_if_stopped()

@@ -38,7 +38,7 @@ settings = {k: build(STAGE.settings[k], v, k) for k, v in settings.items()}
 
 def tell(done, total, note=""):
     print(done, flush=True)
-    signals.check()
+    signals.raise_if_stopped()
 
 
 with joined(os.environ) as first, signals.handling_signals():
