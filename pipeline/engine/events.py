@@ -13,13 +13,14 @@ from pipeline.engine.layout import Root
 Event = Mapping[str, Any]
 """``event`` is its name; the other entries are its figures.
 
-``run-started``, ``stage-cached``, ``stage-started`` (units, made), ``unit-done``,
-``unit-failed`` (error, trace), ``finish-started``, ``progress`` (done, total, note; logged
-only after some seconds without another event), ``worker-full`` (worker, memory_gib:
-restarted as it exceeds its memory), ``worker-lost`` (worker, units that start again), ``workers-missing``
-(timeout_min), ``stage-done`` (report), ``stage-failed``, ``stage-skipped``, ``run-ended``
-or ``run-stopped`` (why). Around the runs of a preset: ``leg-started`` (leg, number, legs),
-``leg-failed`` (leg, why).
+- ``run-started``, ``run-ended``, ``run-stopped`` (why)
+- ``stage-cached``, ``stage-started`` (units, made), ``stage-done`` (report),
+  ``stage-failed``, ``stage-skipped``
+- ``unit-done``, ``unit-failed`` (error, trace), ``finish-started``
+- ``progress`` (done, total, note): logged only after some seconds without another event
+- ``worker-full`` (worker, memory_gib): restarted, as it exceeds its memory;
+  ``worker-lost`` (worker, units that start again); ``workers-missing`` (timeout_min)
+- around the runs of a preset: ``leg-started`` (leg, number, legs), ``leg-failed`` (leg, why)
 """
 
 QUIET_S = 5.0
@@ -35,7 +36,7 @@ class Listener(Protocol):
 
 
 class Events:
-    """Passes every event to the listeners and appends it to a JSON-lines file in ``logs/``."""
+    """Passes every event to the listeners and appends it to a log in ``logs/``."""
 
     def __init__(self, root: Root, listeners: tuple[Listener, ...] = ()) -> None:
         self.log = root.logs / f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{os.getpid()}.jsonl"

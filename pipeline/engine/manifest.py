@@ -98,7 +98,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _remedy(folder: Path) -> str:
-    """Name the command that makes a damaged stage or unit again; empty for other folders."""
+    """Name the command that makes a damaged stage or unit again, if there is one."""
     stage = folder.resolve().parent
     stage = stage.parent if stage.name == "units" else stage
     root = Root(stage.parent.parent)

@@ -203,7 +203,7 @@ class _StageRun:
         errors = {outcome.name: outcome.error for outcome in outcomes if outcome.error}
         report: Report = {}
         if not errors:
-            self._remove_leftovers()  # Also after workers that died: others did their units.
+            self._remove_leftovers()  # Also of workers that died.
             report, errors = self._finish(inputs, tasks)
         self._write_attempt(tasks, errors)
         made = sum(outcome.report is not None for outcome in outcomes)
