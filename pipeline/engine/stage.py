@@ -124,7 +124,8 @@ class Stage:
         reads: Finds files that the stage's settings name and no other stage of the plan
             makes, in the root folder of the experiment or elsewhere. They count as sources.
         normalize: Sets settings without effect on this stage to their defaults before the
-            key is computed: those that other settings switch off, or that concern other stages.
+            key is computed: those that other settings switch off, or that concern other
+            stages.
         modules: Modules whose code decides the bytes. With what they import of ``infgen``
             they are hashed, and the hash is recorded.
         resumes: ``work`` continues from what a killed attempt left below ``target``.
