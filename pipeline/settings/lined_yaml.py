@@ -1,4 +1,4 @@
-"""YAML mappings that know the line of every key, and refuse a key given twice."""
+"""YAML mappings that know the line of every key and refuse a repeated key."""
 
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -21,7 +21,7 @@ RENAMED_ENTRIES = {
 
 
 class LinedMapping(dict[str, Any]):
-    """A mapping as YAML gave it.
+    """A mapping read from YAML.
 
     Attributes:
         file: Name of its file.
@@ -42,7 +42,7 @@ def load(path: Path) -> LinedMapping:
     """Read a YAML file whose outermost value is a mapping.
 
     Raises:
-        ConfigError: naming file and line, if it is not YAML, or a key stands twice.
+        ConfigError: naming file and line, if it is not YAML, or a key is given twice.
     """
     try:
         node = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
@@ -65,10 +65,10 @@ def load(path: Path) -> LinedMapping:
 
 
 def inner(mapping: LinedMapping, key: str) -> LinedMapping:
-    """Return the mapping under a key; an empty one if nothing stands there.
+    """Return the mapping under a key; an empty one if there is none.
 
     Raises:
-        ConfigError: if something else does.
+        ConfigError: if it is something else.
     """
     found = mapping.get(key)
     if found is None:
@@ -79,10 +79,10 @@ def inner(mapping: LinedMapping, key: str) -> LinedMapping:
 
 
 def words(mapping: LinedMapping, key: str) -> tuple[str, ...]:
-    """Return the list of words under a key; none if nothing stands there.
+    """Return the list of words under a key; none if there is no such key.
 
     Raises:
-        ConfigError: if something else does.
+        ConfigError: if it is something else.
     """
     found = mapping.get(key, [])
     if not isinstance(found, list) or not all(isinstance(word, str) for word in found):
@@ -104,7 +104,7 @@ def known(mapping: LinedMapping, names: Sequence[str], what: str) -> None:
 
 
 def did_you_mean(name: str, names: Sequence[str]) -> str:
-    """Say which of some names may have been meant, to be put behind a message."""
+    """Return the ending of a message that names what may have been meant."""
     if (new := RENAMED_ENTRIES.get(name)) in names:
         return f"; it is now {new!r}"
     near = get_close_matches(name, names, n=1)
@@ -131,7 +131,7 @@ def _mapping(node: yaml.MappingNode, file: str) -> LinedMapping:
         key = str(key_node.value)
         if key in found:
             raise ConfigError(
-                f"{file}:{_line(key_node)}: {key!r} stands twice, first in line "
+                f"{file}:{_line(key_node)}: {key!r} is given twice, first in line "
                 f"{found.lines[key]}; keep one"
             )
         found.lines[key] = _line(key_node)

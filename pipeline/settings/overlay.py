@@ -1,6 +1,6 @@
-"""Settings by section, as ``stages.yaml`` or the command line gave them, laid over others.
+"""Overlays: settings by section from ``stages.yaml`` or the command line.
 
-A value knows the place that gave it, so that what is wrong with it is told with its line.
+Every value knows where it was given, so that errors name its line.
 """
 
 import re
@@ -17,7 +17,7 @@ from pipeline.storage.source_files import find_sources
 
 @dataclass(frozen=True, slots=True)
 class SettingValue:
-    """One value, and the place that gave it."""
+    """A value and the place where it was given."""
 
     value: Any
     where: str
@@ -25,7 +25,7 @@ class SettingValue:
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """Settings by section, and source files; empty where nothing is said."""
+    """Settings by section, and source files; empty where none are given."""
 
     sources: tuple[str, ...]
     values: Mapping[str, Mapping[str, SettingValue]]
@@ -56,7 +56,7 @@ class Overlay:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Its settings as they would be written on the command line, after ``-s``."""
+        """Its settings as arguments of ``-s`` on the command line."""
         return tuple(
             f"{section}.{key}={_word(given.value)}"
             for section, settings in self.values.items()
@@ -65,7 +65,7 @@ class Overlay:
 
 
 def merge_overlays(layers: Iterable[Overlay]) -> Overlay:
-    """Lay overlays over each other, the last on top."""
+    """Merge overlays; later ones take precedence."""
     sources: tuple[str, ...] = ()
     values: dict[str, dict[str, SettingValue]] = {}
     for layer in layers:

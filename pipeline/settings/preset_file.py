@@ -1,4 +1,4 @@
-"""Presets as ``stages.yaml`` has them, read with the lines that things stand in."""
+"""Reading presets from ``stages.yaml``; errors name the line."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -44,7 +44,7 @@ def read_preset(
         for play in inner(entry, "rollout_sets")
     }
     for play in rollout_sets:
-        _check_name(inner(entry, "rollout_sets"), play, "play")
+        _check_name(inner(entry, "rollout_sets"), play, "rollout set")
     arms = {
         arm: _arm(
             inner(entry, "arms"), arm, _Context(context, rollout_sets, sections, profiles)
@@ -103,7 +103,7 @@ def _arm(arms: LinedMapping, name: str, context: _Context) -> Arm:
 def _own_rollout_sets(
     entry: LinedMapping, rollout_sets: Sequence[str], sections: Sequence[str]
 ) -> dict[str, Overlay]:
-    """Read which rollout_sets an arm has: a list of names, or settings by name."""
+    """Read the rollout sets of an arm: a list of names, or settings by name."""
     given = entry.get("rollout_sets")
     if isinstance(given, LinedMapping):
         known(given, rollout_sets, "rollout_sets")
@@ -112,7 +112,7 @@ def _own_rollout_sets(
         if play not in rollout_sets:
             where = entry.where("rollout_sets")
             raise ConfigError(
-                f"{where}: no play {play!r}{did_you_mean(play, rollout_sets)}"
+                f"{where}: no rollout set {play!r}{did_you_mean(play, rollout_sets)}"
             )
     return {play: Overlay((), {}) for play in words(entry, "rollout_sets")}
 
@@ -124,7 +124,7 @@ def _only_settings(mapping: LinedMapping, key: str, sections: Sequence[str]) -> 
 
 
 def _settings(entry: LinedMapping, sections: Sequence[str]) -> Overlay:
-    """Read the settings in an entry that holds other things too."""
+    """Read the sections of settings of an entry that has other keys too."""
     own = LinedMapping(entry.file)
     for key in entry:
         if key in sections:
@@ -158,7 +158,7 @@ def _seeds(entry: LinedMapping) -> int:
 
 
 def _word(entry: LinedMapping, key: str, there: Sequence[str]) -> str | None:
-    """Read a word; one of some, if there are any."""
+    """Read a word: one of ``there`` unless that is empty."""
     given = entry.get(key)
     if given is None:
         return None
@@ -172,7 +172,7 @@ def _word(entry: LinedMapping, key: str, there: Sequence[str]) -> str | None:
 
 
 def _check_name(mapping: LinedMapping, name: str, what: str) -> None:
-    """Names become parts of file names."""
+    """Refuse a name that cannot be part of a file name."""
     if not re.fullmatch(r"[\w-]+", name):
         raise ConfigError(
             f"{mapping.where(name)}: {what} {name!r}; expected letters, digits, - and _"
@@ -193,7 +193,7 @@ def _check_arms(arms: Mapping[str, Arm]) -> None:
 
 
 def _ordered(arms: Mapping[str, Arm]) -> list[str]:
-    """Names of arms, each after the one it goes on from."""
+    """Names of arms, each after the one it starts from."""
     order: list[str] = []
     for name in arms:
         chain = [name]

@@ -1,4 +1,4 @@
-"""Presets of ``stages.yaml``: methods that are trained, played and scored to be compared.
+"""Presets of ``stages.yaml``: methods that are trained, simulated and scored side by side.
 
 ::
 
@@ -6,10 +6,10 @@
       towns-benchmark:
         profile: small,benchmark        # below all that follows
         seeds: 3                        # 0, 1 and 2
-        count_error: truth              # what the agent count error is measured against
-        towns:                          # what is read where no records are named
+        count_error: truth              # what agent counts are compared with
+        towns:                          # used where no records are named
           training: {scenes: 2000, seconds: 9.1}
-        rollout_sets:                          # what is done with every arm's weights
+        rollout_sets:                          # settings of rollouts, by name
           long: {rollout: {mode: long}}
           wosac: {rollout: {mode: wosac, count: 32}}
         arms:
@@ -20,8 +20,8 @@
           catk: {profile: "smart,closed-loop", starts_from: smart, rollout_sets: [long]}
           no-cell: {profile: no-position-token, ablates: infgen, rollout_sets: [long]}
 
-Sections of settings may stand in the preset itself, in an arm, in a play, and in a play of
-an arm; each is laid over those before it, and all of them over the profiles.
+Settings may be given in the preset, in an arm, in a rollout set, and in a rollout set of an
+arm. Each takes precedence over those before it, and all of them over the profiles.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,15 +42,13 @@ class Arm:
 
     Attributes:
         name: As on the command line.
-        label: In tables.
-        profile: Profiles that are laid over those of the preset.
-        settings: Laid over all profiles, those of the preset among them.
-        rollout_sets: The same of each of its rollout_sets, with what the play sets, by the
-            play's name.
-        starts_from: Arm whose weights it goes on from.
-        ablates: Arm of which it leaves something out; it then stands in the table of
-            ablations.
-        published: Row of the paper that it stands beside.
+        label: Its name in tables.
+        profile: Profiles over those of the preset.
+        settings: Settings over all profiles.
+        rollout_sets: Settings of each of its rollout sets over all profiles, by name.
+        starts_from: Arm whose weights its training starts from.
+        ablates: Arm that it is an ablation of; it is then listed in the table of ablations.
+        published: Row of the paper that it is compared with.
         where: Its place in the file.
     """
 
@@ -71,11 +69,11 @@ class Preset:
 
     Attributes:
         name: As on the command line.
-        profile: Profiles below all arms.
-        seeds: Every arm is trained and played with so many.
-        count_error: What the agent count error of its tables is measured against.
-        towns: Towns that are written and read where no records are named, by split.
-        arms: Its methods by name, each after the one it goes on from.
+        profile: Profiles of all arms.
+        seeds: Number of seeds with which every arm is trained and simulated.
+        count_error: What agent counts in its tables are compared with.
+        towns: Synthetic towns, by split, used where no records are named.
+        arms: Its methods by name, each after the one it starts from.
     """
 
     name: str
@@ -98,7 +96,7 @@ class Preset:
         return [arm for name, arm in self.arms.items() if not names or name in names]
 
     def initial_arms(self, arms: Sequence[Arm]) -> list[Arm]:
-        """Arms that others go on from but that are not among them, each after its own."""
+        """Return arms that these start from and that are not among them, in order."""
         have = {arm.name for arm in arms}
         needed: set[str] = set()
         for arm in arms:

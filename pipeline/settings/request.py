@@ -1,8 +1,8 @@
-"""What the user asks of a root, and what a root remembers of having been asked.
+"""Requests: what a command asks of a root, stored in the root for later commands.
 
-A command names records, a profile and settings, or leaves them to be as last time:
-``infgen status --root R`` alone speaks of the last run. Whoever names a profile or records
-starts a new request: settings of the last one then count no more.
+A command names records, a profile and settings, or takes them from the last request:
+``infgen status --root R`` reports on the last run. A command that names a profile or
+records starts a new request, without the settings of the last one.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,12 +27,12 @@ OWN_FILE = "stages.yaml"
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """All that decides what a run makes.
+    """Everything that decides what a run makes.
 
     Attributes:
-        root: Where.
+        root: The root.
         file: Its ``stages.yaml``.
-        profile: Laid over it; None for none.
+        profile: Its profiles; None for none.
         records: Paths, patterns or URLs; empty to use those of the file.
         overrides: ``section.key=value`` words.
     """
@@ -45,7 +45,7 @@ class Request:
 
     @property
     def words(self) -> str:
-        """The request as it would be written on the command line."""
+        """The request as command-line options."""
         records = [f"--records {pattern}" for pattern in self.records]
         profile = [f"--profile {self.profile}"] if self.profile else []
         return " ".join([*profile, *records, *[f"-s {word}" for word in self.overrides]])
@@ -63,15 +63,15 @@ class Request:
         return make_plan(self.root, file.stages, chosen, targets or list(file.stages))
 
     def made(self) -> Mapping[str, str]:
-        """Keys of the stages that the last run under this profile was to make."""
+        """Keys of the stages that the last run under this profile planned."""
         return read_request(self.root, self._name).get("keys", {})
 
     def remember(self, plan: Plan, name: str | None = None) -> None:
-        """Make this the root's last request.
+        """Store this as the root's last request.
 
         Args:
-            plan: What it leads to.
-            name: To remember it by; the profile if None.
+            plan: Its plan.
+            name: Name to store it under; the profile if None.
         """
         name = name or self._name
         before = read_request(self.root, name).get("keys", {})
@@ -89,10 +89,10 @@ class Request:
 
     @contextmanager
     def remembered(self, plan: Plan, name: str | None = None) -> Iterator[None]:
-        """Remember this while it is made, and after that unless it is refused.
+        """Store this while it runs, and restore the last request if it is refused.
 
-        Others may look on while it is made, and a run that is killed goes on with it. Words
-        that are refused only then, by a stage, must not come back with the next command.
+        Other commands see it while it runs, and the run after a kill continues it. Settings
+        that a stage refuses only then must not be used by the next command.
         """
         last, path = self.root.refs / LAST, request_file(self.root, name or self._name)
         latest_folder = last.resolve() if last.exists() else None
@@ -102,7 +102,7 @@ class Request:
         try:
             yield
         except (ConfigError, PlanError):
-            if path.is_file() and path.read_bytes() == ours:  # Nobody asked since.
+            if path.is_file() and path.read_bytes() == ours:  # No other request since.
                 _restore(last, latest_folder, path, before)
             raise
 
@@ -120,7 +120,7 @@ def complete_request(
     overrides: Sequence[str],
     environ: Mapping[str, str],
 ) -> Request:
-    """Fill in from the root's memory what a command does not name."""
+    """Complete a command's request from those stored in the root."""
     last = read_request(root, LAST)
     fresh = profile is not None or bool(records)
     before = last if profile is None else read_request(root, profile)
@@ -143,7 +143,7 @@ def _with_known_records(
     last: Mapping[str, Any],
     environ: Mapping[str, str],
 ) -> Request:
-    """Take the records this profile had; or those of the file; or the root's last."""
+    """Use the records of this profile's last request, of the file, or of the last request."""
     known = before.get("records", ())
     if not known and not request.stages(environ).names_sources(request.profile):
         known = last.get("records", ())
@@ -166,7 +166,7 @@ def find_file(named: Path | None, before: Mapping[str, Any]) -> Path:
 def _restore(
     last: Path, latest_folder: Path | None, path: Path, before: bytes | None
 ) -> None:
-    """Remember by a name, and as the last request, what was remembered before."""
+    """Restore the request stored under a name, and the last request."""
     if last.resolve() == path.resolve():
         last.unlink()
         if latest_folder is not None:
@@ -178,12 +178,12 @@ def _restore(
 
 
 def request_file(root: Root, name: str) -> Path:
-    """File in which a root remembers a request by a name."""
+    """File of the request stored under a name."""
     return root.refs / f"{name}.json"
 
 
 def read_request(root: Root, name: str) -> dict[str, Any]:
-    """Return what a root remembers by a name; nothing if that is damaged."""
+    """Return the request stored under a name; empty if missing or damaged."""
     path = root.refs / LAST if name == LAST else request_file(root, name)
     try:
         about = read_json(path)
@@ -193,7 +193,7 @@ def read_request(root: Root, name: str) -> dict[str, Any]:
 
 
 def named_weights(root: Root) -> set[str]:
-    """Return what remembered requests, and their files, name as initial weights."""
+    """Return the initial weights that stored requests and their files name."""
     requests = [read_json(path) for path in sorted(root.refs.glob("*.json"))]
     found = set()
     for word in (word for request in requests for word in request.get("overrides", ())):

@@ -13,7 +13,7 @@
     presets: {}      # methods that are compared: see ``pipeline.settings.presets``
 
 Profiles may be stacked: ``--profile small,paper-loss`` lays the second over the first.
-A stage may name a ``module`` of its own that ends in ``STAGE = Stage(...)``.
+A stage may name a ``module`` of its own that defines ``STAGE = Stage(...)``.
 """
 
 import re
@@ -56,10 +56,10 @@ class StagesFile:
         overrides: Sequence[str] = (),
         between: Sequence[Overlay] = (),
     ) -> Overlay:
-        """Lay profiles, and then ``section.key=value`` words, over the base.
+        """Merge the base, profiles and ``section.key=value`` overrides, in this order.
 
         Args:
-            profile: Names with commas between, each laid over those before it.
+            profile: Names with commas between; later ones take precedence.
             overrides: The words.
             between: Laid over the profiles, below the words.
 
@@ -81,11 +81,11 @@ class StagesFile:
         return self.presets[name]
 
     def names_sources(self, profile: str | None) -> bool:
-        """Whether one of the profiles says itself which source files it reads."""
+        """Whether one of the profiles names source files."""
         return any(overlay.sources for overlay in self.profile_overlays(profile))
 
     def profile_overlays(self, profile: str | None) -> list[Overlay]:
-        """Find profiles by their names with commas between."""
+        """Return the overlays of profiles named with commas between."""
         names = [] if profile is None else profile.split(",")
         return [
             _pick(self.profiles, name.strip(), "profile", "--profile") for name in names

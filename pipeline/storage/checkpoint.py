@@ -1,9 +1,8 @@
-"""All that training needs to go on from a step as if it had never stopped.
+"""Checkpoints: training resumes from them as if it had never stopped.
 
-A checkpoint is a folder, complete once ``checkpoint.json`` names it; that file is replaced
-whole, so a kill at any moment leaves the old checkpoint or the new one. Random numbers are
-keyed by the step, so the step is all there is to remember of them, and of the place in the
-data and the schedule.
+A checkpoint is a folder, complete once ``checkpoint.json`` names it. That file is replaced
+atomically, so a kill at any time leaves the old or the new checkpoint. Random numbers, the
+place in the data and the learning rate follow from the step alone.
 """
 
 import json
@@ -38,7 +37,7 @@ class TrainingState:
 
 
 def save_checkpoint(folder: Path, training: TrainingState, step: int) -> None:
-    """Write everything after ``step`` optimiser steps, then forget the one before."""
+    """Write a checkpoint after ``step`` optimizer steps, then remove the one before."""
     target = folder / f"{PREFIX}{step:09d}"
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir()
@@ -50,7 +49,7 @@ def save_checkpoint(folder: Path, training: TrainingState, step: int) -> None:
 
 
 def load_checkpoint(folder: Path, training: TrainingState) -> int:
-    """Go on from the last checkpoint: return the optimiser steps done, 0 if none."""
+    """Load the last checkpoint; return its optimizer step, 0 without one."""
     pointer = folder / POINTER
     if not pointer.is_file():
         return 0

@@ -1,10 +1,9 @@
 """Records to flat columns and back, by the shapes in their annotations.
 
-A list of records of one type (a frozen dataclass, its arrays annotated by jaxtyping, other
-such dataclasses nested in it) becomes a dictionary of one-dimensional arrays: every array
-field laid end to end (``tracks.xyz_m``), and the sizes of every named dimension per record
-(``dim.agent``). Nothing else is needed to cut the records out again, also from columns that
-stay on disk.
+A list of records of one type (a frozen dataclass with jaxtyping arrays, and such
+dataclasses nested in it) becomes a dictionary of one-dimensional arrays: the concatenated
+values of every field (``tracks.xyz_m``), and the size of every named dimension per record
+(``dim.agent``). Records are sliced out of these again, also from columns on disk.
 """
 
 import math
@@ -29,7 +28,7 @@ T = TypeVar("T")
 
 @runtime_checkable
 class Values(Protocol):
-    """One column: an array, or what gives parts of one."""
+    """One column: an array, or an object that returns slices of one."""
 
     def __len__(self) -> int: ...
 
@@ -45,7 +44,7 @@ class Column(NamedTuple):
     Attributes:
         path: Names of the fields that lead to it.
         dims: Dimensions of an array (``agent``, ``3``, ``feature+1``); None for a scalar.
-        dtype: Of the stored values.
+        dtype: Type of the stored values.
         kind: Python type of a scalar.
     """
 
@@ -90,7 +89,7 @@ def leaves(kind: Any) -> tuple[Column, ...]:
 
 
 def pack(records: Sequence[Any], kind: type) -> dict[str, np.ndarray]:
-    """Lay records end to end. Inverse of ``PackedRecords``.
+    """Concatenate records to columns. Inverse of ``PackedRecords``.
 
     Raises:
         ValueError: if a dimension has two sizes within one record.
@@ -143,10 +142,10 @@ class _Layout(NamedTuple):
 
 
 class PackedRecords(Generic[T], Sequence[T]):
-    """Records cut out of columns on demand: ``records[3]`` touches only that record.
+    """Records sliced out of columns on demand: ``records[3]`` reads only that record.
 
-    Arrays are parts of the columns: views, or read there and then from columns on disk. All
-    that depends on the type is settled when opened: training reads one record at a time.
+    Arrays are slices of the columns: views in memory, or read from columns on disk. Whatever
+    depends on the type alone is computed once: training reads one record at a time.
     """
 
     def __init__(self, columns: Columns, kind: type[T]) -> None:
@@ -179,7 +178,7 @@ class PackedRecords(Generic[T], Sequence[T]):
         return (self[row] for row in range(len(self)))
 
     def column(self, name: str) -> np.ndarray:
-        """Return one whole column, all records end to end."""
+        """Return one whole column of all records."""
         return self._columns[name][:]
 
     def sizes(self, dim: str) -> np.ndarray:

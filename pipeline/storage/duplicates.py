@@ -1,7 +1,7 @@
-"""Scenes that several files of a split hold: the first file, by name, keeps them.
+"""Duplicate scenes: of scenes that several files of a split hold, the first file counts.
 
-Here alone it is settled which scenes of an ingested file count. Whatever is made of scenes
-passes the others over: they would be learned from, played and scored twice.
+All stages that read scenes skip the duplicates, which would otherwise be trained on,
+simulated and scored twice.
 """
 
 from collections.abc import Iterator, Mapping
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from infgen.scene import Scene
 
 DUPLICATE_ROWS = "duplicate_rows"
-"""Ranges ``[first, after)`` of rows of a file's scenes that do not count: in what stage
-``ingest`` reports of the file, and in the tasks of those who read it."""
+"""Ranges ``[first, after)`` of rows of a file's scenes that are duplicates: in the report of
+stage ``ingest`` on the file, and in the tasks of stages that read it."""
 
 
 def mark_duplicates(index: "pl.DataFrame") -> "pl.DataFrame":
-    """Mark the scenes that do not count in an index of all files, ordered by name."""
+    """Mark duplicate scenes in an index of all files, ordered by name."""
     import polars as pl  # noqa: PLC0415
 
     first = pl.struct("split", "scenario_id").is_first_distinct()
@@ -31,7 +31,7 @@ def mark_duplicates(index: "pl.DataFrame") -> "pl.DataFrame":
 
 
 def report_duplicates(index: "pl.DataFrame") -> dict[str, Report]:
-    """Say of each file with marked scenes which of its rows they are."""
+    """Return the rows of marked scenes of each file that has any."""
     import polars as pl  # noqa: PLC0415
 
     rows = index.select("source", "duplicate", at=pl.int_range(pl.len()).over("source"))
@@ -43,13 +43,13 @@ def report_duplicates(index: "pl.DataFrame") -> dict[str, Report]:
 
 
 def unique_rows(file: FinishedUnit) -> list[int]:
-    """Rows of the scenes of an ingested file that count."""
+    """Rows of the scenes of an ingested file that are no duplicates."""
     duplicate_rows = _rows(file.report)
     return [row for row in range(int(file.report["scenes"])) if row not in duplicate_rows]
 
 
 def scenes_task(file: FinishedUnit) -> dict[str, Any]:
-    """Name the scenes of an ingested file that count, in the task of a unit."""
+    """Describe the unique scenes of an ingested file for the task of a unit."""
     duplicate_rows = file.report.get(DUPLICATE_ROWS)
     return {
         "scenes": str(file.path),

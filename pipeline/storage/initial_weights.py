@@ -1,4 +1,4 @@
-"""Weights that a stage begins with: those of the package, of a folder, or of a key."""
+"""Initial weights of a stage: of the package, of a folder, or of a key."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ WEIGHTS, DESCRIPTION = "model.safetensors", "model.json"
 BUILTIN = "builtin"
 """The word for the weights that come with the package."""
 INITIAL_WEIGHTS = "initial_weights"
-"""Name of the weights to begin with, among a stage's sources."""
+"""Name of the initial weights among a stage's sources."""
 
 
 def find_initial_weights(root: Path, setting: str, named: str) -> list[Source]:
@@ -35,9 +35,9 @@ def find_initial_weights(root: Path, setting: str, named: str) -> list[Source]:
     own = [builtin_weights()] if named == BUILTIN else [Path(named).absolute()]
     found = [place for place in (*own, *sorted(keyed)) if (place / DESCRIPTION).is_file()]
     if len(found) != 1:
-        told = "several have it" if found else "there is no such folder or key"
+        why = "several have it" if found else "there is no such folder or key"
         raise ConfigError(
-            f"{setting} is {named!r}, but {told}; expected {BUILTIN!r}, a folder with "
+            f"{setting} is {named!r}, but {why}; expected {BUILTIN!r}, a folder with "
             f"{WEIGHTS} and {DESCRIPTION}, or the start of a key below {stage}"
         )
     folder = found[0].resolve()
@@ -51,6 +51,6 @@ def _fingerprint(path: Path, setting: str) -> str:
     if not isinstance(about, dict) or "weights" not in about:
         raise ConfigError(
             f"{setting}: {path} lacks the entry 'weights'; expected a folder that stage "
-            f"'train' made, with {WEIGHTS} and the {DESCRIPTION} that tells of them"
+            f"'train' made, with {WEIGHTS} and the {DESCRIPTION} that describes them"
         )
     return str(about["weights"])

@@ -1,4 +1,4 @@
-"""Plain tables on disk: indexes, and lists of what was refused."""
+"""Tables on disk: indexes, and lists of refused records."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 Fields = Mapping[str, type]
-"""Names of columns and what they hold: ``str`` or ``int``."""
+"""Column names and types: ``str`` or ``int``."""
 
 
 def make_table(rows: Sequence[Mapping[str, Any]], columns: Fields) -> "pl.DataFrame":

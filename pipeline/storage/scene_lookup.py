@@ -1,7 +1,6 @@
-"""SceneLookup found by scenario id, in raw records or in an ingested store, in any order.
+"""Logged scenes by scenario id, from raw records or from an ingested store, in any order.
 
-Neither holds more than a bounded part of the logs: what rollouts ask for comes in their
-order, not in that of the records.
+Only a bounded part of the scenes is in memory: rollouts come in an order of their own.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,18 +20,18 @@ if TYPE_CHECKING:
     from pipeline.storage.columns import PackedRecords
 
 CACHE_BYTES = 256 << 20
-"""Records that were passed on the way to another, kept in case they are next."""
+"""Bytes of records that are kept after they were passed on the way to another."""
 MAX_OPEN_GROUPS = 2
 MAX_NAMED = 3
 
 
 class MissingSceneError(ValueError):
-    """No log of a scene."""
+    """There is no log of a scene."""
 
 
 @runtime_checkable
 class SceneLookup(Protocol):
-    """SceneLookup by scenario id."""
+    """Logged scenes by scenario id."""
 
     def find(self, scenario_id: str) -> Scene:
         """Return one log.
@@ -79,7 +78,7 @@ class RecordLookup:
         return decode_scene(data)
 
     def _read(self, urls: Sequence[str]) -> Iterator[str]:
-        """Pass record after record, and keep it; yields ids."""
+        """Read record after record into the cache; yield ids."""
         for url in urls:
             for record in iter_records(url):
                 try:
@@ -95,7 +94,7 @@ class RecordLookup:
                     yield scenario_id
 
     def _keep(self, scenario_id: str, data: bytes) -> None:
-        """Keep a record, and let go of the oldest ones while there is no room."""
+        """Cache a record, and drop the oldest ones while it is too large."""
         self._cached[scenario_id] = data
         self._free_bytes -= len(data)
         while self._free_bytes < 0 and len(self._cached) > 1:
@@ -118,7 +117,7 @@ class RecordLookup:
 
 
 class StoreLookup:
-    """SceneLookup in an ingested store, a few groups of scenes in memory at a time."""
+    """Scenes of an ingested store, with a few groups in memory at a time."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         import polars as pl  # noqa: PLC0415

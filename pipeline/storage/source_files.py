@@ -1,13 +1,12 @@
-"""Source files: found by path, pattern or URL, and told apart by what they hold.
+"""Source files: found by path, pattern or URL, and identified by their content.
 
-A plain TFRecord carries two checksums per record; hashing those tells two files apart as
-well as hashing all of it, in a thousandth of the time. A GZIP file would have to be
-unpacked to see them, so its compressed bytes are hashed instead, as are those of any other
-file.
+A plain TFRecord has two checksums per record. Their hash identifies the file as well as a
+hash of all its bytes, in a thousandth of the time. Of GZIP files, which would have to be
+unpacked, and of all other files all bytes are hashed.
 
-A record whose data is damaged has the checksum that it should have, so a file of such
-records passes for a sound one until an ingest has read it. That is right as long as nobody
-mends it: afterwards, the file is told by all its bytes.
+A record with damaged data still has the checksum of the undamaged one, so a damaged and a
+repaired file would have one identity. Once an ingest has found damage and the file is
+repaired, it is therefore identified by all its bytes.
 """
 
 import glob
@@ -31,13 +30,13 @@ from pipeline.engine.layout import Root, read_json
 from pipeline.engine.stage import Source
 
 BUILTIN = "builtin"
-"""Stands for the synthetic records that come with the package."""
+"""Names the synthetic records of the package."""
 INGEST = "ingest"
-"""The stage that says which records are damaged, ..."""
+"""The stage that reports damaged records ..."""
 DAMAGED = "data checksum does not match"
 """... and the reason it gives."""
 WHOLE = "sha256:"
-"""Begins the identity of a file that is told by all its bytes."""
+"""Prefix of the identity of a file by all its bytes."""
 BLOCK_BYTES = 1 << 22
 RECORDS_IN_FOLDER = "*.tfrecord*"
 HEADER_BYTES = 12
@@ -46,11 +45,11 @@ CRC_MASK_DELTA = 0xA282EAD8
 
 
 def find_sources(patterns: Sequence[str], root: Root) -> tuple[Source, ...]:
-    """Find source files and tell their identities, in the order of their names.
+    """Find source files and their identities, in the order of their names.
 
     Args:
         patterns: Paths, folders, glob patterns, fsspec URLs, or ``builtin``.
-        root: Where identities are remembered.
+        root: Root that caches identities.
 
     Raises:
         ConfigError: if a pattern matches nothing, or two files have one name.
@@ -129,7 +128,7 @@ def _refuse_equal_names(urls: Sequence[str]) -> None:
 
 
 class _FingerprintCache:
-    """Identities of local files that have not changed since they were last read."""
+    """Cache of the identities of local files, by path, size and time."""
 
     def __init__(self, root: Root) -> None:
         self._root, self._path = root, root.fingerprints
@@ -137,7 +136,7 @@ class _FingerprintCache:
         self._changed = False
 
     def fingerprint(self, url: str) -> str:
-        """Return the identity of a file, read only if it must be."""
+        """Return the identity of a file; read it only if it has changed."""
         if "://" in url:
             return _fingerprint_remote(url)
         stat = os.stat(url)
@@ -167,14 +166,16 @@ class _FingerprintCache:
         """Offsets of records that an ingest found damaged, by their file's identity."""
         found: dict[str, set[int]] = defaultdict(set)
         for path in self._root.units(INGEST).glob(f"*/{MANIFEST}"):
-            with suppress(StoreError, FileNotFoundError):  # It may just be being removed.
+            with suppress(
+                StoreError, FileNotFoundError
+            ):  # Another process may be removing it.
                 unit = read_json(path)
                 if unit["report"].get("quarantined"):
                     found[unit["inputs"]["source"]] |= _damaged_offsets(path.parent)
         return found
 
     def save(self) -> None:
-        """Keep what was learned. Losing it costs only time."""
+        """Write the cache. Losing it costs only time."""
         if self._changed:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_json(self._path, self._known)
@@ -196,7 +197,7 @@ def _read_cache(path: Path) -> dict[str, list[Any]]:
 
 
 def fingerprint(path: Path) -> str:
-    """Identity of what a local file holds, whatever its name and times."""
+    """Identity of a local file's content, independent of name and times."""
     with path.open("rb", buffering=0) as file:
         marks = _record_marks(file.fileno(), path.stat().st_size)
     return f"tfrecord:{marks}" if marks is not None else _hash_whole(path)
@@ -233,7 +234,7 @@ def _masked(crc: int) -> int:
 
 
 def _fingerprint_remote(url: str) -> str:
-    """Identity of a remote file: what its store says of it, or else all its bytes."""
+    """Identity of a remote file: its store's checksums or times, or else all its bytes."""
     system, path = file_system(url)
     said = sorted(_content_marks(system.info(path)))
     digest = hashlib.sha256(repr(said).encode())
@@ -249,7 +250,7 @@ TIME_MARKS = ("mtime", "lastmodified", "last_modified", "last_commit")
 
 
 def _content_marks(info: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Pick what tells contents apart: checksums if there are any, else times."""
+    """Pick checksums if there are any, else times."""
     found = {name.lower(): str(value) for name, value in info.items() if value}
     marks = [name for name in CONTENT_MARKS if name in found]
     marks = marks or [name for name in TIME_MARKS if name in found]

@@ -1,4 +1,4 @@
-"""Splits, told by file names: ``training.tfrecord-00000-of-01000`` is of ``training``."""
+"""Splits by file names: ``training.tfrecord-00000-of-01000`` is of ``training``."""
 
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
@@ -13,7 +13,7 @@ from pipeline.storage.duplicates import unique_rows
 def split_of(name: str) -> str:
     """Return the split that a file belongs to: its name up to ``.tfrecord``.
 
-    WOMD's own long names are cut to the word that tells:
+    Of WOMD's own long names the distinctive word is used:
     ``uncompressed_scenario_training_training.tfrecord-...`` is of ``training``.
     """
     stem = name.split(".tfrecord")[0]
@@ -27,7 +27,7 @@ def split_of(name: str) -> str:
 
 
 def in_split(name: str, split: str) -> bool:
-    """Tell whether a file belongs to a split."""
+    """Whether a file belongs to a split."""
     return split_of(name) == split
 
 
@@ -37,10 +37,10 @@ def files_of_split(
     """Find the ingested files of a split that hold a scene.
 
     Args:
-        files: Of all splits.
-        split: Whose.
-        to: What they are for; and ...
-        setting: ... what to set where there are none; both for the message.
+        files: Files of all splits.
+        split: The split.
+        to: What they are for, for the message.
+        setting: What to set where there are none, for the message.
 
     Raises:
         PlanError: if no file is of the split, or none of them holds a usable scene.
@@ -63,7 +63,7 @@ def files_of_split(
 def spread_evenly(files: Sequence[FinishedUnit], most: int) -> list[list[int]]:
     """Choose scenes of ingested files, evenly spread_evenly over all of them.
 
-    Neighbours in a file may be alike: views of one town, cuts of one drive.
+    Neighbouring scenes of a file may be similar: views of one town, parts of one drive.
 
     Args:
         files: Of one split, in order.

@@ -97,7 +97,7 @@ def load_network(folder: Path) -> Network:
     )
     try:
         network.load_state_dict(tensors)
-    except RuntimeError as error:  # It names every tensor.
+    except RuntimeError as error:  # The message names every tensor.
         said = textwrap.shorten(str(error), MAX_SAID, placeholder=" ...")
         raise StoreError(
             f"{folder / WEIGHTS} does not fit its settings in {DESCRIPTION}: {said}"
@@ -118,7 +118,7 @@ def load_vocabularies(folder: Path) -> tuple[MotionVocabulary, MapVocabulary]:
 def copy_weights(network: Network, folder: Path) -> None:
     """Give a network the weights in a folder, made with the same vocabularies.
 
-    What the folder holds beyond the network's own parameters is left aside.
+    Other tensors in the folder are ignored.
 
     Raises:
         StoreError: naming the parameters that are missing there or of another shape; or if
@@ -136,7 +136,7 @@ def copy_weights(network: Network, folder: Path) -> None:
         )
     found = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
     if found != about["weights"]:
-        raise StoreError(f"{folder / WEIGHTS} is not the one that {DESCRIPTION} tells of")
+        raise StoreError(f"{folder / WEIGHTS} is not the file that {DESCRIPTION} describes")
     tensors = read_tensors(folder / WEIGHTS)
     parameters = dict(network.named_parameters())
     unfit = [
@@ -160,7 +160,7 @@ def _first_names(names: Sequence[str]) -> str:
 
 
 def _differing_settings(about: Mapping[str, Any], network: Network) -> str:
-    """Say which settings of a network are not those that its weights were trained with."""
+    """Name settings of a network that its weights were not trained with."""
     model, grid = asdict(network.settings), asdict(network.grid_settings)
     for section, asked in (("model", model), ("tokenize", grid)):
         had = about[section]
@@ -175,13 +175,13 @@ def _differing_settings(about: Mapping[str, Any], network: Network) -> str:
 
 
 def _remedy(folder: Path) -> str:
-    """Say where the settings are that go with the weights of the package."""
+    """Name the profile that fits the weights of the package."""
     own = folder.resolve() == builtin_weights().resolve()
     return "; --profile pretrained has all that goes with them" if own else ""
 
 
 def read_description(folder: Path) -> dict[str, Any]:
-    """Read what is said about the weights in a folder.
+    """Read the description of the weights in a folder.
 
     Raises:
         StoreError: if there are none, or they are of another schema.

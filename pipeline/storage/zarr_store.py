@@ -1,9 +1,9 @@
-"""The door to the disk: columns in Zarr, read whole or in parts.
+"""Columns in Zarr groups, read whole or in parts.
 
-Every array is one chunk. Where ``compress`` is off its only codec is crc32c, so the chunk
-file is the array itself followed by four bytes, and any part of it can be read alone.
-A missing chunk is an error here, never zeros. Zarr is imported where it is used: it takes a
-second, and neither ``infgen status`` nor reading in parts needs it.
+Every array is one chunk. Without ``compress`` its only codec is crc32c: the chunk file is
+the array followed by four bytes, and any part of it can be read alone. A missing chunk is
+an error, never zeros. Zarr is imported in functions: it takes a second, and neither
+``infgen status`` nor reading in parts needs it.
 """
 
 import json
@@ -36,11 +36,11 @@ CHECKSUM_BYTES = 4
 
 
 class DiskColumn:
-    """A column that stays on disk: any part of it can be read, and nothing is kept open.
+    """A column on disk, of which any part can be read; no file is kept open.
 
-    A memory map would hold on to a descriptor and a mapping. Training draws its scenes from
-    all shards at once, and those of WOMD have 52,000 columns: most systems allow a process
-    1,024 descriptors and 65,530 mappings.
+    Memory maps would keep a descriptor and a mapping each. Training samples scenes from all
+    shards at once, and those of WOMD have 52,000 columns, while most systems allow a
+    process 1,024 descriptors and 65,530 mappings.
     """
 
     __slots__ = ("_chunk", "_length", "dtype")
@@ -55,7 +55,7 @@ class DiskColumn:
         """Read a part.
 
         Raises:
-            StoreError: if it is not there, or not all of it.
+            StoreError: if it is missing or cut short.
         """
         start, stop, _ = part.indices(self._length)
         if stop <= start:
@@ -83,8 +83,8 @@ def write_group(
 ) -> None:
     """Write one-dimensional columns as a new Zarr v3 group.
 
-    Zarr lays the group out in memory and the files are written from there: its own way to
-    the disk wakes a thread for every file it looks at, which costs as much again.
+    Zarr builds the group in memory, and its files are then written directly: Zarr's own
+    local store starts a thread per file access, which doubles the time.
 
     Raises:
         FileExistsError: if the path exists.
@@ -93,7 +93,7 @@ def write_group(
     from zarr.codecs import BloscCodec, Crc32cCodec  # noqa: PLC0415
     from zarr.storage import MemoryStore  # noqa: PLC0415
 
-    # Level 5 takes five times as long and saves a twelfth of the bytes of scenes.
+    # Level 5 takes five times as long and makes scenes smaller by a twelfth.
     packed = BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle")
     codecs = [packed, Crc32cCodec()] if compress else [Crc32cCodec()]
     files: dict[str, Any] = {}
@@ -145,7 +145,7 @@ def read_group(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def open_group(path: Path) -> tuple[dict[str, DiskColumn], dict[str, Any]]:
-    """Find where the columns of an uncompressed group lie, without reading them.
+    """Open the columns of an uncompressed group without reading them.
 
     Raises:
         StoreError: if the group is compressed, or a chunk is missing or cut short.
@@ -174,7 +174,7 @@ def write_records(
 def read_records(
     path: Path, kind: type[T], schema: str, *, whole: bool
 ) -> PackedRecords[T]:
-    """Open a group of records: all read at once and verified, or each on demand.
+    """Open a group of records: with ``whole`` read and verified at once, else on demand.
 
     Raises:
         StoreError: if the group holds another schema, or is damaged.

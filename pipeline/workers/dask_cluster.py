@@ -1,6 +1,6 @@
-"""The door to Dask: workers on this machine, on its GPUs, or on any cluster.
+"""Dask workers: on this machine, on its GPUs, or on any cluster.
 
-Workers write their results themselves and send back a few figures.
+Workers write their results to disk themselves and return a few figures.
 """
 
 import logging
@@ -43,9 +43,9 @@ from pipeline.workers.scheduling import (
 HELP = "none | local[:N] | gpu[:0,1] | tcp://HOST:PORT | file:scheduler.json"
 LOOPBACK = "127.0.0.1"  # Dask runs what anyone who connects sends it.
 WEB: dict[str, Any] = {"dashboard": False, "dashboard_address": f"{LOOPBACK}:0"}
-"""Any free port for a scheduler's web server: another cluster may have the usual one."""
+"""A free port for the scheduler's web server: another cluster may use the default one."""
 SCHEDULER_TIMEOUT_S = 60.0
-"""Longest that a scheduler may leave a question unanswered."""
+"""Longest wait for an answer of the scheduler."""
 CLOSE_S, POLL_S = 10.0, 0.1
 PROGRESS_EVERY_S = 2.0
 CONFIG = {
@@ -58,12 +58,12 @@ CONFIG = {
 WORKER_ENVIRONMENT = {"ZARR_ASYNC__CONCURRENCY": "4", "ZARR_THREADING__MAX_WORKERS": "2"}
 VISIBLE_DEVICES = "CUDA_VISIBLE_DEVICES"
 WORKERS_TOPIC, MEMORY_TOPIC = "all", "worker-restart-memory"
-"""What Dask tells there: workers that come and go, and those it restarts."""
+"""Dask's topics for workers that start and end, and for those it restarts."""
 PROGRESS_TOPIC = "infgen-progress"
 
 
 def choose_workers(words: str, visible_devices: str | None = None) -> Workers:
-    """Return where units are done.
+    """Return the workers that a word of the command line names.
 
     Args:
         words: As on the command line (``--dask``).
@@ -88,7 +88,7 @@ class DaskWorkers:
     visible_devices: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse words that name no kind of workers.
+        """Check the word.
 
         Raises:
             ConfigError: naming the words and those there are.
@@ -97,7 +97,7 @@ class DaskWorkers:
 
     @contextmanager
     def open(self) -> Iterator["OpenDaskWorkers"]:
-        """Have the cluster from the first unit that needs it to the end of the context."""
+        """Start the cluster with the first unit that needs it; the context stops it."""
         with ExitStack() as stack:
             yield OpenDaskWorkers(self, stack)
 
@@ -115,7 +115,7 @@ class OpenDaskWorkers:
         self._executor: Executor | None = None
 
     def executor(self, *, here: bool) -> Executor:
-        """Return who does the units of a stage; ``here`` if it must be this process."""
+        """Return the executor of a stage's units; with ``here``, one in this process."""
         if here:
             return InProcess()
         if self._executor is None:
@@ -166,7 +166,7 @@ def _close(client: Any) -> None:
 
 
 def _await_file(path: str) -> str:
-    """Wait for the file that a scheduler writes: Dask would do so for ever."""
+    """Wait for the file that a scheduler writes; Dask would wait without limit."""
     begun = time.monotonic()
     while not os.path.exists(path):
         if time.monotonic() - begun > SCHEDULER_TIMEOUT_S:
@@ -183,7 +183,7 @@ def _connect(words: str, place: Mapping[str, Any]) -> Any:
 
 
 def _dask() -> Any:
-    """Import Dask late, and once: it takes more than a second and is not typed."""
+    """Import Dask when it is needed: it takes more than a second and is not typed."""
     return import_module("distributed")
 
 
@@ -201,7 +201,7 @@ def _local(count: int) -> Any:
 
 
 def _memory_bytes(workers: int) -> int:
-    """What each of some workers may use of this machine's memory."""
+    """Memory limit of each of some workers on this machine."""
     return int(import_module("distributed.system").MEMORY_LIMIT) // workers
 
 
@@ -212,7 +212,7 @@ def _gpus(devices: Sequence[str]) -> Any:
 
 
 def gpu_workers(devices: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Say how a worker process per device is started, which sees that device alone.
+    """Describe one worker process per device, which sees that device alone.
 
     The environment is set before anything is imported there.
     """
@@ -232,7 +232,7 @@ def gpu_workers(devices: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def select_gpus(wanted: str, visible: str | None) -> list[str]:
-    """Name the devices that workers are started for.
+    """Return the devices to start workers for.
 
     Args:
         wanted: Numbers with commas, as this process counts them; empty for all.
@@ -277,18 +277,18 @@ class DaskPool:
             client.subscribe_topic(topic, hear)
 
     def close(self) -> None:
-        """Listen no more: a cluster that is about to stop has nothing to tell."""
+        """Stop listening to the cluster's topics."""
         if self._client.status == "running":
             for topic in self._topics:
                 self._client.unsubscribe_topic(topic)
 
     @property
     def inbox(self) -> "SimpleQueue[WorkerEvent]":
-        """What they report, as it comes in."""
+        """Events of the workers, in order of arrival."""
         return self._inbox
 
     def begin(self, name: str, task: Task) -> None:
-        """Hand out a task as a try of that name."""
+        """Submit a task as an attempt of that name."""
         key = f"{name}-{self._mark}"
         future = self._client.submit(
             _run_with_progress, task, key, self._mark, key=key, retries=RETRIES, pure=False
@@ -297,10 +297,10 @@ class DaskPool:
         future.add_done_callback(lambda _: self._inbox.put(TaskEnded(name)))
 
     def take(self, name: str) -> Outcome | TaskFailure:
-        """Return what became of a try that has ended.
+        """Return the result of an attempt that has ended.
 
         Raises:
-            WorkersLostError: if the scheduler cannot tell.
+            WorkersLostError: if the scheduler does not know.
         """
         future = self._futures.pop(f"{name}-{self._mark}")
         try:
@@ -316,7 +316,7 @@ class DaskPool:
         return TaskFailure(error, trace, isinstance(error, _dask().KilledWorker))
 
     def threads(self) -> int:
-        """Count how many tasks they can do at once.
+        """Return the number of tasks that run at once.
 
         Raises:
             WorkersLostError: if the scheduler does not answer.
@@ -340,7 +340,7 @@ class DaskPool:
         )
 
     def _on_worker_event(self, event: tuple[float, Mapping[str, Any]]) -> None:
-        """Take note of workers that come and go."""
+        """Report a worker that ended, with its attempts."""
         about = event[1]
         if about.get("action") == "remove-worker" and not about.get("expected"):
             keys = map(str, about.get("processing-tasks", ()))
@@ -359,7 +359,7 @@ class DaskPool:
 
 
 def _run_with_progress(task: Task, key: str, mark: str) -> Outcome:
-    """Do a task on a worker; now and then tell the driver how far it is."""
+    """Do a task on a worker, and send its progress to the driver now and then."""
     return do(task, _progress_sender(key, mark))
 
 

@@ -1,4 +1,4 @@
-"""What the operating system tells of a run's processes. Reads files only; Linux only."""
+"""Memory of a run's processes, read from ``/proc`` (Linux only)."""
 
 import re
 from collections.abc import Iterator
@@ -12,10 +12,10 @@ _STATUS_LINES = re.compile(r"^(PPid|VmRSS):\s+(\d+)", re.MULTILINE)
 def memory_bytes(pid: int) -> int | None:
     """Resident memory of a process and all below it, as ``top`` shows it.
 
-    What they share counts once for each.
+    Shared memory counts once for each process.
 
     Returns:
-        Bytes; None where it cannot be told: no such process, or no ``/proc``.
+        Bytes; None without such a process or without ``/proc``.
     """
     parents, resident = {}, {}
     for number, facts in _processes():
@@ -30,14 +30,14 @@ def _processes() -> Iterator[tuple[int, dict[str, int]]]:
     for path in PROC.glob("[0-9]*/status"):
         try:
             text = path.read_text()
-        except OSError:  # It has ended meanwhile.
+        except OSError:  # The process has ended.
             continue
         facts = {name: int(value) for name, value in _STATUS_LINES.findall(text)}
         yield int(path.parent.name), facts
 
 
 def _is_below(one: int, top: int, parents: dict[int, int]) -> bool:
-    """Whether a process is another or was started below it, directly or not."""
+    """Whether a process is ``top`` or was started by it, directly or not."""
     seen = set()
     while one != top and one in parents and one not in seen:
         seen.add(one)

@@ -1,8 +1,8 @@
-"""Which unit is done when, by workers that may fail, fill their memory, or be lost.
+"""Scheduling of units on workers that may fail, exceed their memory, or be lost.
 
-At most two tasks per worker thread are on their way at once, so that whoever hands them out
-never holds many. Who was there when workers died is tried again in the end, alone: so the
-unit that kills its workers is found, and no other fails with it.
+At most two tasks per worker thread are submitted at once, so that the scheduler never holds
+many. Units that were running when workers died are tried again at the end, one at a time:
+this finds the unit that kills its workers, and no other unit fails with it.
 """
 
 import math
@@ -16,7 +16,7 @@ from pipeline.engine.stage import Progress
 from pipeline.engine.units import Outcome, Task, Tell, WorkersLostError, failure
 
 RETRIES = 2
-"""A unit that fails is tried so often again before it counts as failed."""
+"""A unit is retried so often before it counts as failed."""
 TASKS_PER_THREAD = 2
 COUNT_WORKERS_EVERY_S = 5.0
 """Without news for so long, the pool is asked how many it still is."""
@@ -26,14 +26,14 @@ NO_WORKER_TIMEOUT_S = 600.0
 
 @dataclass(frozen=True, slots=True)
 class TaskEnded:
-    """A try of a unit has come to its end: take what became of it."""
+    """An attempt of a unit has ended; its result can be taken."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class TaskProgress:
-    """How far a unit is, in its own steps."""
+    """Progress of a unit in its own steps."""
 
     name: str
     done: float
@@ -43,7 +43,7 @@ class TaskProgress:
 
 @dataclass(frozen=True, slots=True)
 class WorkerMemoryFull:
-    """A worker used more memory than it may, and is restarted."""
+    """A worker exceeded its memory limit and is restarted."""
 
     worker: str
     memory_bytes: int
@@ -51,7 +51,7 @@ class WorkerMemoryFull:
 
 @dataclass(frozen=True, slots=True)
 class WorkerLost:
-    """A worker ended; the tries it had begin again on others."""
+    """A worker ended; its attempts start again on others."""
 
     worker: str
     names: tuple[str, ...]
@@ -62,12 +62,12 @@ WorkerEvent = TaskEnded | TaskProgress | WorkerMemoryFull | WorkerLost
 
 @dataclass(frozen=True, slots=True)
 class TaskFailure:
-    """Why a try came to nothing.
+    """Why an attempt failed.
 
     Attributes:
-        error: The reason.
-        trace: Where it was.
-        killed: Whether workers died while they were at it, several in a row.
+        error: The exception.
+        trace: Its traceback.
+        killed: Whether several workers in a row died during it.
     """
 
     error: BaseException
@@ -77,24 +77,24 @@ class TaskFailure:
 
 @runtime_checkable
 class WorkerPool(Protocol):
-    """Workers, wherever they are."""
+    """Workers that attempts are submitted to."""
 
     @property
     def inbox(self) -> SimpleQueue[WorkerEvent]:
-        """What they report, as it comes in."""
+        """Events of the workers, in order of arrival."""
 
     def begin(self, name: str, task: Task) -> None:
-        """Hand out a task as a try of that name."""
+        """Submit a task as an attempt of that name."""
 
     def take(self, name: str) -> Outcome | TaskFailure:
-        """Return what became of a try that has ended.
+        """Return the result of an attempt that has ended.
 
         Raises:
-            WorkersLostError: if nobody can tell.
+            WorkersLostError: if the scheduler does not know.
         """
 
     def threads(self) -> int:
-        """Count how many tasks they can do at once.
+        """Return the number of tasks that run at once.
 
         Raises:
             WorkersLostError: if there is no answer.
@@ -102,7 +102,7 @@ class WorkerPool(Protocol):
 
 
 class PoolExecutor:
-    """Does tasks by a pool of workers."""
+    """Does tasks on a pool of workers."""
 
     def __init__(self, pool: WorkerPool) -> None:
         self._crew = pool
@@ -129,17 +129,17 @@ class PoolExecutor:
 
 @dataclass(slots=True)
 class _Schedule:
-    """Tasks on their way.
+    """Tasks of one run.
 
     Attributes:
-        pool: Who does them.
-        waiting: Those not begun, the next one last.
-        progress: Is told how far the units under way are.
-        tell: Is told of lost workers.
-        suspects: Those that workers died of, or beside.
-        under_way: By the names of their tries.
-        progress_of: How far they are.
-        window: How many may be under way.
+        pool: The workers.
+        waiting: Tasks that are not submitted, the next one last.
+        progress: Receives the progress of running units.
+        tell: Receives events about workers.
+        suspects: Tasks that were running when workers died.
+        under_way: Submitted tasks by the names of their attempts.
+        progress_of: Their progress.
+        window: Largest number of submitted tasks.
     """
 
     pool: WorkerPool
@@ -158,7 +158,7 @@ class _Schedule:
     _workers_missing: bool = False
 
     def begin(self, may_start: Callable[[], bool]) -> bool:
-        """Hand out as many tasks as fit; tell whether any is under way."""
+        """Submit as many tasks as fit; return whether any is submitted."""
         if time.monotonic() - self._counted_at > COUNT_WORKERS_EVERY_S:
             self._count_workers()
         while may_start():
@@ -176,7 +176,7 @@ class _Schedule:
         self.pool.begin(name, task)
 
     def listen(self) -> Outcome | None:
-        """Wait for one piece of news; return a unit's outcome if it was that."""
+        """Wait for one event; return the outcome of a unit if it ended."""
         try:
             news = self.pool.inbox.get(timeout=COUNT_WORKERS_EVERY_S)
         except Empty:
@@ -219,7 +219,7 @@ class _Schedule:
         self.tell("worker-lost", worker=news.worker, units=units)
 
     def _count_workers(self) -> None:
-        """See how many there are: a cluster may grow and shrink meanwhile."""
+        """Count the workers: a cluster may grow and shrink."""
         threads, now = self.pool.threads(), time.monotonic()
         self._counted_at = now
         self._workers_seen_at = now if threads else self._workers_seen_at
@@ -234,7 +234,7 @@ class _Schedule:
         self.window = max(1, threads * TASKS_PER_THREAD)
 
     def emit_progress(self) -> None:
-        """Tell how far the units under way are, as one sum."""
+        """Report the progress of all running units as one sum."""
         progress_of = [share for share in self.progress_of.values() if share.total]
         if len(progress_of) == 1:
             self.progress(progress_of[0].done, progress_of[0].total, progress_of[0].note)

@@ -513,7 +513,7 @@ def test_the_command_says_in_one_line_what_is_wrong(infgen, few, source, tmp_pat
         ),
         ("authors: [Ada]", "account_name, unique_method_name, acknowledge"),
         (YAML.replace(": true", ": maybe"), "is 'maybe'; expected a valid boolean"),
-        (YAML + "authors: [Cy]\n", "stands twice"),
+        (YAML + "authors: [Cy]\n", "is given twice"),
     ],
 )
 def test_a_wrong_file_of_who_submits_what_is_explained(tmp_path, text, reason):

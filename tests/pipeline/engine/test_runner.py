@@ -330,7 +330,7 @@ def test_bad_unit_names_are_refused(workshop, monkeypatch, names):
     stage = replace(toy, plan=lambda inputs, settings: units)
     monkeypatch.setattr("pipeline.engine.plan.load_stage", lambda module: stage)
 
-    with pytest.raises(PlanError, match="bad or double unit"):
+    with pytest.raises(PlanError, match="unit with a bad or repeated name"):
         workshop.run(targets=("count",))
 
 

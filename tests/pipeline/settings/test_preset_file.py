@@ -62,11 +62,11 @@ def test_a_preset_is_read_whole(load):
     assert list(mini.arms["plain"].rollout_sets) == ["long", "brief"]
 
 
-def test_an_arm_comes_after_the_one_whose_weights_it_goes_on_from(load):
+def test_an_arm_comes_after_the_one_it_starts_from(load):
     assert list(load().preset("mini").arms) == ["plain", "fine", "whole", "part"]
 
 
-def test_preset_arm_play_and_the_arms_own_play_are_laid_over_each_other(load):
+def test_later_sections_of_a_preset_take_precedence(load):
     arms = load().preset("mini").arms
 
     assert words(arms["fine"].settings) == {"train.batch_scenes=4", "train.steps=1"}
@@ -105,7 +105,7 @@ def test_arms_are_picked_by_name_and_bring_those_that_they_start_from(load):
         ("count: 2}", "count: [2]}", r"stages.yaml:17: rollout.count is \[2\]"),
         ("count: 2}", "count: null}", "stages.yaml:17: rollout.count is None"),
         ("long: {rollout", "long: {roll", "stages.yaml:17: long: no entry 'roll'"),
-        ("brief: {rollout", "a b: {rollout", "stages.yaml:18: play 'a b'; expected"),
+        ("brief: {rollout", "a b: {rollout", "stages.yaml:18: rollout set 'a b'; expected"),
         ("starts_from: plain", "start: plain", "no entry 'start'; it is now 'starts_from'"),
         (
             "starts_from: plain",
@@ -121,7 +121,7 @@ def test_arms_are_picked_by_name_and_bring_those_that_they_start_from(load):
         (
             "rollout_sets: [long]",
             "rollout_sets: [lang]",
-            "stages.yaml:20: no play 'lang'; did you mean",
+            "stages.yaml:20: no rollout set 'lang'; did you mean",
         ),
         (
             "rollout_sets: [long]",

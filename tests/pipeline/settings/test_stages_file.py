@@ -153,8 +153,12 @@ def test_every_value_knows_its_line(load):
     [
         ("version: 1", "version: 2", "version is 2, expected 1"),
         ("profiles:", "profile:", r"stages.yaml:10: .*'profile'; did you mean 'profiles'"),
-        ("  plain: {}", "  small: {}", "stages.yaml:14: 'small' stands twice, .* line 11"),
-        ("steps: 10", "steps: 10, steps: 11", "stages.yaml:9: 'steps' stands twice"),
+        (
+            "  plain: {}",
+            "  small: {}",
+            "stages.yaml:14: 'small' is given twice, .* line 11",
+        ),
+        ("steps: 10", "steps: 10, steps: 11", "stages.yaml:9: 'steps' is given twice"),
         ("deps: [ingest]", "deps: ingest", "stages.yaml:6: deps is 'ingest'"),
         ("deps: [ingest]", "dep: [ingest]", "stages.yaml:6: .*did you mean 'deps'"),
         ("  train: {l", "  trian: {l", "stages.yaml:9: .*'trian'; did you mean 'train'"),
