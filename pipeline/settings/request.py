@@ -143,7 +143,7 @@ def _with_known_records(
     last: Mapping[str, Any],
     environ: Mapping[str, str],
 ) -> Request:
-    """Use the records of this profile's last request, of the file, or of the last request."""
+    """Use the records of this profile's last request, the file, or the last request."""
     known = before.get("records", ())
     if not known and not request.stages(environ).names_sources(request.profile):
         known = last.get("records", ())

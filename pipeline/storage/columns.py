@@ -144,7 +144,7 @@ class _Layout(NamedTuple):
 class PackedRecords(Generic[T], Sequence[T]):
     """Records sliced out of columns on demand: ``records[3]`` reads only that record.
 
-    Arrays are slices of the columns: views in memory, or read from columns on disk. Whatever
+    Arrays are slices of the columns: views in memory, or read from columns on disk. What
     depends on the type alone is computed once: training reads one record at a time.
     """
 

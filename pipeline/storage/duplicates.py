@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from infgen.scene import Scene
 
 DUPLICATE_ROWS = "duplicate_rows"
-"""Ranges ``[first, after)`` of rows of a file's scenes that are duplicates: in the report of
-stage ``ingest`` on the file, and in the tasks of stages that read it."""
+"""Ranges ``[first, after)`` of rows of a file's scenes that are duplicates: an entry in the
+report of stage ``ingest`` on the file, and in the tasks of stages that read it."""
 
 
 def mark_duplicates(index: "pl.DataFrame") -> "pl.DataFrame":
