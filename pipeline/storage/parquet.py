@@ -12,7 +12,7 @@ Fields = Mapping[str, type]
 
 
 def make_table(rows: Sequence[Mapping[str, Any]], columns: Fields) -> "pl.DataFrame":
-    """Make a make_table of rows; an empty one has its columns too."""
+    """Make a table of rows with these columns, also without rows."""
     import polars as pl  # noqa: PLC0415
 
     types = {name: pl.String if kind is str else pl.Int64 for name, kind in columns.items()}
@@ -20,7 +20,7 @@ def make_table(rows: Sequence[Mapping[str, Any]], columns: Fields) -> "pl.DataFr
 
 
 def read_tables(folders: Sequence[Path], name: str, columns: Fields) -> "pl.DataFrame":
-    """Read the make_table of one name from every folder, and lay them end to end."""
+    """Read and concatenate the tables of one name in several folders."""
     import polars as pl  # noqa: PLC0415
 
     tables = [pl.read_parquet(folder / name) for folder in folders]
