@@ -17,9 +17,9 @@ from pipeline.engine.stage import Progress, Report, Unit
 
 
 class WorkersLostError(OSError):
-    """The workers are gone, and nobody can tell how far they came.
+    """The workers are gone, and with them the units in flight.
 
-    What they have finished is on disk; the next run goes on from there.
+    Finished units are on disk; the next run continues from there.
     """
 
 

@@ -29,7 +29,7 @@ _REQUIRED = ("model", "tokenize", "vocabulary", "weights")
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> str:
-    """Write named tensors whole or not at all; return the sha256 of the file."""
+    """Write named tensors atomically; return the sha256 of the file."""
     ready = {k: tensors[k].detach().cpu().contiguous() for k in sorted(tensors)}
     data = save(ready)
     write_file(path, data)
@@ -80,7 +80,7 @@ def save_network(
 
 
 def load_network(folder: Path) -> Network:
-    """Load the network whose weights a folder holds, ready to be played.
+    """Load the network whose weights a folder holds, ready for simulation.
 
     Raises:
         StoreError: if a file is missing, damaged, or of another schema.

@@ -19,7 +19,7 @@ RETRIES = 2
 """A unit is retried so often before it counts as failed."""
 TASKS_PER_THREAD = 2
 COUNT_WORKERS_EVERY_S = 5.0
-"""Without news for so long, the pool is asked how many it still is."""
+"""Workers are counted again after so long."""
 NO_WORKER_TIMEOUT_S = 600.0
 """Without any worker for so long, a run gives up."""
 
