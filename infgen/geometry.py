@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 SQUARES_PER_COLUMN = 1 << 20
-"""Squares above each other before the next column: more than any map has."""
+"""Rows of squares in a column: more than any map needs."""
 
 
 def wrap_angle(angle_rad: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -64,7 +64,7 @@ def boxes_overlap(
 ) -> Bool[np.ndarray, "..."]:
     """Tell which boxes overlap; boxes that only touch do not.
 
-    Two rectangles are apart if and only if one's own length or width tells them apart.
+    Two rectangles are apart if and only if an axis of one of them separates them.
     """
     return ~(
         _separates(pose, size_lw_m, other, other_size_lw_m)
@@ -90,10 +90,9 @@ def _separates(
 def grid_squares(
     xy_m: Float[np.ndarray, "*shape 2"], side_m: float
 ) -> Int64[np.ndarray, "*shape"]:
-    """Number the squares of the plane that points are in.
+    """Return the number of the grid square that each point lies in.
 
-    Those above each other are consecutive, those beside each other ``SQUARES_PER_COLUMN``
-    apart.
+    Squares of a column are numbered consecutively, columns ``SQUARES_PER_COLUMN`` apart.
     """
     at = np.floor(xy_m / side_m).astype(np.int64)
     return at[..., 0] * SQUARES_PER_COLUMN + at[..., 1]

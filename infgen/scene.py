@@ -1,9 +1,9 @@
-"""One driving log: who moved how, on which roads, under which signals.
+"""One driving log: tracks, map and traffic signals.
 
 World frame: right-handed, z up, metres, relative to ``Scene.origin_xyz_m``; headings
 counter-clockwise from +x. Enum values are those of the Waymo Open Motion Dataset (WOMD)
 unless stated. Records are valid from construction on: shapes are in the annotations
-(checked while tests run), and ``Scene`` refuses rows that point nowhere.
+(checked while tests run), and ``Scene`` refuses rows out of range.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32, Float64, Int8, Int16, Int32, Int64
 
 
 class SceneError(ValueError):
-    """A log whose parts contradict each other."""
+    """A log whose fields contradict each other."""
 
 
 class AgentType(IntEnum):
@@ -70,7 +70,7 @@ class RoadEdgeType(IntEnum):
 
 
 class SignalState(IntEnum):
-    """What a traffic light shows to one lane."""
+    """State of a traffic signal for one lane."""
 
     UNKNOWN = 0
     ARROW_STOP = 1
@@ -91,7 +91,7 @@ class Side(IntEnum):
 
 
 class LinkType(IntEnum):
-    """How one lane follows another."""
+    """How one lane connects to another."""
 
     ENTRY = 0
     EXIT = 1
@@ -102,8 +102,7 @@ class Tracks:
     """The logged motion of every agent of one scene.
 
     One row per agent in the order of the log, one column per 0.1 s step. Where ``valid`` is
-    False the values are whatever the record held (the official metric reads them); nothing
-    else may.
+    False the values are those of the record; only the official metric reads them.
 
     Attributes:
         id: Track id, unique within the scene.
@@ -207,11 +206,11 @@ class RoadMap:
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """Traffic lights as a table: one row per step and signalled lane, steps ascending.
+    """Traffic signal states: one row per step and signalled lane, steps ascending.
 
     Attributes:
         step: 0.1 s step of the row.
-        lane_id: Feature id of the lane that the light speaks to.
+        lane_id: Feature id of the lane that the signal controls.
         state: ``SignalState``.
         stop_xyz_m: Where the lane's traffic stops.
     """
@@ -234,7 +233,7 @@ class Scene:
         origin_xyz_m: World position of the local origin, to add to any ``xyz_m``.
         timestamps_s: Time of each step.
         now: Last step of the history (WOMD's ``current_time_index``).
-        ego: Row of the recording car.
+        ego: Row of the recording car (WOMD's ``sdc_track_index``).
         predict_row: Rows of the tracks to predict, and ``predict_difficulty`` of each.
         interest_id: Track ids of the objects of interest.
     """
@@ -252,7 +251,7 @@ class Scene:
     signals: Signals
 
     def __post_init__(self) -> None:
-        """Refuse a scene whose rows point nowhere.
+        """Refuse a scene with rows or steps out of range.
 
         Raises:
             SceneError: naming the field, its value and what it must be.

@@ -1,4 +1,4 @@
-"""The nearest of many segments, for many points: the same answer as trying them all.
+"""Exact nearest segment of many points, by a coarse-to-fine search over cells.
 
 Points are gathered in cells, coarse then fine. From the middle of a cell to one of its
 points the distance to a segment changes by no more than the way there, times a little where

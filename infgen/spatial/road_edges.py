@@ -17,14 +17,14 @@ from infgen.scene import FeatureType, Scene
 from infgen.spatial.nearest import nearest_by_cells
 
 HEIGHT_SCALE = np.float32(3.0)
-"""Heights weigh this much more when the nearest segment is chosen."""
+"""Factor on heights when the nearest segment is chosen."""
 CLOSED_GAP_M2 = np.float32(1.0)
 """Squared distance of first and last point below which an edge is closed."""
 NONE = -1
 
 
 class RoadError(ValueError):
-    """A map without what a road feature needs."""
+    """A map without any road edge to measure from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +85,8 @@ def scene_road_edges(scene: Scene, *, flat: bool = False) -> RoadEdges | None:
     """Road edges of a scene, in its own frame; None if it has none.
 
     Args:
-        scene: Whose map it is.
-        flat: Lay all of them on the ground.
+        scene: The scene.
+        flat: Set all heights to zero.
     """
     rows = scene.road_map.rows(FeatureType.ROAD_EDGE)
     flatten = np.array([1, 1, not flat], dtype=np.float32)

@@ -1,8 +1,9 @@
-"""The agent matrix: every agent's life, moves and poses, half second by half second.
+"""The agent matrix: presence, motion token and pose of every agent at every token step.
 
-Matching rolls forward (SPEC 2.3): each move starts where the last *chosen* one ended, not
-where the log says the agent was. An error of one move is seen, and corrected, by the next;
-it never adds up. A chain starts at the pose an agent enters with, and anew after a gap.
+Matching rolls forward (SPEC 2.3): each motion token starts where the last *chosen* one
+ended, not where the log says the agent was. The next token corrects the
+error of the one before, so errors never add up. A chain of tokens starts at the pose an
+agent is inserted with, and again after a gap in the log.
 
 Encoding and decoding go through the same ``_advance`` and ``_place_inserted`` on arrays of
 the same shape, so that what is decoded equals what was encoded bit for bit.
@@ -50,7 +51,7 @@ class AgentMatrix:
 
 @dataclass(frozen=True, slots=True)
 class Anchors:
-    """Where chains of moves start from the log: at the end of ``token``, at ``pose``."""
+    """Logged poses that chains of motion tokens start from, at the end of ``token``."""
 
     agent: Int16[np.ndarray, " anchor"]
     token: Int16[np.ndarray, " anchor"]
@@ -65,13 +66,13 @@ class Anchors:
 def match_agents(
     paths: Paths, table: MatchTable, grid: Grid, order: str
 ) -> tuple[AgentMatrix, Insertions, Anchors]:
-    """Write every agent's path as an entry and the chain of moves that follows it.
+    """Tokenize every agent: its insertion and the motion tokens that follow its path.
 
     Args:
         paths: Agents at the borders of tokens.
         table: Moves to choose from.
         grid: Cells and heading bins of entries.
-        order: Order of newcomers within a token: ``distance`` or ``bearing``.
+        order: Order of inserted agents within a token: ``distance`` or ``bearing``.
     """
     seen = seen_tokens(paths.valid)
     presence = presence_states(seen)
@@ -79,31 +80,33 @@ def match_agents(
     anchors = _find_anchors(paths, seen, presence)
 
     pose = np.zeros_like(paths.pose[:, 0])
-    poses, moves, entries = [], [], []
+    poses, motion_tokens, insertions = [], [], []
     for token in range(seen.shape[1]):
         logged = paths.pose[:, token + 1]
-        move = _nearest_motion_tokens(
+        motion_token = _nearest_motion_tokens(
             logged, pose, paths.agent_type, observed[:, token], table
         )
-        pose = _advance(pose, paths.agent_type, move, anchors.at(token), table.vocabulary)
+        pose = _advance(
+            pose, paths.agent_type, motion_token, anchors.at(token), table.vocabulary
+        )
         inserted = np.flatnonzero(presence[:, token] == Presence.INSERTED)
-        move[inserted] = FIRST_MOTION_TOKEN
+        motion_token[inserted] = FIRST_MOTION_TOKEN
         if len(inserted):
             inserted = _insertion_order(inserted, logged, pose[paths.ego], paths.ego, order)
             new = encode_insertions(
                 token, inserted, logged[inserted], pose[paths.ego], grid
             )
             pose = _place_inserted(pose, new, paths.ego, grid)
-            entries.append(new)
+            insertions.append(new)
         poses.append(pose)
-        moves.append(move)
+        motion_tokens.append(motion_token)
 
-    joined = join_insertions(entries)
+    joined = join_insertions(insertions)
     path = _zero_where_absent(poses, presence)
     matrix = AgentMatrix(
         agent_type=paths.agent_type,
         pose=path,
-        motion_token=np.stack(moves, axis=1),
+        motion_token=np.stack(motion_tokens, axis=1),
         presence=presence,
         observed=observed,
         cell=_encode_cells(path, paths.ego, observed, joined, grid),
@@ -112,30 +115,32 @@ def match_agents(
 
 
 def decode_agents(
-    kind: Int8[np.ndarray, " agent"],
-    move: Int16[np.ndarray, "agent token"],
+    agent_type: Int8[np.ndarray, " agent"],
+    motion_token: Int16[np.ndarray, "agent token"],
     presence: Int8[np.ndarray, "agent token"],
-    entries: Insertions,
+    insertions: Insertions,
     anchors: Anchors,
     ego: int,
     vocabulary: MotionVocabulary,
     grid: Grid,
 ) -> AgentMatrix:
-    """Move agents along their moves from where they enter. Inverse of ``match_agents``.
+    """Rebuild the agent matrix from its tokens. Inverse of ``match_agents``.
 
-    Everything ``match_agents`` found follows from its moves, presence, entries and anchors.
+    Motion tokens, presence, insertions and anchors determine all other fields.
     """
-    pose = np.zeros((len(kind), 3), dtype=np.float32)
+    pose = np.zeros((len(agent_type), 3), dtype=np.float32)
     poses = []
-    for token in range(move.shape[1]):
-        pose = _advance(pose, kind, move[:, token], anchors.at(token), vocabulary)
-        new = entries.at(token)
+    for token in range(motion_token.shape[1]):
+        pose = _advance(
+            pose, agent_type, motion_token[:, token], anchors.at(token), vocabulary
+        )
+        new = insertions.at(token)
         if len(new.agent):
             pose = _place_inserted(pose, new, ego, grid)
         poses.append(pose)
-    path, observed = _zero_where_absent(poses, presence), move >= 0
-    cell = _encode_cells(path, ego, observed, entries, grid)
-    return AgentMatrix(kind, path, move, presence, observed, cell)
+    path, observed = _zero_where_absent(poses, presence), motion_token >= 0
+    cell = _encode_cells(path, ego, observed, insertions, grid)
+    return AgentMatrix(agent_type, path, motion_token, presence, observed, cell)
 
 
 def agent_matrix(tokens: SceneTokens) -> AgentMatrix:
@@ -153,9 +158,10 @@ def agent_matrix(tokens: SceneTokens) -> AgentMatrix:
 def decode_tracks(
     matrix: AgentMatrix, vocabulary: MotionVocabulary, clock: Clock = CLOCK
 ) -> tuple[Float32[np.ndarray, "agent step 3"], Bool[np.ndarray, "agent step"]]:
-    """Draw agents at every 0.1 s step along the paths of their moves (SPEC 2.4).
+    """Decode motion tokens to poses at every 0.1 s step (SPEC 2.4).
 
-    An agent is drawn from the pose it enters with, the end of its first token, on.
+    The first decoded pose is the one at which the agent is inserted: the end of its first
+        token.
 
     Returns:
         Poses [agent, step, 3], zero where unknown, and whether they are known.
@@ -170,7 +176,7 @@ def decode_tracks(
     steps[:, 1:][moving] = to_world(path[moving], before[moving][:, None])
     known[:, 1:][moving] = True
 
-    # Pose at a token's end: where agents enter, and where chains start anew.
+    # Poses at a token's end: insertions, and the first pose after a gap.
     placed = matrix.presence == Presence.INSERTED
     placed[:, :-1] |= moving & (matrix.motion_token[:, :-1] == NO_MOTION_TOKEN)
     steps[placed, -1] = matrix.pose[placed]
@@ -193,24 +199,26 @@ def _find_anchors(paths: Paths, seen: np.ndarray, presence: np.ndarray) -> Ancho
 def _nearest_motion_tokens(
     logged: np.ndarray,
     pose: np.ndarray,
-    kind: np.ndarray,
+    agent_type: np.ndarray,
     observed: np.ndarray,
     table: MatchTable,
 ) -> np.ndarray:
-    move = np.full(len(pose), NO_MOTION_TOKEN, dtype=np.int16)
+    motion_token = np.full(len(pose), NO_MOTION_TOKEN, dtype=np.int16)
     rows = np.flatnonzero(observed)
-    move[rows] = nearest_motion_tokens(logged[rows], pose[rows], kind[rows], table)
-    return move
+    motion_token[rows] = nearest_motion_tokens(
+        logged[rows], pose[rows], agent_type[rows], table
+    )
+    return motion_token
 
 
 def _advance(
     pose: np.ndarray,
-    kind: np.ndarray,
-    move: np.ndarray,
+    agent_type: np.ndarray,
+    motion_token: np.ndarray,
     anchors: Anchors,
     vocabulary: MotionVocabulary,
 ) -> np.ndarray:
-    pose = advance(pose, kind, move, vocabulary)
+    pose = advance(pose, agent_type, motion_token, vocabulary)
     pose[anchors.agent] = anchors.pose
     return pose
 
@@ -218,33 +226,33 @@ def _advance(
 def _insertion_order(
     inserted: np.ndarray, logged: np.ndarray, ego_pose: np.ndarray, ego: int, order: str
 ) -> np.ndarray:
-    """Order the rows of newcomers; the ego is always the first."""
+    """Order the rows of inserted agents; the ego is always the first."""
     inserted = inserted[insertion_order(logged[inserted], ego_pose, order)]
     return inserted[np.argsort(inserted != ego, kind="stable")]
 
 
 def _place_inserted(
-    pose: np.ndarray, entries: Insertions, ego: int, grid: Grid
+    pose: np.ndarray, insertions: Insertions, ego: int, grid: Grid
 ) -> np.ndarray:
-    """Put newcomers where their entries say, but for the ego: its anchor says where."""
-    pose, others = pose.copy(), entries.agent != ego
-    entered = decode_insertions(entries, pose[ego], grid)
-    pose[entries.agent[others]] = entered[others]
+    """Set the poses of inserted agents; the ego takes its pose from its anchor."""
+    pose, others = pose.copy(), insertions.agent != ego
+    entered = decode_insertions(insertions, pose[ego], grid)
+    pose[insertions.agent[others]] = entered[others]
     return pose
 
 
 def _zero_where_absent(poses: list[np.ndarray], presence: np.ndarray) -> np.ndarray:
-    """Return poses [agent, token, 3]; zero for who is not there."""
+    """Stack poses [agent, token, 3]; absent agents get zeros."""
     path = np.stack(poses, axis=1)
     path[presence == Presence.ABSENT] = 0
     return path
 
 
 def _encode_cells(
-    pose: np.ndarray, ego: int, observed: np.ndarray, entries: Insertions, grid: Grid
+    pose: np.ndarray, ego: int, observed: np.ndarray, insertions: Insertions, grid: Grid
 ) -> np.ndarray:
-    """Return the cell of every agent seen; who enters is in the cell of its entry."""
+    """Return the cell of every observed agent; insertions keep the cell they encode."""
     cell = encode_cell(to_grid(pose[..., :2], pose[ego]), grid)
     cell = np.where(observed, cell, np.int16(NO_CELL))
-    cell[entries.agent, entries.token] = entries.cell
+    cell[insertions.agent, insertions.token] = insertions.cell
     return cell

@@ -1,8 +1,7 @@
-"""Agents coming in: where and how each newcomer stands to the ego, in tokens.
+"""Insertions as tokens: position cell and heading bin of each agent relative to the ego.
 
-A newcomer is a cell of the ego's grid and a bin of heading; the offset from the cell's
-centre and the residual from the bin's middle are kept beside, so its pose comes back. The
-pose it enters with *is* what these decode to.
+The offset from the cell's centre and the residual from the bin's middle are kept too. The
+pose of an inserted agent is by definition what its insertion decodes to.
 """
 
 from dataclasses import dataclass
@@ -24,26 +23,26 @@ from infgen.tokens.grid import (
 
 @dataclass(frozen=True, slots=True)
 class Insertions:
-    """Newcomers, token by token.
+    """Insertions of a scene, in the order of their token steps.
 
     Attributes:
-        token: Token at which each enters, ascending.
-        agent: Its row.
+        token: Token step of each insertion, ascending.
+        agent: Row of the agent.
         cell: Cell of the ego's grid, or ``NO_CELL``.
         offset_m: Position less the cell's centre, in the grid frame.
         heading: Heading bin relative to the ego.
         residual_rad: Relative heading less the bin's middle.
     """
 
-    token: Int16[np.ndarray, " entry"]
-    agent: Int16[np.ndarray, " entry"]
-    cell: Int16[np.ndarray, " entry"]
-    offset_m: Float32[np.ndarray, "entry 2"]
-    heading: Int16[np.ndarray, " entry"]
-    residual_rad: Float32[np.ndarray, " entry"]
+    token: Int16[np.ndarray, " insertion"]
+    agent: Int16[np.ndarray, " insertion"]
+    cell: Int16[np.ndarray, " insertion"]
+    offset_m: Float32[np.ndarray, "insertion 2"]
+    heading: Int16[np.ndarray, " insertion"]
+    residual_rad: Float32[np.ndarray, " insertion"]
 
     def at(self, token: int) -> "Insertions":
-        """Return the newcomers of one token."""
+        """Return the insertions of one token step."""
         rows = slice(*np.searchsorted(self.token, [token, token + 1]))
         return Insertions(
             token=self.token[rows],
@@ -57,12 +56,12 @@ class Insertions:
 
 def encode_insertions(
     token: int,
-    agent: Int64[np.ndarray, " entry"],
-    pose: Float32[np.ndarray, "entry 3"],
+    agent: Int64[np.ndarray, " insertion"],
+    pose: Float32[np.ndarray, "insertion 3"],
     ego_pose: Float32[np.ndarray, "3"],
     grid: Grid,
 ) -> Insertions:
-    """Write newcomers of one token by where they stand to the ego. Keeps their order."""
+    """Encode the poses of the agents inserted at one token step, in the given order."""
     xy_m = to_grid(pose[:, :2], ego_pose)
     relative_rad = wrap_angle(pose[:, 2] - ego_pose[2])
     cell, heading = encode_cell(xy_m, grid), encode_heading(relative_rad, grid)
@@ -77,28 +76,28 @@ def encode_insertions(
 
 
 def decode_insertions(
-    entries: Insertions, ego_pose: Float32[np.ndarray, "3"], grid: Grid
-) -> Float32[np.ndarray, "entry 3"]:
-    """Return the poses at which newcomers of one token enter."""
-    xy_m = from_grid(decode_cell(entries.cell, grid) + entries.offset_m, ego_pose)
-    relative_rad = decode_heading(entries.heading, grid) + entries.residual_rad
+    insertions: Insertions, ego_pose: Float32[np.ndarray, "3"], grid: Grid
+) -> Float32[np.ndarray, "insertion 3"]:
+    """Decode the poses of insertions at one step. Inverse of ``encode_insertions``."""
+    xy_m = from_grid(decode_cell(insertions.cell, grid) + insertions.offset_m, ego_pose)
+    relative_rad = decode_heading(insertions.heading, grid) + insertions.residual_rad
     heading_rad = wrap_angle(relative_rad + ego_pose[2])
     return np.concatenate([xy_m, heading_rad[:, None]], axis=-1)
 
 
 def insertion_order(
-    pose: Float32[np.ndarray, "entry 3"], ego_pose: Float32[np.ndarray, "3"], order: str
-) -> Int64[np.ndarray, " entry"]:
-    """Order newcomers of one token by their ``insertion_key``."""
+    pose: Float32[np.ndarray, "insertion 3"], ego_pose: Float32[np.ndarray, "3"], order: str
+) -> Int64[np.ndarray, " insertion"]:
+    """Return the rows of agents inserted at one step, ordered by ``insertion_key``."""
     return np.argsort(insertion_key(pose, ego_pose, order), kind="stable")
 
 
 def insertion_key(
-    pose: Float32[np.ndarray, "entry 3"],
-    ego_pose: Float32[np.ndarray, "*#entry 3"],
+    pose: Float32[np.ndarray, "insertion 3"],
+    ego_pose: Float32[np.ndarray, "*#insertion 3"],
     order: str,
-) -> Float32[np.ndarray, " entry"]:
-    """Return what newcomers of one token are ordered by, ascending.
+) -> Float32[np.ndarray, " insertion"]:
+    """Return the sort key of agents inserted at one token step, ascending.
 
     Args:
         pose: Where they are.
@@ -113,7 +112,7 @@ def insertion_key(
 
 
 def join_insertions(parts: list[Insertions]) -> Insertions:
-    """Lay the newcomers of consecutive tokens end to end."""
+    """Concatenate the insertions of consecutive token steps."""
     return Insertions(
         token=np.concatenate([part.token for part in parts]),
         agent=np.concatenate([part.agent for part in parts]),

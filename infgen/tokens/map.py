@@ -1,4 +1,4 @@
-"""Map lines as road tokens: pieces of at most five metres, each matched to one shape.
+"""Map tokens: pieces of polylines of at most five metres, each matched to one shape.
 
 Every lane, road line and road edge is a line; a crosswalk, speed bump or driveway is drawn
 as its two long sides, each in both directions. Lines are broken where consecutive points do
@@ -35,7 +35,7 @@ _MATCH_BLOCK = 512
 
 
 class PointType(IntEnum):
-    """What a road token is drawn on the ground as (ten kinds, after CatK)."""
+    """Type of the points of a map token (ten types, after CatK)."""
 
     FREEWAY = 0
     SURFACE_STREET = 1
@@ -50,7 +50,7 @@ class PointType(IntEnum):
 
 
 class PolylineType(IntEnum):
-    """What kind of feature a road token is part of."""
+    """Type of the polyline a map token is part of."""
 
     LANE = 0
     ROAD_LINE = 1
@@ -105,14 +105,14 @@ class MapPolylinePieces:
         feature_id: Map feature that the line was drawn from.
     """
 
-    pose: Float32[np.ndarray, "road 3"]
-    z_m: Float32[np.ndarray, " road"]
-    curve_m: Float32[np.ndarray, "road 11 2"]
-    length_m: Float32[np.ndarray, " road"]
-    point_type: Int8[np.ndarray, " road"]
-    polyline_type: Int8[np.ndarray, " road"]
-    polyline: Int32[np.ndarray, " road"]
-    feature_id: Int64[np.ndarray, " road"]
+    pose: Float32[np.ndarray, "map_token 3"]
+    z_m: Float32[np.ndarray, " map_token"]
+    curve_m: Float32[np.ndarray, "map_token 11 2"]
+    length_m: Float32[np.ndarray, " map_token"]
+    point_type: Int8[np.ndarray, " map_token"]
+    polyline_type: Int8[np.ndarray, " map_token"]
+    polyline: Int32[np.ndarray, " map_token"]
+    feature_id: Int64[np.ndarray, " map_token"]
 
     @property
     def num_map_tokens(self) -> int:
@@ -120,7 +120,7 @@ class MapPolylinePieces:
         return len(self.polyline)
 
     @property
-    def sample_m(self) -> Float32[np.ndarray, "road 3 2"]:
+    def sample_m(self) -> Float32[np.ndarray, "map_token 3 2"]:
         """First, middle and last point, in the frame of the piece's pose."""
         return self.curve_m[:, list(MAP_SAMPLE_POINTS)]
 
@@ -170,14 +170,14 @@ def cut_map_tokens(road_map: RoadMap) -> MapPolylinePieces:
 
 def match_map_tokens(
     pieces: MapPolylinePieces, vocabulary: MapVocabulary
-) -> Int16[np.ndarray, " road"]:
+) -> Int16[np.ndarray, " map_token"]:
     """Find the shape nearest to each piece: least sum of squared gaps of three points."""
     return nearest_map_tokens(pieces.curve_m, vocabulary)
 
 
 def nearest_map_tokens(
-    curve_m: Float32[np.ndarray, "road 11 2"], vocabulary: MapVocabulary
-) -> Int16[np.ndarray, " road"]:
+    curve_m: Float32[np.ndarray, "map_token 11 2"], vocabulary: MapVocabulary
+) -> Int16[np.ndarray, " map_token"]:
     """Find the shape nearest to each curve in the frame of its piece.
 
     The first points coincide by construction, so four numbers decide. The squared gap, less

@@ -1,6 +1,7 @@
-"""From poses to moves and back: the nearest row of a vocabulary, and where it leads.
+"""From poses to motion tokens and back: the nearest row of a vocabulary, and its end pose.
 
-Two moves are as far apart as the corners of a box at their ends are on average (SPEC 2.1).
+The distance of two motion tokens is the mean distance of the corners of a box at their ends
+(SPEC 2.1).
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from infgen.geometry import box_corners, to_local, to_world
 from infgen.tokens.vocabulary import MotionVocabulary
 
 _BLOCK_ROWS = 4096
-"""Keeps the table of gaps (rows x moves) within 32 MiB."""
+"""Keeps the table of distances (rows x motion tokens) within 32 MiB."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -21,24 +22,24 @@ class MatchTable:
     """A motion vocabulary laid out for matching.
 
     The *spread* of a pose is the point (x, y, r cos heading, r sin heading), where r is
-    half the diagonal of the kind's box. The distance of two spreads is the root mean square
-    distance of the corners. As opposite corners turn opposite ways, the mean distance is at
-    most that, and at least 1 / sqrt(2) of it: so the nearest spread tells which few moves
-    are worth measuring.
+    half the diagonal of the agent type's box. The distance of two spreads is the root mean
+    square distance of the corners. As opposite corners turn opposite ways, the mean
+    distance is at most that, and at least 1 / sqrt(2) of it: so the nearest spread tells
+    which few motion tokens are worth measuring.
 
     Attributes:
-        vocabulary: The moves.
-        reach_m: Half the diagonal of each kind's box.
-        weights: One column per move and kind: the spread of its end times -2, then its
-            squared length. The product with a spread and a one is the squared distance of
-            the two less the square of the one.
-        corners_m: Corners of each kind's box at each move's end: x of the four, then y.
+        vocabulary: The motion tokens.
+        reach_m: Half the diagonal of each agent type's box.
+        weights: One column per motion token and agent type: the spread of its end times -2,
+            then its squared length. The product with a spread and a one is the squared
+            distance of the two less the square of the one.
+        corners_m: Corners of the box at each motion token's end: x of the four, then y.
     """
 
     vocabulary: MotionVocabulary
     reach_m: Float32[np.ndarray, " 3"]
-    weights: Float32[np.ndarray, "3 5 move"]
-    corners_m: Float64[np.ndarray, "3 move 8"]
+    weights: Float32[np.ndarray, "3 5 motion"]
+    corners_m: Float64[np.ndarray, "3 motion 8"]
 
 
 @lru_cache(maxsize=4)
@@ -56,11 +57,11 @@ def make_match_table(vocabulary: MotionVocabulary) -> MatchTable:
 
 
 @lru_cache(maxsize=4)
-def neighbour_tokens(table: MatchTable, count: int) -> Int16[np.ndarray, "3 move near"]:
-    """Return for each move some that end near to it, itself (or a twin) among them.
+def neighbour_tokens(table: MatchTable, count: int) -> Int16[np.ndarray, "3 motion near"]:
+    """Return the motion tokens that end nearest to each, itself (or an equal one) included.
 
     Args:
-        table: The moves.
+        table: The motion tokens.
         count: How many.
     """
     near = []
@@ -74,99 +75,99 @@ def neighbour_tokens(table: MatchTable, count: int) -> Int16[np.ndarray, "3 move
 def nearest_motion_tokens(
     target: Float32[np.ndarray, "row 3"],
     pose: Float32[np.ndarray, "row 3"],
-    kind: Int8[np.ndarray, " row"],
+    agent_type: Int8[np.ndarray, " row"],
     table: MatchTable,
 ) -> Int16[np.ndarray, " row"]:
-    """Find the move from each pose that ends nearest to each target.
+    """Find the motion token from each pose that ends nearest to each target.
 
-    Nearest is the least mean distance of the corners of the kind's box; of equally near
-    moves the first.
+    Nearest is the least mean distance of the corners of the agent type's box; of equally
+    near ones the first.
 
     Args:
-        target: Where each agent is at the end of the move.
-        pose: Where the move starts.
-        kind: ``AgentType`` of each agent.
-        table: The moves to choose from.
+        target: Where each agent is at the end of the motion token.
+        pose: Where the motion token starts.
+        agent_type: ``AgentType`` of each agent.
+        table: The motion tokens to choose from.
     """
-    return nearest_k_motion_tokens(target, pose, kind, table, 1)[:, 0]
+    return nearest_k_motion_tokens(target, pose, agent_type, table, 1)[:, 0]
 
 
 def nearest_k_motion_tokens(
     target: Float32[np.ndarray, "row 3"],
     pose: Float32[np.ndarray, "row 3"],
-    kind: Int8[np.ndarray, " row"],
+    agent_type: Int8[np.ndarray, " row"],
     table: MatchTable,
     count: int,
 ) -> Int16[np.ndarray, "row near"]:
-    """Find the few moves from each pose that end nearest to each target, nearest first.
+    """Find the ``count`` motion tokens that end nearest to each target, nearest first.
 
-    What near is and the arguments are as for ``nearest_motion_tokens``, the first of these;
-    there must be ``count`` moves.
+    Distance and arguments are those of ``nearest_motion_tokens``; the vocabulary must hold
+    ``count`` tokens.
     """
-    order = np.argsort(kind, kind="stable")
-    move = np.empty((len(order), count), dtype=np.int16)
+    order = np.argsort(agent_type, kind="stable")
+    motion_token = np.empty((len(order), count), dtype=np.int16)
     near = neighbour_tokens(table, count)
     for start in range(0, len(order), _BLOCK_ROWS):
         rows = order[start : start + _BLOCK_ROWS]
         wanted = to_local(target[rows], pose[rows])
-        move[rows] = _nearest(wanted, kind[rows], table, near)
-    return move
+        motion_token[rows] = _nearest(wanted, agent_type[rows], table, near)
+    return motion_token
 
 
 def advance(
     pose: Float32[np.ndarray, "agent 3"],
-    kind: Int8[np.ndarray, " agent"],
-    move: Int16[np.ndarray, " agent"],
+    agent_type: Int8[np.ndarray, " agent"],
+    motion_token: Int16[np.ndarray, " agent"],
     vocabulary: MotionVocabulary,
 ) -> Float32[np.ndarray, "agent 3"]:
-    """Move agents on by half a second; who has no move (a negative one) stays."""
-    end = vocabulary.end_pose[kind, np.maximum(move, 0)]
-    return np.where(move[:, None] >= 0, to_world(end, pose), pose)
+    """Advance agents by one motion token; those without one (negative) stay."""
+    end = vocabulary.end_pose[agent_type, np.maximum(motion_token, 0)]
+    return np.where(motion_token[:, None] >= 0, to_world(end, pose), pose)
 
 
 def follow(
     target: Float32[np.ndarray, "agent 3"],
     pose: Float32[np.ndarray, "agent 3"],
-    kind: Int8[np.ndarray, " agent"],
+    agent_type: Int8[np.ndarray, " agent"],
     table: MatchTable,
 ) -> tuple[Int16[np.ndarray, " agent"], Float32[np.ndarray, "agent 3"]]:
-    """Write one half second of agents driven from outside as moves.
+    """Encode one token step of externally controlled agents as motion tokens.
 
-    Called once per half second with the pose it returned before, the chain of moves follows
-    the targets, and an error of one move is corrected by the next.
+    Called once per token step with the pose it returned before, the chain of motion tokens
+    follows the targets, and an error of one motion token is corrected by the next.
 
     Returns:
-        The moves, and the poses they lead to.
+        The motion tokens, and the poses they lead to.
     """
-    move = nearest_motion_tokens(target, pose, kind, table)
-    return move, advance(pose, kind, move, table.vocabulary)
+    motion_token = nearest_motion_tokens(target, pose, agent_type, table)
+    return motion_token, advance(pose, agent_type, motion_token, table.vocabulary)
 
 
 def _nearest(
-    wanted: np.ndarray, kind: np.ndarray, table: MatchTable, near: np.ndarray
+    wanted: np.ndarray, agent_type: np.ndarray, table: MatchTable, near: np.ndarray
 ) -> np.ndarray:
-    """Return the nearest moves [row, few] of each pose wanted; ``kind`` ascends."""
-    corners_m = _corners(wanted, table.vocabulary.size_lw_m[kind])  # [row, 8]
-    row, move = _candidates(wanted, corners_m, kind, table, near)
-    gap_m = _mean_gap(table.corners_m[kind[row], move], corners_m[row])
+    """Return the nearest motion tokens [row, few] of each pose; ``agent_type`` ascends."""
+    corners_m = _corners(wanted, table.vocabulary.size_lw_m[agent_type])  # [row, 8]
+    row, motion_token = _candidates(wanted, corners_m, agent_type, table, near)
+    gap_m = _mean_gap(table.corners_m[agent_type[row], motion_token], corners_m[row])
 
     order = np.lexsort([gap_m, row])  # Stable: of equally near moves the first.
     first = np.searchsorted(row, np.arange(len(wanted)))
-    return move[order[first[:, None] + np.arange(near.shape[2])]]
+    return motion_token[order[first[:, None] + np.arange(near.shape[2])]]
 
 
 def _candidates(
     wanted: np.ndarray,
     corners_m: np.ndarray,
-    kind: np.ndarray,
+    agent_type: np.ndarray,
     table: MatchTable,
     near: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows and moves, ascending, among which each row's nearest few surely are."""
-    spread = _spread(wanted, table.reach_m[kind])
+    """Return rows and motion tokens, ascending, sure to hold each row's nearest few."""
+    spread = _spread(wanted, table.reach_m[agent_type])
     square = (spread**2).sum(axis=-1)
     spread = np.column_stack([spread, np.ones_like(square)])
-    ends = np.searchsorted(kind, np.arange(4))
+    ends = np.searchsorted(agent_type, np.arange(4))
     found = []
     for number in np.flatnonzero(np.diff(ends)):
         rows = slice(ends[number], ends[number + 1])

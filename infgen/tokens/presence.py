@@ -1,8 +1,8 @@
-"""Who is there: from what the log shows of each agent to the states of its life (SPEC 3.3).
+"""Presence of agents at each token step, from their logged validity (SPEC 3.3).
 
-A token is *seen* if the log shows the agent at both its ends. An agent enters at its first
-seen token and leaves at its last one. What it does while it enters is swallowed: its first
-move is that of the next token.
+A token is *seen* if the log shows the agent at both its ends. An agent is
+inserted at its first seen token and removed at its last one. Its motion during the first
+token is not encoded: its first motion token is that of the next token step.
 """
 
 import numpy as np
@@ -29,18 +29,18 @@ def last_token(seen: Bool[np.ndarray, "agent token"]) -> Int64[np.ndarray, " age
 
 
 def has_motion(seen: Bool[np.ndarray, "agent token"]) -> Bool[np.ndarray, " agent"]:
-    """Tell the agents of whom one token and the next are seen: there is a move to learn."""
+    """Tell which agents are seen in two tokens in a row, so have motion to learn."""
     return (seen[:, :-1] & seen[:, 1:]).any(axis=1)
 
 
 def presence_states(
     seen: Bool[np.ndarray, "agent token"],
 ) -> Int8[np.ndarray, "agent token"]:
-    """Give each agent its presence at each token.
+    """Return the ``Presence`` of each agent at each token step.
 
-    The end of the log is not an exit: who is seen in the last token stays. A gap is not one
-    either: an agent is present throughout its life, seen or not. A life of one token is
-    ``INSERTED``, then ``ABSENT``: nobody leaves who has not moved.
+    An agent seen in the last token of the log is not removed. A gap does not end presence:
+    an agent is present from its first to its last seen token. An agent seen in one token
+    only is ``INSERTED``, then ``ABSENT``.
     """
     tokens = np.arange(seen.shape[1])
     first, last = first_token(seen)[:, None], last_token(seen)[:, None]
@@ -54,14 +54,14 @@ def presence_states(
 def observed_tokens(
     seen: Bool[np.ndarray, "agent token"], presence: Int8[np.ndarray, "agent token"]
 ) -> Bool[np.ndarray, "agent token"]:
-    """Tell the tokens at which an agent's own motion is known: seen, and not entering."""
+    """Tell the tokens whose motion is known: seen, and not the insertion."""
     return seen & (presence != Presence.INSERTED)
 
 
 def gap_ends(
     seen: Bool[np.ndarray, "agent token"], presence: Int8[np.ndarray, "agent token"]
 ) -> Bool[np.ndarray, "agent token"]:
-    """Tell the last token of each gap: at its end the agent is back in the log."""
+    """Tell the last token of each gap: at its end the agent is valid again."""
     back = np.zeros_like(seen)
     back[:, :-1] = ~seen[:, :-1] & seen[:, 1:] & (presence[:, :-1] != Presence.ABSENT)
     return back

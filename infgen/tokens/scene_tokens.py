@@ -1,7 +1,7 @@
-"""What the model reads of a scene: agents as tokens, newcomers, roads, and the stream.
+"""The tokens of one scene: agents, insertions, map and the interleaved sequence.
 
 The agent matrix has one row per kept agent and one column per half-second token; a token's
-pose is the pose at its end. ``Presence`` says what each cell of the matrix is.
+pose is the pose at its end. ``Presence`` is the state of each entry of the matrix.
 """
 
 from dataclasses import dataclass
@@ -11,15 +11,15 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8, Int16, Int32, UInt8, UInt16
 
 NO_MOTION_TOKEN = -1
-"""Move of a token at which the agent is absent or not observed."""
+"""Motion token of a token step at which the agent is absent or not observed."""
 FIRST_MOTION_TOKEN = -2
-"""Move of the token at which an agent enters (the paper's BOS)."""
+"""Motion token of the token step at which an agent is inserted (the paper's BOS)."""
 NO_CELL = -1
 """Cell of an absent agent, or of one outside the grid."""
 
 
 class Presence(IntEnum):
-    """Where an agent is in its life."""
+    """State of an agent at a token step."""
 
     ABSENT = 0
     PRESENT = 1
@@ -28,7 +28,7 @@ class Presence(IntEnum):
 
 
 class SignalClass(IntEnum):
-    """Signal states merged to what a driver does about them."""
+    """Signal states merged by what they ask of a driver."""
 
     STOP = 0
     GO = 1
@@ -38,7 +38,7 @@ class SignalClass(IntEnum):
 
 
 class TokenType(IntEnum):
-    """Kinds of token in the interleaved stream."""
+    """Token types in the interleaved sequence."""
 
     MOTION = 0
     KEEP = 1
@@ -68,40 +68,42 @@ class SceneTokens:
         z_m: Height of the box centre at each token's end; meaningless where absent.
         pose: Quantised x, y, heading at each token's end; zero where absent. An agent that
             is present but not observed keeps the last pose it had.
-        motion_token: Row of the kind's vocabulary, ``FIRST_MOTION_TOKEN`` or
-            ``NO_MOTION_TOKEN``.
+        motion_token: Row of the motion vocabulary of the agent's type,
+            ``FIRST_MOTION_TOKEN`` or ``NO_MOTION_TOKEN``.
         presence: ``Presence``.
         observed: Whether the log shows the agent at both ends of the token; False at
             ``INSERTED`` (SPEC 3.3).
         pattern: Bit i: whether the log shows the agent at step i + 1 of the token, before
-            short gaps are filled and at any distance (``tokens.patterns``); 0 where absent.
+            short gaps are filled and at any distance (``tokens.validity_patterns``); 0
+            where absent.
         cell: Cell of the ego's grid that holds the agent, or ``NO_CELL``; only where it is
-            observed or entering.
+            observed or inserted.
         near: Whether the agent is ever observed within the motion-loss radius of the ego.
-        insertion_token: Token at which each newcomer enters, ascending; within a token from
-            near to far. Who enters outside the grid has ``insertion_cell`` ``NO_CELL``.
-        insertion_agent: Row of the newcomer.
+        insertion_token: Token step of each insertion, ascending; within a step from near
+            to far. An insertion outside the grid has ``insertion_cell`` ``NO_CELL``.
+        insertion_agent: Row of the inserted agent.
         insertion_offset_m: Position less the cell's centre, in the ego's grid frame.
         insertion_heading: Heading bin relative to the ego.
         insertion_residual_rad: Heading less the bin's centre.
-        map_pose: First point and heading of each road token.
+        map_pose: First point and heading of each map token.
         map_z_m: Height of its first point.
         map_token: Row of the map vocabulary.
-        map_point_type: Kind of its points (``tokens.roads.PointType``).
-        map_polyline_type: Kind of the polyline it is part of
-            (``tokens.roads.PolylineType``).
+        map_point_type: ``tokens.map.PointType``.
+        map_polyline_type: ``tokens.map.PolylineType`` of its polyline.
         map_polyline: Index of that polyline; consecutive tokens of one polyline are
             adjacent.
         map_signal: ``SignalClass`` of its lane at ``now``.
         signal_polyline: Polylines (as in ``map_polyline``) that ever have a signal.
         signal_state: ``SignalClass`` of those at each token's end.
-        sequence_type: The interleaved stream: ``TokenType`` ...
-        sequence_value: ... its value (move, cell, heading bin or kind; else 0) ...
+        sequence_type: The interleaved sequence: ``TokenType`` ...
+        sequence_value: ... its value (motion token, cell, heading bin or agent type; else
+            0) ...
         sequence_agent: ... the agent's row (-1 for ``BEGIN_MOTION``) ...
-        sequence_step: ... and the half second it belongs to.
-        anchor_agent: Rows whose chain of moves starts anew from the log: after a gap (at
-            the last token not observed), and the ego at its first token. ``anchor_token``
-            is when, ``anchor_pose`` the pose at that token's end.
+        sequence_step: ... and the token step it belongs to.
+        anchor_agent: Row of each agent whose chain of motion tokens restarts from the log:
+            after a gap (at the last token not observed), and the ego at its first token.
+        anchor_token: Token step of the restart.
+        anchor_pose: Logged pose at the end of that token.
     """
 
     scenario_id: str
@@ -119,25 +121,25 @@ class SceneTokens:
     pattern: UInt8[np.ndarray, "agent token"]
     cell: Int16[np.ndarray, "agent token"]
     near: Bool[np.ndarray, " agent"]
-    insertion_token: Int16[np.ndarray, " entry"]
-    insertion_agent: Int16[np.ndarray, " entry"]
-    insertion_cell: Int16[np.ndarray, " entry"]
-    insertion_offset_m: Float32[np.ndarray, "entry 2"]
-    insertion_heading: Int16[np.ndarray, " entry"]
-    insertion_residual_rad: Float32[np.ndarray, " entry"]
-    map_pose: Float32[np.ndarray, "road 3"]
-    map_z_m: Float32[np.ndarray, " road"]
-    map_token: Int16[np.ndarray, " road"]
-    map_point_type: Int8[np.ndarray, " road"]
-    map_polyline_type: Int8[np.ndarray, " road"]
-    map_polyline: Int32[np.ndarray, " road"]
-    map_signal: Int8[np.ndarray, " road"]
+    insertion_token: Int16[np.ndarray, " insertion"]
+    insertion_agent: Int16[np.ndarray, " insertion"]
+    insertion_cell: Int16[np.ndarray, " insertion"]
+    insertion_offset_m: Float32[np.ndarray, "insertion 2"]
+    insertion_heading: Int16[np.ndarray, " insertion"]
+    insertion_residual_rad: Float32[np.ndarray, " insertion"]
+    map_pose: Float32[np.ndarray, "map_token 3"]
+    map_z_m: Float32[np.ndarray, " map_token"]
+    map_token: Int16[np.ndarray, " map_token"]
+    map_point_type: Int8[np.ndarray, " map_token"]
+    map_polyline_type: Int8[np.ndarray, " map_token"]
+    map_polyline: Int32[np.ndarray, " map_token"]
+    map_signal: Int8[np.ndarray, " map_token"]
     signal_polyline: Int32[np.ndarray, " signal"]
     signal_state: Int8[np.ndarray, "signal token"]
-    sequence_type: UInt8[np.ndarray, " word"]
-    sequence_value: Int16[np.ndarray, " word"]
-    sequence_agent: Int16[np.ndarray, " word"]
-    sequence_step: UInt16[np.ndarray, " word"]
+    sequence_type: UInt8[np.ndarray, " item"]
+    sequence_value: Int16[np.ndarray, " item"]
+    sequence_agent: Int16[np.ndarray, " item"]
+    sequence_step: UInt16[np.ndarray, " item"]
     anchor_agent: Int16[np.ndarray, " anchor"]
     anchor_token: Int16[np.ndarray, " anchor"]
     anchor_pose: Float32[np.ndarray, "anchor 3"]
@@ -154,5 +156,5 @@ class SceneTokens:
 
     @property
     def num_map_tokens(self) -> int:
-        """Number of road tokens."""
+        """Number of map tokens."""
         return len(self.map_token)

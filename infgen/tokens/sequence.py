@@ -1,11 +1,11 @@
-"""The interleaved stream: one scene as one sequence of words, and back.
+"""The interleaved sequence: the agent matrix as one sequence of tokens, and back.
 
-Each half second says (SPEC 3.4): ``MOVE`` of every observed agent that was there before,
-from near to far of the ego; ``STAY`` or ``LEAVE`` of every agent that was there before, in
-the same order; for each newcomer ``ADD, CELL, HEADING, KIND``; then ``BEGIN_MOTION``. Near
-and far are measured where agents were at the end of the half second before, so the order
-tells nothing of what is to come. A newcomer gone with its first half second has a ``LEAVE``
-right after its ``KIND``.
+Each token step holds, in this order (SPEC 3.4): ``MOTION`` of every observed agent that was
+present before, from near to far of the ego; ``KEEP`` or ``REMOVE`` of every agent that was
+present before, in the same order; ``ADD, POSITION, HEADING, AGENT_TYPE`` of each inserted
+agent; ``BEGIN_MOTION``. Distances are those at the end of the step before, so the order
+reveals nothing of the future. An agent present for its first token step only has a
+``REMOVE`` right after its ``AGENT_TYPE``.
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ from infgen.tokens.settings import TokenSettings
 from infgen.tokens.vocabulary import MotionVocabulary
 
 _NO_AGENT = -1
-_MOVES, _CONTROLS, _ENTRIES, _END = range(4)
+_MOTION, _CONTROLS, _INSERTIONS, _END = range(4)
 
 
 class TokenSequence(NamedTuple):
@@ -40,27 +40,27 @@ class TokenSequence(NamedTuple):
     rank: np.ndarray
 
 
-def encode_sequence(matrix: AgentMatrix, entries: Insertions, ego: int) -> TokenSequence:
-    """Write the agent matrix as the interleaved stream."""
+def encode_sequence(matrix: AgentMatrix, insertions: Insertions, ego: int) -> TokenSequence:
+    """Write the agent matrix as the interleaved sequence."""
     parts = [
         *_agent_tokens(matrix, ego),
-        *_insertion_tokens(matrix, entries),
+        *_insertion_tokens(matrix, insertions),
         _begin_motion_tokens(matrix.motion_token.shape[1]),
     ]
-    words = TokenSequence(
+    sequence = TokenSequence(
         *(np.concatenate(columns) for columns in zip(*parts, strict=True))
     )
-    order = np.lexsort((words.rank, words.phase, words.token))
-    return TokenSequence(*(column[order] for column in words))
+    order = np.lexsort((sequence.rank, sequence.phase, sequence.token))
+    return TokenSequence(*(column[order] for column in sequence))
 
 
 def decode_sequence(
     tokens: SceneTokens, vocabulary: MotionVocabulary, settings: TokenSettings
 ) -> AgentMatrix:
-    """Read the agent matrix back from the stream. Inverse of ``encode_sequence``.
+    """Read the agent matrix back from the sequence. Inverse of ``encode_sequence``.
 
-    Nothing of ``tokens`` is read but the stream (``word...``), the ego's row, and what
-    stands beside the stream: entry offsets and residuals, and the anchors.
+    Nothing of ``tokens`` is read but the sequence (``sequence_...``), the
+    ego's row, the insertions' offsets and residuals, and the anchors.
     """
     word, token, agent = tokens.sequence_type, tokens.sequence_step, tokens.sequence_agent
     value, added = tokens.sequence_value, word == TokenType.ADD
@@ -74,15 +74,15 @@ def decode_sequence(
     ):
         rows = word == said
         presence[agent[rows], token[rows]] = meant
-    move = np.full(shape, NO_MOTION_TOKEN, dtype=np.int16)
+    motion_token = np.full(shape, NO_MOTION_TOKEN, dtype=np.int16)
     rows = word == TokenType.MOTION
-    move[agent[rows], token[rows]] = value[rows]
-    move[agent[added], token[added]] = FIRST_MOTION_TOKEN
-    kind = np.zeros(shape[0], dtype=np.int8)
+    motion_token[agent[rows], token[rows]] = value[rows]
+    motion_token[agent[added], token[added]] = FIRST_MOTION_TOKEN
+    agent_type = np.zeros(shape[0], dtype=np.int8)
     rows = word == TokenType.AGENT_TYPE
-    kind[agent[rows]] = value[rows]
+    agent_type[agent[rows]] = value[rows]
 
-    entries = Insertions(
+    insertions = Insertions(
         token=token[added].astype(np.int16),
         agent=agent[added],
         cell=value[word == TokenType.POSITION],
@@ -93,22 +93,34 @@ def decode_sequence(
     anchors = Anchors(tokens.anchor_agent, tokens.anchor_token, tokens.anchor_pose)
     grid = make_grid(settings)
     return decode_agents(
-        kind, move, presence, entries, anchors, tokens.ego, vocabulary, grid
+        agent_type,
+        motion_token,
+        presence,
+        insertions,
+        anchors,
+        tokens.ego,
+        vocabulary,
+        grid,
     )
 
 
 def _agent_tokens(matrix: AgentMatrix, ego: int) -> list[TokenSequence]:
-    """Write moves and controls of the agents that were there before."""
+    """Write motion and control tokens of the agents that were present before."""
     away_m = matrix.pose[:, :-1, :2] - matrix.pose[ego, :-1, :2]
     distance_m = np.hypot(away_m[..., 0], away_m[..., 1])  # [agent, token - 1]
     order = np.argsort(distance_m, axis=0, kind="stable")
     rank = np.empty_like(order)
     np.put_along_axis(rank, order, np.arange(len(rank))[:, None], axis=0)
 
-    presence, move = matrix.presence[:, 1:], matrix.motion_token[:, 1:]
-    agent, token = np.nonzero(move >= 0)
-    moves = _make_tokens(
-        TokenType.MOTION, move[agent, token], agent, token + 1, _MOVES, rank[agent, token]
+    presence, motion_token = matrix.presence[:, 1:], matrix.motion_token[:, 1:]
+    agent, token = np.nonzero(motion_token >= 0)
+    motion_tokens = _make_tokens(
+        TokenType.MOTION,
+        motion_token[agent, token],
+        agent,
+        token + 1,
+        _MOTION,
+        rank[agent, token],
     )
     here = (presence == Presence.PRESENT) | (presence == Presence.REMOVED)
     agent, token = np.nonzero(here)
@@ -118,29 +130,29 @@ def _agent_tokens(matrix: AgentMatrix, ego: int) -> list[TokenSequence]:
     controls = _make_tokens(
         said, np.zeros_like(agent), agent, token + 1, _CONTROLS, rank[agent, token]
     )
-    return [moves, controls]
+    return [motion_tokens, controls]
 
 
-def _insertion_tokens(matrix: AgentMatrix, entries: Insertions) -> list[TokenSequence]:
-    """Write what is said of each newcomer, all together and in the entries' order."""
-    agent, token = entries.agent.astype(np.int64), entries.token.astype(np.int64)
+def _insertion_tokens(matrix: AgentMatrix, insertions: Insertions) -> list[TokenSequence]:
+    """Write the tokens of each insertion together, in the order of the insertions."""
+    agent, token = insertions.agent.astype(np.int64), insertions.token.astype(np.int64)
     turn = 5 * np.arange(len(agent))
     zero = np.zeros_like(agent)
     said = [
         (TokenType.ADD, zero),
-        (TokenType.POSITION, entries.cell),
-        (TokenType.HEADING, entries.heading),
+        (TokenType.POSITION, insertions.cell),
+        (TokenType.HEADING, insertions.heading),
         (TokenType.AGENT_TYPE, matrix.agent_type[agent]),
     ]
     parts = [
-        _make_tokens(word, value, agent, token, _ENTRIES, turn + place)
+        _make_tokens(word, value, agent, token, _INSERTIONS, turn + place)
         for place, (word, value) in enumerate(said)
     ]
     last = matrix.presence.shape[1] - 1
     after = matrix.presence[agent, np.minimum(token + 1, last)]
     gone = (token < last) & (after == Presence.ABSENT)
     parts.append(
-        _make_tokens(TokenType.REMOVE, zero, agent, token, _ENTRIES, turn + len(said))
+        _make_tokens(TokenType.REMOVE, zero, agent, token, _INSERTIONS, turn + len(said))
     )
     parts[-1] = TokenSequence(*(column[gone] for column in parts[-1]))
     return parts

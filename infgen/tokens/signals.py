@@ -1,4 +1,4 @@
-"""Traffic lights as classes: what a driver does about them (SPEC 1.4)."""
+"""Traffic signal states merged into classes, per lane and token step (SPEC 1.4)."""
 
 from typing import NamedTuple
 
@@ -22,11 +22,11 @@ _CLASS_OF = {
 _CLASSES = np.array([_CLASS_OF[state] for state in SignalState], dtype=np.int8)
 
 REMEMBERED = len(SignalClass)
-"""Added to the class of a light that nobody has looked at since: it may have changed."""
+"""Added to the last known class of a signal whose present state is not given."""
 
 
 def classify_signals(state: Int8[np.ndarray, " signal"]) -> Int8[np.ndarray, " signal"]:
-    """Give each ``SignalState`` its ``SignalClass``; an unheard-of state is unknown."""
+    """Give each ``SignalState`` its ``SignalClass``; states out of range are unknown."""
     known = (state >= 0) & (state < len(_CLASSES))
     return np.where(known, _CLASSES[state * known], np.int8(SignalClass.UNKNOWN))
 
@@ -34,13 +34,13 @@ def classify_signals(state: Int8[np.ndarray, " signal"]) -> Int8[np.ndarray, " s
 def signals_at(
     signals: Signals, lane_id: Int64[np.ndarray, " lane"], step: Int64[np.ndarray, " step"]
 ) -> Int8[np.ndarray, "lane step"]:
-    """Return the class that each lane's light shows at some steps.
+    """Return the class of each lane's signal at given steps.
 
-    A lane that the log gives no state at a step has ``NO_SIGNAL`` there; of two states the
-    later row counts.
+    A lane without a logged state at a step has ``NO_SIGNAL``; of two states the later row
+    counts.
 
     Args:
-        signals: All lights of the log.
+        signals: All signal states of the log.
         lane_id: Feature ids.
         step: Steps, ascending.
     """
@@ -59,46 +59,46 @@ def signals_at(
 
 
 def hold_last_signals(
-    shown: Int8[np.ndarray, "light token"], known: int, tokens: int
-) -> Int8[np.ndarray, "light all_tokens"]:
-    """Return what lights show while they are looked at, then what they showed last.
+    shown: Int8[np.ndarray, "signal token"], known: int, tokens: int
+) -> Int8[np.ndarray, "signal all_tokens"]:
+    """Return signal classes while they are known, then the last known ones.
 
     Args:
-        shown: ``SignalClass`` of each at the end of each half second.
-        known: Half seconds in which they are looked at, at least one.
-        tokens: Half seconds to tell of; from ``known`` on, classes are ``REMEMBERED``.
+        shown: ``SignalClass`` of each at the end of each token step.
+        known: Token steps whose states are known, at least one.
+        tokens: Token steps to return; from ``known`` on, ``REMEMBERED`` is added.
     """
     seen, last = shown[:, :known], shown[:, known - 1 : known] + np.int8(REMEMBERED)
     return np.concatenate([seen, np.repeat(last, tokens - known, axis=1)], axis=1)
 
 
 class LoggedSignals(NamedTuple):
-    """What the traffic lights of a scene show.
+    """Signal classes of a scene at every token step.
 
     Attributes:
-        polyline: Lines of road tokens that ever have a light, ascending.
-        shown: ``SignalClass`` of each at the end of each half second.
+        polyline: Polylines of map tokens that ever have a signal, ascending.
+        shown: ``SignalClass`` of each at the end of each token step.
     """
 
-    polyline: Int32[np.ndarray, " light"]
-    shown: Int8[np.ndarray, "light token"]
+    polyline: Int32[np.ndarray, " signal"]
+    shown: Int8[np.ndarray, "signal token"]
 
 
 def signal_polylines(
     signals: Signals,
-    line: Int32[np.ndarray, " road"],
-    feature_id: Int64[np.ndarray, " road"],
+    polyline: Int32[np.ndarray, " map_token"],
+    feature_id: Int64[np.ndarray, " map_token"],
     last_step: int,
-) -> tuple[Int32[np.ndarray, " line"], Int64[np.ndarray, " line"]]:
-    """List the lines of road tokens that have a light up to a step, and their lanes.
+) -> tuple[Int32[np.ndarray, " polyline"], Int64[np.ndarray, " polyline"]]:
+    """List the polylines that have a signal up to a step, and their lanes.
 
     Args:
-        signals: All lights of the log.
-        line: Line of each road token; tokens of one line are adjacent.
-        feature_id: Map feature of each road token.
-        last_step: Later lights are not looked at.
+        signals: All signal states of the log.
+        polyline: Polyline of each map token; tokens of one polyline are adjacent.
+        feature_id: Map feature of each map token.
+        last_step: Later signal states are ignored.
     """
     lanes = np.unique(signals.lane_id[signals.step <= last_step])
-    first = np.flatnonzero(np.diff(line, prepend=-1))
+    first = np.flatnonzero(np.diff(polyline, prepend=-1))
     rows = first[np.isin(feature_id[first], lanes)]
-    return line[rows], feature_id[rows]
+    return polyline[rows], feature_id[rows]

@@ -1,4 +1,4 @@
-"""What tokens say about the scenes they were made from: counts to check a data set by.
+"""Statistics of tokenized scenes: counts to check a data set by.
 
 TokenStatistics of scenes add up to the figures of a split, so shards count on their own.
 """
@@ -18,7 +18,7 @@ ERROR_BIN_M = 0.001
 NUM_ERROR_BINS = 1001
 """The last bin holds all errors of a metre and more."""
 MAX_COUNTED_INSERTIONS = 32
-"""The last bin holds half seconds with so many newcomers and more."""
+"""The last bin holds token steps with so many inserted agents and more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,13 +29,13 @@ class TokenStatistics:
         scenes, tokens, roads, words: How many there are.
         agents: Agents of each kind.
         late: Of those, how many enter after the history.
-        gaps: Times that a chain of moves starts anew after a gap.
+        gaps: Times that a chain of motion tokens starts anew after a gap.
         first: Agents by the token at which they enter.
         last: Agents by their last token.
-        entering: Half seconds after the history by their newcomers within the grid.
-        beyond: Newcomers after the history that enter outside the grid.
-        error: Observed moves of each kind by how far from the log their end is, in bins of
-            ``ERROR_BIN_M``.
+        entering: Token steps after the history by their inserted agents within the grid.
+        beyond: Inserted agents after the history that enter outside the grid.
+        error: Observed motion tokens of each kind by how far from the log their end is, in
+            bins of ``ERROR_BIN_M``.
     """
 
     scenes: int
@@ -63,7 +63,7 @@ class TokenStatistics:
 
 
 def no_statistics() -> TokenStatistics:
-    """Return the figures of no scene."""
+    """Return the statistics of no scene."""
     return TokenStatistics(
         scenes=0,
         tokens=0,
@@ -107,15 +107,17 @@ def count(scene: Scene, tokens: SceneTokens, clock: Clock = CLOCK) -> TokenStati
 
 
 def describe(figures: TokenStatistics) -> dict[str, Any]:
-    """Say what the tokens of a split add up to, kind by kind where it matters."""
+    """Return the statistics of a split as JSON values, by agent type where it matters."""
     scenes, agents = max(1, figures.scenes), max(1, int(figures.agents.sum()))
     steps = max(1, int(figures.entering.sum()))
     newcomers = int(np.arange(len(figures.entering)) @ figures.entering)
-    kinds = [kind.name.lower() for kind in AgentType if kind != AgentType.OTHER]
+    agent_types = [
+        agent_type.name.lower() for agent_type in AgentType if agent_type != AgentType.OTHER
+    ]
     return {
         "scenes": figures.scenes,
         "tokens": figures.tokens,
-        "agents": dict(zip(kinds, figures.agents.tolist(), strict=True)),
+        "agents": dict(zip(agent_types, figures.agents.tolist(), strict=True)),
         "agents_per_scene": figures.agents.sum() / scenes,
         "roads_per_scene": figures.roads / scenes,
         "words_per_scene": figures.words / scenes,
@@ -123,12 +125,13 @@ def describe(figures: TokenStatistics) -> dict[str, Any]:
         "first_token": figures.first.tolist(),
         "last_token": figures.last.tolist(),
         "share_entering_after_now": figures.late.sum() / agents,
-        "entering_after_now": dict(zip(kinds, figures.late.tolist(), strict=True)),
+        "entering_after_now": dict(zip(agent_types, figures.late.tolist(), strict=True)),
         "entries_per_token_in_grid": newcomers / steps,
         "tokens_by_entries_in_grid": figures.entering.tolist(),
         "entries_beyond_grid": figures.beyond,
         "matching_error_m": {
-            kind: _spread(counts) for kind, counts in zip(kinds, figures.error, strict=True)
+            agent_type: _spread(counts)
+            for agent_type, counts in zip(agent_types, figures.error, strict=True)
         },
     }
 

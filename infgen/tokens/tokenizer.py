@@ -1,4 +1,4 @@
-"""From a scene to its tokens: the one function that puts this room together."""
+"""From a scene to its tokens: agents, insertions, map, signals and the sequence."""
 
 from typing import Any
 
@@ -27,14 +27,14 @@ def tokenize_scene(
     until: int | None = None,
     clock: Clock = CLOCK,
 ) -> SceneTokens:
-    """Write a scene as tokens.
+    """Tokenize a scene.
 
     Args:
         scene: The log.
-        motion: Moves that agents are written with.
-        roads: Shapes that map lines are written with.
-        settings: How.
-        until: Last step to look at. With ``until=scene.now`` the tokens are the history
+        motion: Vocabulary of agents.
+        roads: Vocabulary of the map.
+        settings: Settings of the tokens.
+        until: Last step to read. With ``until=scene.now`` the tokens are the history
             alone, as a simulation starts from: nothing later is read, and every agent
             observed at that step is kept, no other. (For agents however far from the ego
             set ``max_ego_distance_m`` to infinity.)
@@ -47,10 +47,10 @@ def tokenize_scene(
     grid = make_grid(settings)
     paths = read_paths(scene, settings, until, clock)
     paths = paths.take(_kept_agents(paths, whole_log=until is None))
-    agents, entries, anchors = match_agents(
+    agents, insertions, anchors = match_agents(
         paths, make_match_table(motion), grid, settings.insertion_order
     )
-    words = encode_sequence(agents, entries, paths.ego)
+    words = encode_sequence(agents, insertions, paths.ego)
 
     road_fields = _map_fields(scene, roads, last, agents.motion_token.shape[1], clock)
     return SceneTokens(
@@ -69,12 +69,12 @@ def tokenize_scene(
         pattern=np.where(agents.presence == Presence.ABSENT, np.uint8(0), paths.pattern),
         cell=agents.cell,
         near=paths.near,
-        insertion_token=entries.token,
-        insertion_agent=entries.agent,
-        insertion_cell=entries.cell,
-        insertion_offset_m=entries.offset_m,
-        insertion_heading=entries.heading,
-        insertion_residual_rad=entries.residual_rad,
+        insertion_token=insertions.token,
+        insertion_agent=insertions.agent,
+        insertion_cell=insertions.cell,
+        insertion_offset_m=insertions.offset_m,
+        insertion_heading=insertions.heading,
+        insertion_residual_rad=insertions.residual_rad,
         sequence_type=words.word,
         sequence_value=words.value,
         sequence_agent=words.agent,
@@ -87,10 +87,10 @@ def tokenize_scene(
 
 
 def read_logged_signals(scene: Scene, clock: Clock = CLOCK) -> LoggedSignals:
-    """Read what a log's traffic lights show in all of its half seconds.
+    """Read the signal classes of a log at all of its token steps.
 
-    A history that is tokenized alone ends at ``now``, and its lights with it. Whoever plays
-    on may let them change as they did in the log.
+    A history that is tokenized alone ends at ``now``, and its signals with it. A simulation
+    may continue them as logged.
     """
     pieces, last = cut_map_tokens(scene.road_map), scene.tracks.num_steps - 1
     line, lane_id = signal_polylines(
@@ -103,7 +103,7 @@ def read_logged_signals(scene: Scene, clock: Clock = CLOCK) -> LoggedSignals:
 def _map_fields(
     scene: Scene, roads: MapVocabulary, last: int, tokens: int, clock: Clock
 ) -> dict[str, Any]:
-    """Return the fields of ``SceneTokens`` that tell of the map and its signals."""
+    """Return the map and signal fields of ``SceneTokens``."""
     pieces = cut_map_tokens(scene.road_map)
     line, lane_id = signal_polylines(
         scene.signals, pieces.polyline, pieces.feature_id, last
@@ -125,7 +125,7 @@ def _map_fields(
 
 
 def _kept_agents(paths: Paths, *, whole_log: bool) -> np.ndarray:
-    """Return rows of the agents to write: those there now (as the ego is) or moving."""
+    """Return the rows of agents to tokenize: valid now (as the ego is), or with motion."""
     kept = paths.at_now
     if whole_log:
         kept = kept | has_motion(seen_tokens(paths.valid))

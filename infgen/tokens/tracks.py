@@ -1,6 +1,6 @@
-"""Logged tracks made ready for tokens: cleaned, filled, cut to the ego's surroundings.
+"""Prepare logged tracks for tokenization: clean, fill gaps, keep the ego's surroundings.
 
-What leaves this file is known at the borders of tokens only, steps 0, 5, 10 and so on
+Results hold values at token borders only, steps 0, 5, 10 and so on
 (SPEC 1.2, 1.6).
 """
 
@@ -17,7 +17,7 @@ from infgen.tokens.settings import TokenSettings
 from infgen.tokens.validity_patterns import encode_patterns
 
 MAX_TURN_RAD = 1.5
-"""No agent turns farther in one step; a heading that does is an error of the log."""
+"""A heading that turns farther than this in one step is an error of the log."""
 
 
 class TokensError(ValueError):
@@ -36,8 +36,8 @@ class Paths:
         pose: x, y, heading at each border; meaningless where not valid.
         z_m: Height of the box centre at each border.
         valid: Whether the agent is known there, and near enough to the ego.
-        pattern: Which steps of each token the log itself shows (``tokens.patterns``),
-            however far from the ego.
+        pattern: Which steps of each token the log itself shows
+            (``tokens.validity_patterns``), however far from the ego.
         near: Whether it is ever observed within the motion-loss radius of the ego.
         at_now: Whether it is known at the last step of the history.
     """
@@ -81,12 +81,12 @@ class _Filled(NamedTuple):
 def read_paths(
     scene: Scene, settings: TokenSettings, until: int | None = None, clock: Clock = CLOCK
 ) -> Paths:
-    """Make a log's tracks ready for tokens.
+    """Prepare the tracks of a log for tokenization.
 
     Args:
         scene: The log.
         settings: How gaps and distance are treated.
-        until: Last step that may be looked at; None for the whole log.
+        until: Last step to read; None for the whole log.
         clock: Steps and tokens.
 
     Raises:
@@ -183,7 +183,7 @@ def _road_users(scene: Scene, last: int) -> tuple[Tracks, int]:
 
 
 def _fill_gaps(tracks: Tracks, max_gap_s: float, ego: int, clock: Clock) -> _Filled:
-    """Draw straight lines across gaps, and call short gaps known.
+    """Interpolate linearly across gaps, and mark short gaps as valid.
 
     A gap lasts as long as the steps that miss. The ego's gaps are all filled: it is what
     everything else is relative to.

@@ -1,8 +1,8 @@
-"""When within each half second the log shows an agent: five times yes or no as one number.
+"""Validity patterns: the steps of a token at which the log shows an agent, as a number.
 
-Detectors lose agents for a step or two and find them again. Poses and moves are of tracks
-with such gaps filled; a pattern tells of the gaps: bit ``i`` of a token's pattern (0 to 31)
-says whether the log shows the agent at step ``i + 1`` of the token.
+Detectors lose agents for a step or two. Poses and motion tokens come from tracks with such
+gaps filled; the pattern (0 to 31) records the gaps: bit ``i`` is set if the log shows the
+agent at step ``i + 1`` of the token.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from infgen.clock import CLOCK, Clock
 def encode_patterns(
     valid: Bool[np.ndarray, "agent step"], clock: Clock = CLOCK
 ) -> UInt8[np.ndarray, "agent token"]:
-    """Write what the log shows of each agent, token by token; step 0 is in none of them."""
+    """Encode the logged validity of each token step; step 0 belongs to none."""
     length = clock.steps_per_token
     tokens = clock.num_tokens(valid.shape[1])
     steps = valid[:, 1 : 1 + length * tokens].reshape(len(valid), tokens, length)
@@ -24,7 +24,7 @@ def encode_patterns(
 def decode_patterns(
     pattern: UInt8[np.ndarray, "agent token"], clock: Clock = CLOCK
 ) -> Bool[np.ndarray, "agent step"]:
-    """Tell the steps at which the log shows each agent; False at step 0, in no token.
+    """Return the logged validity at every step; False at step 0, which no token holds.
 
     Inverse of ``encode_patterns`` at all other steps.
     """

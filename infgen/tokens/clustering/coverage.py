@@ -1,6 +1,7 @@
-"""How well two vocabularies write scenes they were not made from, and what they hold.
+"""Coverage of the two vocabularies on held-out scenes, and their contents.
 
-Moves are matched as tokens are, rolling forward, so the error is that of the tokens.
+Motion tokens are matched as in tokenization, rolling forward, so the error is that of
+tokens.
 """
 
 from collections.abc import Iterable
@@ -26,7 +27,7 @@ from infgen.tokens.tracks import Paths
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 MOVING_M = 0.05
-"""A move whose end is nearer than this to its start does not count as moving."""
+"""A motion token whose end is nearer than this to its start does not count as moving."""
 STRAIGHT_DEG = 0.1
 """What turns less is counted neither as left nor as right."""
 
@@ -37,8 +38,8 @@ class Matches:
 
     Attributes:
         agent_type: ``AgentType`` of the agent.
-        motion_token: The move chosen.
-        error_m: From the centre where the chain of moves is to the logged centre.
+        motion_token: The motion token chosen.
+        error_m: From the centre where the chain of motion tokens is to the logged centre.
     """
 
     agent_type: Int8[np.ndarray, " match"]
@@ -50,61 +51,67 @@ def match_paths(paths: Iterable[Paths], vocabulary: MotionVocabulary) -> Matches
     """Match the agents of scenes as the tokenizer does."""
     settings = TokenSettings()
     table, grid = make_match_table(vocabulary), make_grid(settings)
-    kinds, moves, errors_m = [np.empty(0, np.int8)], [np.empty(0, int)], [np.empty(0)]
+    agent_types, motion_tokens, errors_m = (
+        [np.empty(0, np.int8)],
+        [np.empty(0, int)],
+        [np.empty(0)],
+    )
     for scene in paths:
         agents = match_agents(scene, table, grid, settings.insertion_order)[0]
         away_m = agents.pose[..., :2].astype(np.float64) - scene.pose[:, 1:, :2]
         row, token = np.nonzero(agents.observed)
-        kinds.append(agents.agent_type[row])
-        moves.append(agents.motion_token[row, token].astype(int))
+        agent_types.append(agents.agent_type[row])
+        motion_tokens.append(agents.motion_token[row, token].astype(int))
         errors_m.append(np.hypot(*away_m[row, token].T))
-    return Matches(np.concatenate(kinds), np.concatenate(moves), np.concatenate(errors_m))
+    return Matches(
+        np.concatenate(agent_types), np.concatenate(motion_tokens), np.concatenate(errors_m)
+    )
 
 
 def describe_motion(
     vocabulary: MotionVocabulary,
-    origin: Int8[np.ndarray, "3 move"],
-    validation_split: Matches,
+    origin: Int8[np.ndarray, "3 motion"],
+    held_out: Matches,
     familiar: Matches,
     settings: VocabSettings,
 ) -> dict[str, Any]:
-    """Say of each kind what its moves are and how well they write held-out scenes.
+    """Describe the motion tokens of each agent type and their error on held-out scenes.
 
     Args:
-        vocabulary: The moves.
+        vocabulary: The motion tokens.
         origin: ``Origin`` of each.
-        validation_split: Matches of scenes the vocabulary was not made from.
+        held_out: Matches of scenes the vocabulary was not made from.
         familiar: Matches of scenes it was made from; they count only as use.
         settings: What the vocabulary was made with.
     """
     return {
-        AgentType(kind).name.lower(): {
-            **_origins(origin[kind]),
-            **_use(kind, vocabulary.num_motion_tokens, validation_split, familiar),
+        AgentType(agent_type).name.lower(): {
+            **_origins(origin[agent_type]),
+            **_use(agent_type, vocabulary.num_motion_tokens, held_out, familiar),
             "held_out_error_m": _spread(
-                validation_split.error_m[validation_split.agent_type == kind]
+                held_out.error_m[held_out.agent_type == agent_type]
             ),
             "held_out_error_moving_m": _spread(
-                _moving_error(vocabulary, validation_split, kind)
+                _moving_error(vocabulary, held_out, agent_type)
             ),
             **_describe_shapes(
-                MotionSpace(kind, motion_limits(settings)),
-                vocabulary.path[kind],
+                MotionSpace(agent_type, motion_limits(settings)),
+                vocabulary.path[agent_type],
                 np.array([1, -1, -1], dtype=np.float32),
             ),
-            **_describe_kinematics(vocabulary.path[kind], kind, settings),
+            **_describe_kinematics(vocabulary.path[agent_type], agent_type, settings),
         }
-        for kind in range(NUM_AGENT_TYPES)
+        for agent_type in range(NUM_AGENT_TYPES)
     }
 
 
 def describe_map(
     vocabulary: MapVocabulary,
-    origin: Int8[np.ndarray, " road"],
+    origin: Int8[np.ndarray, " map_token"],
     held_out_m: Float32[np.ndarray, "unknown 11 2"],
     familiar_m: Float32[np.ndarray, "known 11 2"],
 ) -> dict[str, Any]:
-    """Say what the shapes of map pieces are and how well they fit held-out ones."""
+    """Describe the shapes of map tokens and their error on held-out polylines."""
     space = MapSpace()
     chosen = nearest_map_tokens(held_out_m, vocabulary)
     used = np.union1d(chosen, nearest_map_tokens(familiar_m, vocabulary))
@@ -129,24 +136,26 @@ def _origins(origin: np.ndarray) -> dict[str, int]:
 
 
 def _use(
-    kind: int, num_motion_tokens: int, validation_split: Matches, familiar: Matches
+    agent_type: int, num_motion_tokens: int, held_out: Matches, familiar: Matches
 ) -> dict[str, int]:
     parts = [
-        matches.motion_token[matches.agent_type == kind]
-        for matches in (validation_split, familiar)
+        matches.motion_token[matches.agent_type == agent_type]
+        for matches in (held_out, familiar)
     ]
     used = len(np.unique(np.concatenate(parts)))
     return {"dead": num_motion_tokens - used, "held_out_tokens": len(parts[0])}
 
 
-def _moving_error(vocabulary: MotionVocabulary, matches: Matches, kind: int) -> np.ndarray:
-    end_m = np.hypot(*vocabulary.end_pose[kind, :, :2].T)
-    moving = (matches.agent_type == kind) & (end_m[matches.motion_token] > MOVING_M)
+def _moving_error(
+    vocabulary: MotionVocabulary, matches: Matches, agent_type: int
+) -> np.ndarray:
+    end_m = np.hypot(*vocabulary.end_pose[agent_type, :, :2].T)
+    moving = (matches.agent_type == agent_type) & (end_m[matches.motion_token] > MOVING_M)
     return matches.error_m[moving]
 
 
 def _describe_shapes(space: Space, items: Items, mirror: np.ndarray) -> dict[str, Any]:
-    """Say how close rows are to each other, and to the mirror images of others."""
+    """Measure how close rows are to each other, and to mirror images of others."""
     points_m, mirrored_m = space.points_m(items), space.points_m(items * mirror)
     gaps_m = np.array([np.partition(mean_gap_m(points_m, one), 1)[1] for one in points_m])
     mirror_m = np.array([mean_gap_m(points_m, one).min() for one in mirrored_m])
@@ -154,11 +163,11 @@ def _describe_shapes(space: Space, items: Items, mirror: np.ndarray) -> dict[str
 
 
 def _describe_kinematics(
-    path: np.ndarray, kind: int, settings: VocabSettings
+    path: np.ndarray, agent_type: int, settings: VocabSettings
 ) -> dict[str, Any]:
     end = path[:, -1].astype(np.float64)
     speed_mps = np.hypot(end[:, 0], end[:, 1]) * np.sign(end[:, 0]) / CLOCK.token_s
-    beyond = ~keeps_limits(path, kind, motion_limits(settings))
+    beyond = ~keeps_limits(path, agent_type, motion_limits(settings))
     return {
         "speed_mps": _range(speed_mps),
         **_turns(np.degrees(end[:, 2])),

@@ -1,8 +1,8 @@
 """k-disks: cover items with disks of one radius, and take the mean of each (SPEC 2.1).
 
-An item stands for a few points (the corners of a box where a move ends; the points of a
-line). Two items are as far apart as their points are on average. A disk is all free items
-within the tolerance of a seed. Its mean becomes a centre, unless it stands within the
+An item stands for a few points (the corners of a box where a motion token ends; the points
+of a line). Two items are as far apart as their points are on average. A disk is all free
+items within the tolerance of a seed. Its mean becomes a centre, unless it stands within the
 tolerance of an earlier one or is no allowed item; then the member nearest to the mean does.
 Items within the tolerance of a centre are free no longer, so members are far enough.
 """

@@ -1,4 +1,4 @@
-"""Map pieces made by rule: arcs of every length and bend, for what few maps do not show."""
+"""Map samples made by rule: arcs of every length and curvature, where maps show none."""
 
 import numpy as np
 from jaxtyping import Float32
@@ -10,7 +10,7 @@ MAX_ARC_TURN_RAD = 2.0
 """Turn of the sharpest arc, first interval to last."""
 
 
-def make_arcs(spacing_m: float) -> Float32[np.ndarray, "road 11 2"]:
+def make_arcs(spacing_m: float) -> Float32[np.ndarray, "map_token 11 2"]:
     """Make arcs, the longest and straightest first.
 
     Args:

@@ -1,7 +1,8 @@
-"""Moves made by rule: even motion along arcs, for what few logs do not show.
+"""Motion samples made by rule: uniform motion along arcs, where logs show none.
 
-A vocabulary must be able to follow any road user, or the chain of moves runs away from the
-log. Where logs hold no move nearby, a fan of arcs within the limits stands in.
+A vocabulary must be able to follow any road user, or the chain of motion tokens runs away
+from the log. Where logs hold no motion token nearby, a fan of arcs within the limits stands
+in.
 """
 
 import numpy as np
@@ -37,27 +38,27 @@ COMFORT_MPS2, COMFORT_RAD_S = 3.0, 1.0
 
 
 def make_fan(
-    kind: int, limits: MotionLimits, spacing_m: float
-) -> Float32[np.ndarray, "move 6 3"]:
+    agent_type: int, limits: MotionLimits, spacing_m: float
+) -> Float32[np.ndarray, "motion 6 3"]:
     """Make arcs of all lengths and turns of a kind, the most ordinary first.
 
     Args:
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         limits: What the arcs keep to.
         spacing_m: How far neighbouring arcs' box corners end apart, about.
     """
-    length_m, turn_rad = _grid(kind, limits, spacing_m)
-    effort = _effort(length_m, turn_rad, float(limits.speed_mps[kind]))
-    path = _arcs(length_m, turn_rad, PIVOT_M[kind])
-    if kind == AgentType.PEDESTRIAN:
+    length_m, turn_rad = _grid(agent_type, limits, spacing_m)
+    effort = _effort(length_m, turn_rad, float(limits.speed_mps[agent_type]))
+    path = _arcs(length_m, turn_rad, PIVOT_M[agent_type])
+    if agent_type == AgentType.PEDESTRIAN:
         path, effort = _with_sidesteps(path, effort)
     order = np.lexsort((*path[:, -1].T, effort))
     path = path[order]
-    return path[keeps_limits(path, kind, limits)]
+    return path[keeps_limits(path, agent_type, limits)]
 
 
 def _with_sidesteps(path: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Add slow moves aside, whatever way a pedestrian faces."""
+    """Add slow motion tokens aside, whatever way a pedestrian faces."""
     slow = np.hypot(path[:, -1, 0], path[:, -1, 1]) <= SIDESTEP_MPS * CLOCK.token_s
     slow &= path[:, -1, 0] > 0
     paths, efforts = [path], [effort]
@@ -71,18 +72,22 @@ def _with_sidesteps(path: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _grid(
-    kind: int, limits: MotionLimits, spacing_m: float
+    agent_type: int, limits: MotionLimits, spacing_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return length and turn of every arc, symmetric about straight on."""
-    corner_m = np.hypot(*BOX_LW_M[kind]) / 2
-    most_rad = min(np.pi, float(limits.yaw_rate_rad_s[kind]) * CLOCK.token_s)
+    corner_m = np.hypot(*BOX_LW_M[agent_type]) / 2
+    most_rad = min(np.pi, float(limits.yaw_rate_rad_s[agent_type]) * CLOCK.token_s)
     turns = int(most_rad / (spacing_m / corner_m))
     turn_rad = np.arange(-turns, turns + 1) * (spacing_m / corner_m)
-    back = int(min(REVERSE_MPS[kind], MAX_REVERSE_MPS[kind]) * CLOCK.token_s / spacing_m)
-    ahead = int(float(limits.speed_mps[kind]) * CLOCK.token_s / spacing_m)
+    back = int(
+        min(REVERSE_MPS[agent_type], MAX_REVERSE_MPS[agent_type])
+        * CLOCK.token_s
+        / spacing_m
+    )
+    ahead = int(float(limits.speed_mps[agent_type]) * CLOCK.token_s / spacing_m)
     length_m = np.arange(-back, ahead + 1) * spacing_m
     length_m, turn_rad = (x.ravel() for x in np.meshgrid(length_m, turn_rad))
-    wide = np.abs(length_m) >= MIN_TURN_RADIUS_M[kind] * np.abs(turn_rad)
+    wide = np.abs(length_m) >= MIN_TURN_RADIUS_M[agent_type] * np.abs(turn_rad)
     wide &= np.abs(length_m * turn_rad) <= MAX_LATERAL_MPS2 * CLOCK.token_s**2
     return length_m[wide], turn_rad[wide]
 
@@ -97,7 +102,7 @@ def _effort(length_m: np.ndarray, turn_rad: np.ndarray, most_mps: float) -> np.n
 
 def _arcs(
     length_m: np.ndarray, turn_rad: np.ndarray, pivot_m: float
-) -> Float32[np.ndarray, "move 6 3"]:
+) -> Float32[np.ndarray, "motion 6 3"]:
     """Draw a pivot along arcs at an even pace, the centre of the box ahead of it."""
     share = np.linspace(0, 1, CLOCK.steps_per_token + 1)
     turned_rad = turn_rad[:, None] * share  # [move, 6]

@@ -1,4 +1,4 @@
-"""Samples of map pieces: what the map vocabulary is made from and measured on."""
+"""Samples of map tokens: what the map vocabulary is made from and measured on."""
 
 from dataclasses import dataclass
 

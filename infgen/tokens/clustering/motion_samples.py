@@ -38,9 +38,9 @@ class MotionSamples:
         """Number of segments."""
         return len(self.key)
 
-    def of_agent_type(self, kind: int) -> Float32[np.ndarray, "move 6 3"]:
+    def of_agent_type(self, agent_type: int) -> Float32[np.ndarray, "motion 6 3"]:
         """Paths of one kind, ascending by key."""
-        return self.path[self.agent_type == kind]
+        return self.path[self.agent_type == agent_type]
 
 
 NO_MOTION_SAMPLES = MotionSamples(
@@ -51,7 +51,7 @@ NO_MOTION_SAMPLES = MotionSamples(
 def scene_motion_samples(
     scene: Scene, limits: MotionLimits, still_m: float, clock: Clock = CLOCK
 ) -> MotionSamples:
-    """Cut the moves of all road users out of a scene, token by token.
+    """Cut the motion tokens of all road users out of a scene, token by token.
 
     Left out are moves beyond the limits and those that stay within ``still_m`` of where
     they start (mean distance of box corners): standing still is known without logs.
@@ -67,40 +67,53 @@ def scene_motion_samples(
     heading_rad = clean_headings(tracks.heading_rad, tracks.valid)
     pose = np.concatenate([tracks.xyz_m[..., :2], heading_rad[..., None]], axis=-1)
     pose = pose[agent[:, None], steps[start]]  # [segment, 6, 3]
-    path, kind = to_local(pose, pose[:, :1]), tracks.agent_type[agent]
-    found = MotionSamples(item_keys(scene.scenario_id, tracks.id[agent], start), kind, path)
-    return _join([_usable(found, kind, limits, still_m) for kind in range(NUM_AGENT_TYPES)])
+    path, agent_type = to_local(pose, pose[:, :1]), tracks.agent_type[agent]
+    found = MotionSamples(
+        item_keys(scene.scenario_id, tracks.id[agent], start), agent_type, path
+    )
+    return _join(
+        [
+            _usable(found, agent_type, limits, still_m)
+            for agent_type in range(NUM_AGENT_TYPES)
+        ]
+    )
 
 
 def merge_motion_samples(parts: list[MotionSamples], per_kind: int) -> MotionSamples:
     """Merge segments and keep at most so many of each kind, whatever their order."""
     merged = _join(parts)
     rows = []
-    for kind in range(NUM_AGENT_TYPES):
-        of_agent_type = np.flatnonzero(merged.agent_type == kind)
+    for agent_type in range(NUM_AGENT_TYPES):
+        of_agent_type = np.flatnonzero(merged.agent_type == agent_type)
         rows.append(of_agent_type[smallest_keys(merged.key[of_agent_type], per_kind)])
     return _take(merged, np.concatenate(rows))
 
 
 def corner_gap_m(
-    one: Float32[np.ndarray, "*rows 3"], two: Float32[np.ndarray, "*rows 3"], kind: int
+    one: Float32[np.ndarray, "*rows 3"],
+    two: Float32[np.ndarray, "*rows 3"],
+    agent_type: int,
 ) -> np.ndarray:
     """Return mean distances [rows] of the corners of a kind's box at two poses."""
-    away_m = box_corners(one, BOX_LW_M[kind]) - box_corners(two, BOX_LW_M[kind])
+    away_m = box_corners(one, BOX_LW_M[agent_type]) - box_corners(two, BOX_LW_M[agent_type])
     return np.linalg.norm(away_m, axis=-1).mean(axis=-1)
 
 
 def _usable(
-    found: MotionSamples, kind: int, limits: MotionLimits, still_m: float
+    found: MotionSamples, agent_type: int, limits: MotionLimits, still_m: float
 ) -> MotionSamples:
-    of_agent_type = _take(found, np.flatnonzero(found.agent_type == kind))
-    moves = (
-        corner_gap_m(of_agent_type.path[:, -1], of_agent_type.path[:, 0], kind) > still_m
+    of_agent_type = _take(found, np.flatnonzero(found.agent_type == agent_type))
+    moving = (
+        corner_gap_m(of_agent_type.path[:, -1], of_agent_type.path[:, 0], agent_type)
+        > still_m
     )
     usable = _take(
-        of_agent_type, np.flatnonzero(moves & plausible(of_agent_type.path, kind, limits))
+        of_agent_type,
+        np.flatnonzero(moving & plausible(of_agent_type.path, agent_type, limits)),
     )
-    return MotionSamples(usable.key, usable.agent_type, smooth(usable.path, kind, limits))
+    return MotionSamples(
+        usable.key, usable.agent_type, smooth(usable.path, agent_type, limits)
+    )
 
 
 def _take(segments: MotionSamples, rows: np.ndarray) -> MotionSamples:

@@ -1,8 +1,8 @@
-"""What a road user can do in half a second, and what is only noise of the log.
+"""Physical limits of motion tokens, and the smoothing of logged noise.
 
-The vocabulary holds no move beyond these limits. Speed, acceleration and turn are bounded
-at every 0.1 s step; acceleration as a vector. All three bounds are convex, so a mean of
-moves within them is within them.
+The vocabulary holds no motion token beyond these limits. Speed, acceleration and turn are
+bounded at every 0.1 s step; acceleration as a vector. All three bounds are convex, so a
+mean of motion within them is within them.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from infgen.scene import AgentType
 from infgen.tokens.clustering.settings import VocabSettings
 
 PEDESTRIAN_MAX_YAW_RATE_RAD_S = 2 * np.pi
-"""A pedestrian turns round on the spot within one move; others obey the setting."""
+"""A pedestrian turns round on the spot within one motion token; others obey the setting."""
 
 MAX_REVERSE_MPS = (6.0, 2.0, 1.5)
 """Who goes backwards faster is logged with a wrong heading (row: ``AgentType``)."""
@@ -66,40 +66,40 @@ def motion_limits(settings: VocabSettings) -> MotionLimits:
 
 
 def keeps_limits(
-    path: Float32[np.ndarray, "move 6 3"], kind: int, limits: MotionLimits
-) -> Bool[np.ndarray, " move"]:
-    """Tell which moves keep to the limits of a kind at every step."""
+    path: Float32[np.ndarray, "motion 6 3"], agent_type: int, limits: MotionLimits
+) -> Bool[np.ndarray, " motion"]:
+    """Tell which motion tokens keep to the limits of an agent type at every step."""
     speed_mps, accel_mps2, yaw_rad_s = _rates(path)
     return (
-        (speed_mps <= limits.speed_mps[kind] * _INSIDE)
-        & (accel_mps2 <= limits.accel_mps2[kind] * _INSIDE)
-        & (yaw_rad_s <= limits.yaw_rate_rad_s[kind] * _INSIDE)
-        & _follows_heading(path, kind)
+        (speed_mps <= limits.speed_mps[agent_type] * _INSIDE)
+        & (accel_mps2 <= limits.accel_mps2[agent_type] * _INSIDE)
+        & (yaw_rad_s <= limits.yaw_rate_rad_s[agent_type] * _INSIDE)
+        & _follows_heading(path, agent_type)
     )
 
 
 def plausible(
-    path: Float32[np.ndarray, "move 6 3"], kind: int, limits: MotionLimits
-) -> Bool[np.ndarray, " move"]:
-    """Tell which logged moves are possible but for jitter, which ``smooth`` takes away."""
+    path: Float32[np.ndarray, "motion 6 3"], agent_type: int, limits: MotionLimits
+) -> Bool[np.ndarray, " motion"]:
+    """Tell which logged motion is possible once ``smooth`` has removed its jitter."""
     speed_mps, accel_mps2, _ = _rates(path)
     step_m = np.diff(path[..., :2], axis=1)
     change_mps = np.linalg.norm(step_m[:, -1] - step_m[:, 0], axis=-1) / CLOCK.step_s
     mean_accel_mps2 = change_mps / (CLOCK.token_s - CLOCK.step_s)
     mean_yaw_rad_s = np.abs(path[:, -1, 2]) / CLOCK.token_s
     return (
-        (speed_mps <= limits.speed_mps[kind] * _SMOOTHED)
-        & (accel_mps2 <= limits.accel_mps2[kind] * JUMP_FACTOR)
-        & (mean_accel_mps2 <= limits.accel_mps2[kind] * _SMOOTHED)
-        & (mean_yaw_rad_s <= limits.yaw_rate_rad_s[kind] * _SMOOTHED)
-        & _follows_heading(path, kind)
+        (speed_mps <= limits.speed_mps[agent_type] * _SMOOTHED)
+        & (accel_mps2 <= limits.accel_mps2[agent_type] * JUMP_FACTOR)
+        & (mean_accel_mps2 <= limits.accel_mps2[agent_type] * _SMOOTHED)
+        & (mean_yaw_rad_s <= limits.yaw_rate_rad_s[agent_type] * _SMOOTHED)
+        & _follows_heading(path, agent_type)
     )
 
 
 def smooth(
-    path: Float32[np.ndarray, "move 6 3"], kind: int, limits: MotionLimits
-) -> Float32[np.ndarray, "move 6 3"]:
-    """Draw plausible moves towards even motion, as far as the limits ask; ends stay.
+    path: Float32[np.ndarray, "motion 6 3"], agent_type: int, limits: MotionLimits
+) -> Float32[np.ndarray, "motion 6 3"]:
+    """Blend plausible motion towards uniform motion until it keeps the limits; ends stay.
 
     Positions of a log jitter by centimetres, which at 0.1 s are many m/s2. Even motion has
     no acceleration and everywhere the mean turn, so the share of it needed is known.
@@ -111,8 +111,8 @@ def smooth(
 
     _, accel_mps2, yaw_rad_s = _rates(path)
     mean_yaw_rad_s = np.abs(path[:, -1, 2]) / CLOCK.token_s
-    most_mps2 = limits.accel_mps2[kind] * _SMOOTHED
-    spare_rad_s = limits.yaw_rate_rad_s[kind] * _SMOOTHED - mean_yaw_rad_s
+    most_mps2 = limits.accel_mps2[agent_type] * _SMOOTHED
+    spare_rad_s = limits.yaw_rate_rad_s[agent_type] * _SMOOTHED - mean_yaw_rad_s
     kept_xy = most_mps2 / np.maximum(accel_mps2, most_mps2)
     kept_turn = spare_rad_s / np.maximum(yaw_rad_s - mean_yaw_rad_s, spare_rad_s)
     kept = np.stack([kept_xy, kept_xy, kept_turn], axis=-1)[:, None]
@@ -122,7 +122,7 @@ def smooth(
 
 
 def _rates(path: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the highest speed, acceleration and yaw rate of each move."""
+    """Return the highest speed, acceleration and yaw rate of each motion token."""
     step_m = np.diff(path[..., :2].astype(np.float64), axis=1)
     change_m = np.diff(step_m, axis=1)
     turn_rad = wrap_angle(np.diff(path[..., 2].astype(np.float64), axis=1))
@@ -133,14 +133,14 @@ def _rates(path: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
 
 
-def _follows_heading(path: np.ndarray, kind: int) -> np.ndarray:
-    """Tell which moves go where the agent points, as far as its kind must."""
+def _follows_heading(path: np.ndarray, agent_type: int) -> np.ndarray:
+    """Tell which motion tokens go along the heading, as far as the agent type must."""
     turn_rad = path[:, -1, 2]
     end_m = rotate(path[:, -1, :2], -turn_rad / 2)  # seen along the mean heading
     forward_m, left_m = end_m[:, 0], end_m[:, 1]
-    straight = forward_m >= -MAX_REVERSE_MPS[kind] * CLOCK.token_s
-    if kind == AgentType.PEDESTRIAN:
+    straight = forward_m >= -MAX_REVERSE_MPS[agent_type] * CLOCK.token_s
+    if agent_type == AgentType.PEDESTRIAN:
         return straight
-    swing_m = 2 * MAX_PIVOT_M[kind] * np.sin(turn_rad / 2)
+    swing_m = 2 * MAX_PIVOT_M[agent_type] * np.sin(turn_rad / 2)
     straight &= left_m <= np.maximum(swing_m, 0) + MAX_SIDE_SLIP_M
     return straight & (left_m >= np.minimum(swing_m, 0) - MAX_SIDE_SLIP_M)

@@ -1,6 +1,6 @@
-"""Samples that do not depend on who draws them, nor in which order.
+"""Reproducible samples that do not depend on worker or order.
 
-Every item has a key: a hash of what it is, not of where it was met. A sample is the items
+Every item has a key: a hash of its identity. A sample is the items
 with the smallest keys, so samples of samples are samples of the whole.
 """
 

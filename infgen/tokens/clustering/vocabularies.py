@@ -1,4 +1,4 @@
-"""From samples of logs to the two vocabularies.
+"""Cluster samples of logs into the two vocabularies.
 
 Logged items fill a vocabulary first. Where they do not suffice, their mirror images follow,
 then shapes made by rule, at last ever finer differences. ``Origin`` tells which is which.
@@ -30,13 +30,13 @@ from infgen.tokens.vocabulary import (
 )
 
 MADE_ANCHOR_M = 0.5
-"""Where logs show no move within this distance of a possible one, one is made."""
+"""A motion token is made by rule where logs show none within this distance."""
 MAX_ANCHOR_SHARE = 1 / 8
-"""Of a vocabulary, at most, goes to such moves before logged ones have had their turn."""
+"""Largest share of a vocabulary for such motion tokens."""
 RARE_SHARE = 1 / 4
-"""Of a vocabulary is kept for what common moves or shapes leave uncovered ..."""
+"""Share of a vocabulary reserved for samples that common rows leave uncovered ..."""
 RARE_MOTION_FACTOR, RARE_MAP_FACTOR = 2.0, 3.0
-"""... by disks so many times the tolerance. Better cover all roughly than most finely."""
+"""... with disks of so many times the tolerance."""
 COARSEST_FACTOR = 8
 """Made shapes are laid coarsely first (so many tolerances apart), then ever finer."""
 
@@ -54,32 +54,32 @@ class Origin(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class MotionSpace:
-    """Moves of one kind: as far apart as the corners of its box at their ends."""
+    """Motion of one agent type, compared by the corners of its box at the end."""
 
     agent_type: int
     limits: MotionLimits
 
-    def points_m(self, items: Items) -> Float64[np.ndarray, "move 4 2"]:
-        """Return the box corners at the ends of moves."""
+    def points_m(self, items: Items) -> Float64[np.ndarray, "motion 4 2"]:
+        """Return the box corners at the ends of motion tokens."""
         return box_corners(items[:, -1].astype(np.float64), BOX_LW_M[self.agent_type])
 
     def mean(self, items: Items) -> Float32[np.ndarray, "6 3"]:
-        """Return the mean of moves; of headings the direction of the mean vector."""
+        """Return the mean of motion; of headings the direction of the mean vector."""
         xy_m = items[..., :2].mean(axis=0, dtype=np.float64)
         heading = items[..., 2].astype(np.float64)
         heading = np.arctan2(np.sin(heading).mean(axis=0), np.cos(heading).mean(axis=0))
         return np.column_stack([xy_m, heading]).astype(np.float32)
 
-    def allowed(self, items: Items) -> Bool[np.ndarray, " move"]:
-        """Tell which moves keep to the limits."""
+    def allowed(self, items: Items) -> Bool[np.ndarray, " motion"]:
+        """Tell which motion tokens keep to the limits."""
         return keeps_limits(items, self.agent_type, self.limits)
 
 
 @dataclass(frozen=True, slots=True)
 class MapSpace:
-    """Pieces of map lines: as far apart as their middle and last points."""
+    """Pieces of polylines, compared by their middle and last points."""
 
-    def points_m(self, items: Items) -> Float64[np.ndarray, "road 2 2"]:
+    def points_m(self, items: Items) -> Float64[np.ndarray, "map_token 2 2"]:
         """Return the points that pieces are matched by, but for the first."""
         return items[:, list(MAP_SAMPLE_POINTS[1:])].astype(np.float64)
 
@@ -87,14 +87,14 @@ class MapSpace:
         """Return the mean of pieces. As theirs do, its first interval lies along +x."""
         return items.mean(axis=0, dtype=np.float64).astype(np.float32)
 
-    def allowed(self, items: Items) -> Bool[np.ndarray, " road"]:
+    def allowed(self, items: Items) -> Bool[np.ndarray, " map_token"]:
         """Allow every piece."""
         return np.ones(len(items), dtype=bool)
 
 
 @dataclass(slots=True)
 class _VocabularyBuilder:
-    """A vocabulary while it is filled."""
+    """A vocabulary under construction."""
 
     space: Space
     count: int
@@ -166,24 +166,24 @@ class _VocabularyBuilder:
 
 def cluster_motion(
     segments: MotionSamples, settings: VocabSettings
-) -> tuple[MotionVocabulary, Int8[np.ndarray, "3 move"]]:
+) -> tuple[MotionVocabulary, Int8[np.ndarray, "3 motion"]]:
     """Make the motion vocabulary from segments of logs (which may be none).
 
     Returns:
-        The vocabulary, and the ``Origin`` of its moves.
+        The vocabulary, and the ``Origin`` of its motion tokens.
     """
-    kinds = [
-        _cluster_agent_type(segments.of_agent_type(kind), kind, settings)
-        for kind in range(NUM_AGENT_TYPES)
+    agent_types = [
+        _cluster_agent_type(segments.of_agent_type(agent_type), agent_type, settings)
+        for agent_type in range(NUM_AGENT_TYPES)
     ]
-    origin = np.array([builder.origin for builder in kinds], dtype=np.int8)
-    path = np.stack([builder.rows for builder in kinds])
+    origin = np.array([builder.origin for builder in agent_types], dtype=np.int8)
+    path = np.stack([builder.rows for builder in agent_types])
     return MotionVocabulary(BOX_LW_M, path, origin == Origin.LOGGED), origin
 
 
 def cluster_map(
     curve_m: Float32[np.ndarray, "piece 11 2"], settings: VocabSettings
-) -> tuple[MapVocabulary, Int8[np.ndarray, " road"], float]:
+) -> tuple[MapVocabulary, Int8[np.ndarray, " map_token"], float]:
     """Make the map vocabulary from pieces of lines (which may be none).
 
     Returns:
@@ -203,12 +203,12 @@ def cluster_map(
 
 
 def _cluster_agent_type(
-    path: Float32[np.ndarray, "segment 6 3"], kind: int, settings: VocabSettings
+    path: Float32[np.ndarray, "segment 6 3"], agent_type: int, settings: VocabSettings
 ) -> _VocabularyBuilder:
-    """Fill one kind's vocabulary; its first row stands still."""
+    """Build the vocabulary of one agent type; its first row is stationary."""
     limits = motion_limits(settings)
-    space, logged = MotionSpace(kind, limits), _distinct(path)
-    order = np.random.default_rng((settings.seed, kind)).permutation(len(logged))
+    space, logged = MotionSpace(agent_type, limits), _distinct(path)
+    order = np.random.default_rng((settings.seed, agent_type)).permutation(len(logged))
     mirrored = logged * np.array([1, -1, -1], np.float32)
     mirrored = mirrored if settings.mirror else mirrored[:0]
 
@@ -223,13 +223,13 @@ def _cluster_agent_type(
         order,
         tolerance_m,
         mirrored,
-        lambda apart_m: make_fan(kind, limits, apart_m),
+        lambda apart_m: make_fan(agent_type, limits, apart_m),
     )
     return builder
 
 
 def _anchors(space: MotionSpace, logged: Items, most: int) -> Items:
-    """Make the most ordinary of the moves that logs show nothing like."""
+    """Make the most ordinary of the motion tokens that logs show nothing like."""
     made = make_fan(space.agent_type, space.limits, MADE_ANCHOR_M / 4)
     still = np.zeros((1, *made.shape[1:]), np.float32)
     order = np.arange(len(made))

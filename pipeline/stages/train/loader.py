@@ -62,7 +62,7 @@ class TokenScenes(Sequence[SceneTokens]):
         """
         agents = self._counts("agent").clip(max=limits.agents)
         tokens = self._counts("token").clip(max=limits.tokens)
-        roads = self._counts("road").clip(max=limits.roads)
+        roads = self._counts("map_token").clip(max=limits.roads)
         return np.column_stack([agents * tokens, roads])
 
     def _counts(self, dim: str) -> np.ndarray:

@@ -31,9 +31,9 @@ def tensors(batch):
 
 def with_a_gap(scene):
     """The scene with row 1 unseen for two tokens, then going on."""
-    observed, move = scene.observed.copy(), scene.move.copy()
+    observed, move = scene.observed.copy(), scene.motion_token.copy()
     observed[1, 3:5], move[1, 3:5] = False, NO_MOTION_TOKEN
-    return replace(scene, observed=observed, move=move)
+    return replace(scene, observed=observed, motion_token=move)
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ def agents_of(record, limits, life, near=True):
     presence, observed, move = (
         np.array([LETTERS[letter][i] for letter in life]) for i in range(3)
     )
-    change = {"presence": presence, "observed": observed, "move": move}
+    change = {"presence": presence, "observed": observed, "motion_token": move}
     arrays = {name: getattr(scene, name).copy() for name in change}
     for name, values in change.items():
         arrays[name][1] = values
