@@ -48,8 +48,8 @@ class RoadEncoder(nn.Module):
         curve_m = torch.from_numpy(vocabulary.curve_m.copy())
         self.register_buffer("curve_m", curve_m, persistent=False)
         self.curve = embedding_mlp(vocabulary.curve_m[0].size, width)
-        self.point_type = nn.Embedding(len(PointType), width)
-        self.polyline_type = nn.Embedding(len(PolylineType), width)
+        self.point_kind = nn.Embedding(len(PointType), width)
+        self.line_kind = nn.Embedding(len(PolylineType), width)
         looks = len(SignalClass) + (REMEMBERED if self.signals_each_step else 0)
         self.signal = nn.Embedding(looks, width)
         self.relation = relation_embedding(self.radius_m, settings.fourier_bands, width)
@@ -113,8 +113,8 @@ class RoadEncoder(nn.Module):
         """What each road token is, by itself [row, D]."""
         shapes = self.curve(self.curve_m.flatten(1))  # [token, D]
         embedded: Tensor = gather(shapes, rows.pack(roads.token))
-        embedded = embedded + self.point_type(rows.pack(roads.point_type))
-        embedded = embedded + self.polyline_type(rows.pack(roads.polyline_type))
+        embedded = embedded + self.point_kind(rows.pack(roads.point_type))
+        embedded = embedded + self.line_kind(rows.pack(roads.polyline_type))
         if self.signals_each_step:
             return embedded
         return embedded + self.signal(rows.pack(roads.signal))

@@ -22,7 +22,7 @@ def read_signals(
     num_steps: int,
     origin_xyz_m: Float64[np.ndarray, "3"],
 ) -> Signals:
-    """Decode the traffic lights of all steps, stop points in metres around an origin.
+    """Decode the traffic signals of all steps, stop points in metres around an origin.
 
     A missing stop point is the record's zero, as protobuf has it.
 

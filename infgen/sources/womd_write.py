@@ -143,12 +143,12 @@ def _dynamic_states(signals: Signals, origin_xyz_m: np.ndarray, num_steps: int) 
     """Write one message per step, also of steps without signals."""
     stops = _points(3, signals.stop_xyz_m.astype(np.float64) + origin_xyz_m)
     size = len(stops) // max(1, len(signals.step))
-    lights = zip(signals.lane_id.tolist(), signals.state.tolist(), strict=True)
+    states = zip(signals.lane_id.tolist(), signals.state.tolist(), strict=True)
     rows = [
         message(
             1, integer(1, lane) + integer(2, state) + stops[row * size : (row + 1) * size]
         )
-        for row, (lane, state) in enumerate(lights)
+        for row, (lane, state) in enumerate(states)
     ]
     ends = np.searchsorted(signals.step, np.arange(num_steps + 1))
     return b"".join(

@@ -67,7 +67,7 @@ def neighbour_tokens(table: MatchTable, count: int) -> Int16[np.ndarray, "3 moti
     near = []
     for weights in table.weights:
         spread = np.concatenate([weights[:4] / -2, np.ones_like(weights[:1])])
-        gap = spread.T @ weights  # [move, move], less the square of the row
+        gap = spread.T @ weights  # [motion, motion], less the square of the row
         near.append(np.argpartition(gap, count - 1, axis=1)[:, :count])
     return np.stack(near).astype(np.int16)
 
@@ -151,7 +151,7 @@ def _nearest(
     row, motion_token = _candidates(wanted, corners_m, agent_type, table, near)
     gap_m = _mean_gap(table.corners_m[agent_type[row], motion_token], corners_m[row])
 
-    order = np.lexsort([gap_m, row])  # Stable: of equally near moves the first.
+    order = np.lexsort([gap_m, row])  # Stable: of equally near ones the first.
     first = np.searchsorted(row, np.arange(len(wanted)))
     return motion_token[order[first[:, None] + np.arange(near.shape[2])]]
 
@@ -171,14 +171,14 @@ def _candidates(
     found = []
     for number in np.flatnonzero(np.diff(ends)):
         rows = slice(ends[number], ends[number + 1])
-        gap = spread[rows] @ table.weights[number]  # [row, move], less square
+        gap = spread[rows] @ table.weights[number]  # [row, motion], less square
         guess = near[number, gap.argmin(axis=1)]  # [row, few]
         guess_m = _mean_gap(table.corners_m[number, guess], corners_m[rows, None])
         guess_m = guess_m.max(axis=1)
 
         # The nearest few are no farther than any few at most, their spreads 1.42 times.
         twice = (2 * guess_m**2).astype(np.float32)
-        # Sixty roundings of a float32, relative to moves about as long as the one wanted.
+        # Sixty roundings of a float32, relative to tokens about as long as the one wanted.
         slack = np.float32(5e-6) * (square[rows] + twice)
         flat = np.flatnonzero(gap <= (twice - square[rows] + slack)[:, None])
         found.append(flat + ends[number] * gap.shape[1])

@@ -86,7 +86,7 @@ def count(scene: Scene, tokens: SceneTokens, clock: Clock = CLOCK) -> TokenStati
     late = tokens.insertion_token > tokens.now
     inside = late & (tokens.insertion_cell != NO_CELL)
     length, after = tokens.num_tokens, tokens.now + 1
-    newcomers = np.bincount(tokens.insertion_token[inside], minlength=length)[after:]
+    inserted = np.bincount(tokens.insertion_token[inside], minlength=length)[after:]
     return TokenStatistics(
         scenes=1,
         tokens=length,
@@ -98,7 +98,7 @@ def count(scene: Scene, tokens: SceneTokens, clock: Clock = CLOCK) -> TokenStati
         first=np.bincount(first_token(there), minlength=length),
         last=np.bincount(last_token(there), minlength=length),
         entering=np.bincount(
-            np.minimum(newcomers, MAX_COUNTED_INSERTIONS),
+            np.minimum(inserted, MAX_COUNTED_INSERTIONS),
             minlength=MAX_COUNTED_INSERTIONS + 1,
         ),
         beyond=int((late & ~inside).sum()),
@@ -110,7 +110,7 @@ def describe(figures: TokenStatistics) -> dict[str, Any]:
     """Return the statistics of a split as JSON values, by agent type where it matters."""
     scenes, agents = max(1, figures.scenes), max(1, int(figures.agents.sum()))
     steps = max(1, int(figures.entering.sum()))
-    newcomers = int(np.arange(len(figures.entering)) @ figures.entering)
+    inserted = int(np.arange(len(figures.entering)) @ figures.entering)
     agent_types = [
         agent_type.name.lower() for agent_type in AgentType if agent_type != AgentType.OTHER
     ]
@@ -126,7 +126,7 @@ def describe(figures: TokenStatistics) -> dict[str, Any]:
         "last_token": figures.last.tolist(),
         "share_entering_after_now": figures.late.sum() / agents,
         "entering_after_now": dict(zip(agent_types, figures.late.tolist(), strict=True)),
-        "entries_per_token_in_grid": newcomers / steps,
+        "entries_per_token_in_grid": inserted / steps,
         "tokens_by_entries_in_grid": figures.entering.tolist(),
         "entries_beyond_grid": figures.beyond,
         "matching_error_m": {
@@ -137,7 +137,7 @@ def describe(figures: TokenStatistics) -> dict[str, Any]:
 
 
 def _errors(scene: Scene, tokens: SceneTokens, clock: Clock) -> np.ndarray:
-    """Count moves by how far their end is from where the log has the agent."""
+    """Count motion tokens by how far their end is from where the log has the agent."""
     ids = scene.tracks.id
     order = np.argsort(ids, kind="stable")
     row = order[np.searchsorted(ids[order], tokens.track_id)]

@@ -105,7 +105,7 @@ def _arcs(
 ) -> Float32[np.ndarray, "motion 6 3"]:
     """Draw a pivot along arcs at an even pace, the centre of the box ahead of it."""
     share = np.linspace(0, 1, CLOCK.steps_per_token + 1)
-    turned_rad = turn_rad[:, None] * share  # [move, 6]
+    turned_rad = turn_rad[:, None] * share  # [motion, 6]
     chord_m = length_m[:, None] * share * np.sinc(turned_rad / (2 * np.pi))
     x_m = chord_m * np.cos(turned_rad / 2) + pivot_m * (np.cos(turned_rad) - 1)
     y_m = chord_m * np.sin(turned_rad / 2) + pivot_m * np.sin(turned_rad)

@@ -53,7 +53,7 @@ def scene_motion_samples(
 ) -> MotionSamples:
     """Cut the motion tokens of all road users out of a scene, token by token.
 
-    Left out are moves beyond the limits and those that stay within ``still_m`` of where
+    Left out is motion beyond the limits and motion that stays within ``still_m`` of where
     they start (mean distance of box corners): standing still is known without logs.
     """
     tracks = scene.tracks

@@ -105,7 +105,7 @@ def smooth(
     no acceleration and everywhere the mean turn, so the share of it needed is known.
     """
     share = np.linspace(0, 1, path.shape[1], dtype=np.float32)[:, None]
-    even = path[:, -1:] * share  # [move, 6, 3]
+    even = path[:, -1:] * share  # [motion, 6, 3]
     apart = path - even
     apart[..., 2] = wrap_angle(apart[..., 2])
 
