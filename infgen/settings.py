@@ -27,6 +27,7 @@ RULES = ConfigDict(
     defer_build=True,  # Most commands build a few sections only.
 )
 """How all settings are read."""
+_UNKNOWN = "unexpected_keyword_argument"
 MAX_SEED = 2**63 - 1
 
 
@@ -103,7 +104,9 @@ def _config_error(
     where: str | Mapping[str, str],
 ) -> ConfigError:
     """Tell the first thing that is wrong in one line, with its place."""
-    first, missing = error.errors()[0], _missing(error)
+    unknown = [each for each in error.errors() if each["type"] == _UNKNOWN]
+    first = (unknown or error.errors())[0]
+    missing = [] if unknown else _missing(error)
     said = first["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
     key = str(first["loc"][0]) if first["loc"] else ""
     place = where if isinstance(where, str) else _place(key, said, where)
@@ -111,7 +114,7 @@ def _config_error(
         return ConfigError(f"{place}: {said}")
     if missing:
         return ConfigError(f"{place}: {', '.join(missing)} missing")
-    if first["type"] == "unexpected_keyword_argument":
+    if unknown:
         return ConfigError(f"{place}: no setting {key!r}; {_nearest(key, kind)}")
     return ConfigError(f"{place}.{key} is {values[key]!r}; {said}")
 

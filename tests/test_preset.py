@@ -14,30 +14,30 @@ PRESETS = """
   pair:
     profile: small,benchmark,tiny
     seeds: 2
-    plays:
+    rollout_sets:
       long: {}
       motion-only: {rollout: {mode: motion-only}}
       wosac: {rollout: {mode: wosac}}
     arms:
-      infgen: {published: InfGen, plays: [long, motion-only, wosac]}
+      infgen: {published: InfGen, rollout_sets: [long, motion-only, wosac]}
       smart:
         published: SMART-7M
         profile: smart
-        plays: {long: {score: {presence_radius_m: 75}}}
+        rollout_sets: {long: {score: {presence_radius_m: 75}}}
 
   odd:
     profile: small,benchmark,tiny
-    plays: {long: {}}
+    rollout_sets: {long: {}}
     arms:
-      infgen: {published: InfGen, plays: [long]}
-      odd: {label: Odd one, train: {motion_weight: 1e39}, plays: [long]}
-      odder: {profile: smart, start: odd, plays: [long]}
+      infgen: {published: InfGen, rollout_sets: [long]}
+      odd: {label: Odd one, train: {motion_weight: 1e39}, rollout_sets: [long]}
+      odder: {profile: smart, starts_from: odd, rollout_sets: [long]}
   wrong:
     profile: small,benchmark,tiny
-    plays: {long: {}}
+    rollout_sets: {long: {}}
     arms:
-      infgen: {published: InfGen, plays: [long]}
-      wrong: {model: {width: 15}, plays: [long]}
+      infgen: {published: InfGen, rollout_sets: [long]}
+      wrong: {model: {width: 15}, rollout_sets: [long]}
 """
 """Beside those of the package: one that goes well, one that does not, one that cannot."""
 RUNS = 2 * (3 + 1)

@@ -49,7 +49,7 @@ def read_description(path: Path, root: Root) -> About:
     if not path.is_file():
         raise ConfigError(f"{path}: no such file; expected {_asked()}")
     values = load(path)
-    about = build(About, values, {name: values.where(name) for name in values})
+    about = build(About, values, {name: f"{values.where(name)}: about" for name in values})
     trained = root.latest_folder("train")
     count = read_manifest(trained)["report"].get("parameters") if trained else None
     return about.with_parameters(count) if count else about

@@ -509,7 +509,7 @@ def test_the_command_says_in_one_line_what_is_wrong(infgen, few, source, tmp_pat
         (YAML.replace("account_name", "acount_name"), "did you mean 'account_name'"),
         (
             YAML.replace("[Ada, Bo]", "Ada"),
-            "about.yaml:3: authors is 'Ada'; expected a valid tuple",
+            "about.yaml:3: about.authors is 'Ada'; expected a valid tuple",
         ),
         ("authors: [Ada]", "account_name, unique_method_name, acknowledge"),
         (YAML.replace(": true", ": maybe"), "is 'maybe'; expected a valid boolean"),
