@@ -230,7 +230,7 @@ def test_figures_name_every_term_with_its_count(network, record, limits, setting
 
     found = figures(terms)
 
-    names = "motion stay add cell kind size heading offset map"
+    names = "motion keep add position agent_type size heading offset map"
     assert {*names.split()} <= found.keys()
     assert {f"{name}_count" for name in names.split()} <= found.keys()
     assert 0 <= found["motion_accuracy"] <= 1

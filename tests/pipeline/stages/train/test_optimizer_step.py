@@ -125,7 +125,7 @@ def test_means_of_parts_would_not_be_the_same(course, books):
     found = Descent(begin(course, *books), course.train, Team(), 2).step(parts, range(2), 0)
 
     assert counts[1] > 0
-    assert float(found.terms["kind"].count) == counts[0]
+    assert float(found.terms["agent_type"].count) == counts[0]
     assert float(found.terms["cell"].weight) == counts[0]
 
 
