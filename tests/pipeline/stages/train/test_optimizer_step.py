@@ -126,7 +126,7 @@ def test_means_of_parts_would_not_be_the_same(course, books):
 
     assert counts[1] > 0
     assert float(found.terms["agent_type"].count) == counts[0]
-    assert float(found.terms["cell"].weight) == counts[0]
+    assert float(found.terms["position"].weight) == counts[0]
 
 
 def test_a_parameter_that_no_scene_reaches_has_no_gradient_but_zero(course, books):
