@@ -16,11 +16,11 @@ from pipeline.commands import tables, tools
 from pipeline.commands.doctor import examine
 from pipeline.commands.options import (
     WORK,
-    Asked,
-    Comparing,
+    ComparisonOptions,
     Json,
+    RequestOptions,
     RootFolder,
-    Running,
+    RunFlags,
     StrictCode,
     gathers,
 )
@@ -30,10 +30,10 @@ from pipeline.commands.verbs import (
     STALE,
     compare_arms,
     exit_code,
-    find_standings,
+    find_statuses,
     print_json,
+    print_statuses,
     run_stages,
-    tell_standings,
     watch_stages,
 )
 from pipeline.engine import artefacts, signals
@@ -93,14 +93,14 @@ def infgen(
 
 
 @app.command()
-@gathers(asked=Asked, comparing=Comparing, running=Running)
+@gathers(request_options=RequestOptions, comparing=ComparisonOptions, running=RunFlags)
 def run(
     stages: Annotated[list[str] | None, typer.Argument(metavar="STAGE")] = None,
     json_: Json = False,
     *,
-    asked: Asked,
-    comparing: Comparing,
-    running: Running,
+    request_options: RequestOptions,
+    comparing: ComparisonOptions,
+    running: RunFlags,
 ) -> None:
     """Make stages, and what they need, where they are not made yet (default: report).
 
@@ -111,19 +111,19 @@ def run(
     A preset trains, plays and scores several methods alike and sets them side by side.
     """
     if comparing.preset is not None:
-        compare_arms(asked, comparing, stages or [], running, as_json=json_)
+        compare_arms(request_options, comparing, stages or [], running, as_json=json_)
         return
-    run_stages(asked.request(), stages or [], running, as_json=json_)
+    run_stages(request_options.request(), stages or [], running, as_json=json_)
 
 
 @app.command()
-@gathers(asked=Asked, running=Running)
+@gathers(request_options=RequestOptions, running=RunFlags)
 def ingest(
     files: Annotated[list[str] | None, typer.Argument(metavar="RECORDS")] = None,
     json_: Json = False,
     *,
-    asked: Asked,
-    running: Running,
+    request_options: RequestOptions,
+    running: RunFlags,
 ) -> None:
     """Turn raw records into scenes.
 
@@ -131,13 +131,15 @@ def ingest(
 
     Example: infgen ingest builtin --root R --profile small
     """
-    run_stages(asked.request(files or ()), ["ingest"], running, as_json=json_)
+    run_stages(request_options.request(files or ()), ["ingest"], running, as_json=json_)
 
 
 def _stage_verb(stage: str, what: str, *examples: str) -> None:
-    @gathers(asked=Asked, running=Running)
-    def verb(json_: Json = False, *, asked: Asked, running: Running) -> None:
-        run_stages(asked.request(), [stage], running, as_json=json_)
+    @gathers(request_options=RequestOptions, running=RunFlags)
+    def verb(
+        json_: Json = False, *, request_options: RequestOptions, running: RunFlags
+    ) -> None:
+        run_stages(request_options.request(), [stage], running, as_json=json_)
 
     more = ("--profile small -n", "--profile small", *examples)
     lines = [f"Example: infgen {stage} --root R {words}" for words in more]
@@ -167,18 +169,20 @@ _stage_verb("report", "Gather tables and figures in one page.")
 
 
 @app.command()
-@gathers(asked=Asked)
-def plan(json_: Json = False, strict_code: StrictCode = False, *, asked: Asked) -> None:
+@gathers(request_options=RequestOptions)
+def plan(
+    json_: Json = False, strict_code: StrictCode = False, *, request_options: RequestOptions
+) -> None:
     """Say what a run of all stages would make, and why (run -n).
 
     Example: infgen plan --root R -s tokenize.max_gap_s=2
     """
-    found = find_standings(asked.request(), strict_code=strict_code)
-    tell_standings(found, as_json=json_)
+    found = find_statuses(request_options.request(), strict_code=strict_code)
+    print_statuses(found, as_json=json_)
 
 
 @app.command()
-@gathers(asked=Asked)
+@gathers(request_options=RequestOptions)
 def status(
     check: Annotated[bool, typer.Option("--check", help="Exit 3 if any is stale.")] = False,
     json_: Json = False,
@@ -190,7 +194,7 @@ def status(
     ] = 2.0,
     strict_code: StrictCode = False,
     *,
-    asked: Asked,
+    request_options: RequestOptions,
 ) -> None:
     """Say how every stage stands to what is asked for, and why.
 
@@ -199,26 +203,26 @@ def status(
     Example: infgen status --root R --watch
     """
     if watch:
-        watch_stages(asked, every, as_json=json_, check=check)
+        watch_stages(request_options, every, as_json=json_, check=check)
         return
-    found = find_standings(asked.request(), strict_code=strict_code)
-    tell_standings(found, as_json=json_)
+    found = find_statuses(request_options.request(), strict_code=strict_code)
+    print_statuses(found, as_json=json_)
     if check and any(standing.state != "cached" for standing in found):
         raise typer.Exit(STALE)
 
 
 @app.command()
-@gathers(asked=Asked)
+@gathers(request_options=RequestOptions)
 def dag(
     mermaid: Annotated[bool, typer.Option("--mermaid", help="As a Mermaid chart.")] = False,
     *,
-    asked: Asked,
+    request_options: RequestOptions,
 ) -> None:
     """Show which stage reads which.
 
     Example: infgen dag --mermaid
     """
-    stages = asked.request().stages(os.environ).stages
+    stages = request_options.request().stages(os.environ).stages
     typer.echo(tables.graph_text(stages.values(), mermaid=mermaid))
 
 
@@ -344,7 +348,9 @@ def demo(root: RootFolder = WORK / "demo", json_: Json = False) -> None:
 
     Example: infgen demo
     """
-    run_stages(Asked(root=root, profile="demo").request(), [], Running(), as_json=json_)
+    run_stages(
+        RequestOptions(root=root, profile="demo").request(), [], RunFlags(), as_json=json_
+    )
 
 
 app.add_typer(tools.app)

@@ -1,6 +1,6 @@
 """Does who stands first at a light set off when it turns green, and wait while it is red?
 
-Logs, half second by half second as they are learned from, and what some weights expect::
+Logs, token step by token step as they are learned from, and what some weights expect::
 
     python benchmarks/at_the_lights.py ROOT [--weights ROOT/latest/train]
         [--split validation] [--scenes 80]
@@ -79,7 +79,9 @@ def look(network: Network, scene: SceneTokens) -> Stood:
         motion = network(batch).motion
     far_m = torch.from_numpy(network.motion_vocabulary().end_pose[..., :2]).norm(dim=-1)
     moves = (far_m > STILL_M)[batch.agents.kind[0]]  # [agent, move]
-    odds = motion.rows.spread(motion.move_logits)[0].softmax(dim=-1)  # [token, agent, move]
+    odds = motion.rows.spread(motion.motion_logits)[0].softmax(
+        dim=-1
+    )  # [token, agent, move]
     stood, went, quiet = _who_stood(batch.agents)
     token, agent = stood.nonzero(as_tuple=True)
     lines = StopLines.of(batch.roads)

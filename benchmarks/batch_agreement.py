@@ -9,7 +9,7 @@ the two are different futures, each as good as the other. This counts how often:
         [--weights ROOT/latest/train] [--mode long]
 
 Every scene is played once with all its rollouts in one batch, and with each of them alone,
-half second by half second; a rollout is followed until something sampled is not the same
+token step by token step; a rollout is followed until something sampled is not the same
 (moves, who enters where and as what, who leaves). Without ``--weights`` the network is
 random, of size small, and as lively as the log (``benchmarks/rollout.py``). The last line
 is one JSON object.
@@ -24,20 +24,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from made_codebooks import made_codebooks
+from made_vocabularies import made_vocabularies
 from measuring import read_scene
 from records import read_split
-from rollout import Case, Pace, make_network
+from rollout import Case, ThroughputMeter, make_network
 
 from infgen.clock import CLOCK
 from infgen.config import RolloutSettings, TokenSettings
 from infgen.model.network import Network
-from infgen.model.stepping import Memory, Stepper
-from infgen.model.token_step import Column, MotionStep
+from infgen.model.step_memory import StepMemory
+from infgen.model.stepping import Stepper
+from infgen.model.token_step import MotionStep, TokenStep
 from infgen.rollout.population import Population
-from infgen.rollout.recording import Start
+from infgen.rollout.recording import RolloutStart
 from infgen.rollout.session import Session
-from infgen.rollout.simulator import Player
+from infgen.rollout.simulator import Simulator
 from infgen.scene import Scene
 from infgen.tokens.tokenizer import tokenize_scene
 from pipeline.storage.weights import load_network
@@ -50,7 +51,7 @@ class Saying(Stepper):
 
     said: MotionStep | None = None
 
-    def motion_step(self, memory: Memory, column: Column) -> MotionStep:
+    def motion_step(self, memory: StepMemory, column: TokenStep) -> MotionStep:
         """Append a column to the past and say what follows it."""
         self.said = super().motion_step(memory, column)
         return self.said
@@ -78,11 +79,11 @@ def follow(
     books = network.motion_vocabulary(), network.map_vocabulary()
     tokens = network.grid_settings
     history = tokenize_scene(scene, *books, tokens, until=scene.now)
-    starts = [Start(scene, history, at, settings.seed) for at in range(rollouts)]
+    starts = [RolloutStart(scene, history, at, settings.seed) for at in range(rollouts)]
 
-    def session(of: Sequence[Start]) -> tuple[Session, Saying]:
+    def session(of: Sequence[RolloutStart]) -> tuple[Session, Saying]:
         saying = Saying(network)
-        player = Player(saying, *books, tokens, settings, torch.device("cpu"))
+        player = Simulator(saying, *books, tokens, settings, torch.device("cpu"))
         return Session(player, of), saying
 
     together, all_say = session(starts)
@@ -116,7 +117,7 @@ def _parted(single: Population, together: Population, at: int) -> str:
 def _gap(single: MotionStep | None, together: MotionStep | None, at: int) -> float:
     assert single is not None
     assert together is not None
-    away = single.move_logits[0] - together.move_logits[at]
+    away = single.motion_logits[0] - together.motion_logits[at]
     return float(away.abs().max())
 
 
@@ -129,9 +130,9 @@ def _network(weights: Path | None, scene: Scene) -> Network:
     if weights is not None:
         return load_network(weights).eval()
     case = Case("small", 1, "long", "plain", 0.0, 0, 0, "cpu", 1)
-    motion, roads = made_codebooks()
+    motion, roads = made_vocabularies()
     tokens = tokenize_scene(scene, motion, roads, TokenSettings())
-    return make_network(case, Pace.of(tokens))
+    return make_network(case, ThroughputMeter.of(tokens))
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Does a scene stay alive, and do newcomers set off as real ones do?
+"""Does a scene stay alive, and do inserted agents set off as real ones do?
 
 Reads the logs and the rollouts of a root, however long they are::
 
@@ -7,13 +7,14 @@ Reads the logs and the rollouts of a root, however long they are::
 The first table has the rollouts, span by span, beside the logs as far as they go: agents
 around the ego, its speed and that of vehicles, the share of vehicles that are off the road
 (most are parked there), that of those that drive, entries and exits per half second, and in
-how many half seconds the ego, and other vehicles, set off after standing for two seconds.
+how many token steps the ego, and other vehicles, set off after standing for two seconds.
 The second has who comes after now, from when it is near: speed in the first second, who
 begins off the road or on top of somebody, pedestrians and cyclists; below it stands how far
-apart logs and rollouts are in speeds and in the side newcomers come from. A rollout whose
-ego leaves the map, where a street out of town ends, counts until then. It is said how many
-do, how long one stands at most, and by how much agents, its speed and off-road shares drift
-from the first span, and from the second, to the last. The last line is one JSON object.
+apart logs and rollouts are in speeds and in the side inserted agents come from. A rollout
+whose ego leaves the map, where a street out of town ends, counts until then. It is said how
+many do, how long one stands at most, and by how much agents, its speed and off-road shares
+drift from the first span, and from the second, to the last. The last line is one JSON
+object.
 """
 
 import argparse
@@ -36,7 +37,7 @@ from infgen.metrics.kinematics import speed, speed_valid
 from infgen.metrics.placement import count_per_token
 from infgen.metrics.road import road_edge_m
 from infgen.metrics.traffic import Traffic, from_log, from_rollout, on_map
-from infgen.rollout.rules.off_road import Lanes, lane_pieces
+from infgen.rollout.rules.off_road import Lanes, lane_segments
 from infgen.scene import AgentType
 from infgen.settings import build
 from infgen.spatial.road_edges import RoadEdges, scene_road_edges
@@ -69,7 +70,7 @@ COLUMNS = {
 
 @dataclass(slots=True)
 class Side:
-    """Logs, or rollouts: sums and counts of each figure by span, and newcomers."""
+    """Logs, or rollouts: sums and counts of each figure by span, and inserted agents."""
 
     sums: dict[str, Float64[np.ndarray, "2 span"]]
     newcomers: Newcomers = field(default_factory=Newcomers)
@@ -213,7 +214,7 @@ def measure(root: Path, look: Look) -> tuple[Side, Side]:
     sides: list[Side] = []
     for scenario_id, some in groupby(rollouts, key=lambda one: one.scenario_id):
         scene = logs.find(scenario_id)
-        place = Place(scene_road_edges(scene), lane_pieces(scene))
+        place = Place(scene_road_edges(scene), lane_segments(scene))
         played = [from_rollout(one) for one in some]
         if not sides:
             steps = played[0].motion.valid.shape[2] - played[0].now - 1

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
 from infgen.model.batching.batch import Batch, Limits
-from infgen.model.tensors import map_tensors
+from infgen.model.batching.tensors import map_tensors
 from infgen.tokens.scene_tokens import SceneTokens
 from pipeline.commands.screen import show_table
 from pipeline.engine.events import Events
@@ -35,8 +35,8 @@ from pipeline.engine.runner import RunOptions, run
 from pipeline.settings.request import Request
 from pipeline.settings.stages_file import DEFAULT_FILE
 from pipeline.stages.train.loader import Recipe, TokenScenes, train_batches
-from pipeline.stages.train.process_group import Team
-from pipeline.stages.train.setup import Course
+from pipeline.stages.train.process_group import ProcessGroup
+from pipeline.stages.train.setup import TrainingSetup
 
 SECONDS = 6.0
 """How long each figure is measured."""
@@ -123,8 +123,8 @@ def report(root: Path, batch: int, workers: Sequence[int]) -> None:
     """Measure, print the tables, and last one line of JSON."""
     how = TrainSettings(batch_scenes=batch)
     scenes = TokenScenes(shards(root))
-    course = Course(ModelSettings(), how, TokenSettings(), scenes, [], root)
-    recipe = course.recipe(Team())
+    course = TrainingSetup(ModelSettings(), how, TokenSettings(), scenes, [], root)
+    recipe = course.recipe(ProcessGroup())
     raw, raw_bytes = raw_rates(scenes)
     rates = {count: batch_rate(recipe, count) for count in workers}
     size = float(np.mean([batch_bytes(recipe[step][0]) for step in range(8)]))

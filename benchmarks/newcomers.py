@@ -22,12 +22,12 @@ SPEED_EDGES_MPS = np.arange(0.0, 26.0)
 STANDING_MPS = 0.5
 """Who is slower in the first second stands."""
 BEARINGS = 8
-"""Sectors of where newcomers come from, the first of them straight ahead of the ego."""
+"""Sectors that inserted agents come from; the first is straight ahead of the ego."""
 
 
 @dataclass(slots=True)
 class Newcomers:
-    """All newcomers of some logs or rollouts, one entry for each part of it.
+    """All inserted agents of some logs or rollouts, one entry for each part of it.
 
     Attributes:
         first_mps: Speeds in the first second; of whoever is seen in it.
@@ -51,7 +51,7 @@ class Newcomers:
         known: np.ndarray,
         near: np.ndarray,
     ) -> None:
-        """Measure the newcomers of one log or rollout that are near for a second.
+        """Measure the inserted agents of one log or rollout that are near for a second.
 
         Args:
             traffic: Logged or played.
@@ -98,12 +98,12 @@ class Newcomers:
         }
 
     def speed_counts(self) -> Float64[np.ndarray, " bin"]:
-        """Count newcomers by their speed in the first second."""
+        """Count inserted agents by their speed in the first second."""
         mps = np.minimum(_joined(self.first_mps), SPEED_EDGES_MPS[-1])
         return np.histogram(mps, SPEED_EDGES_MPS)[0].astype(np.float64)
 
     def bearing_counts(self) -> Float64[np.ndarray, " sector"]:
-        """Count newcomers by the sector of the ego's surroundings they come from."""
+        """Count inserted agents by the sector of the ego's surroundings they come from."""
         width_rad = 2 * np.pi / BEARINGS
         sector = np.rint(_joined(self.bearing_rad) / width_rad).astype(int) % BEARINGS
         return np.bincount(sector, minlength=BEARINGS).astype(np.float64)

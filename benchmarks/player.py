@@ -1,6 +1,6 @@
 """How smoothly the player runs in a real browser, and how large its page is.
 
-A made scene of the promised size (128 agents, 2,000 road tokens, 30 s; log and three
+A made scene of the promised size (128 agents, 2,000 map tokens, 30 s; log and three
 rollouts side by side) is played in Chromium without a screen or a graphics card::
 
     python benchmarks/player.py [--showings N] [--seconds S] [--chromium PATH]
@@ -25,7 +25,7 @@ from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import SignalClass
 from infgen.views.player import player_page
 from infgen.views.scene.drawn_map import DrawnMap, Lights, RoadLook
-from infgen.views.scene.view_model import Film, Role, Showing
+from infgen.views.scene.view_model import Role, Showing, ViewModel
 
 AGENTS, ROAD_TOKENS, STEPS, NOW = 128, 2000, 311, 10
 TOKEN_M, STREET_M, REACH_M = 5.0, 500.0, 140.0
@@ -40,11 +40,11 @@ FLAGS = (
 )
 
 
-def busy_film(showings: int = 4, seed: int = 0) -> Film:
+def busy_film(showings: int = 4, seed: int = 0) -> ViewModel:
     """Make a scene of the promised size: winding streets, everyone turning and braking."""
     rng = np.random.default_rng(seed)
     names = ["log", *(f"rollout {at}" for at in range(showings - 1))]
-    return Film(
+    return ViewModel(
         scenario_id="busy",
         now=NOW,
         weights="none",
@@ -61,7 +61,7 @@ def busy_film(showings: int = 4, seed: int = 0) -> Film:
 
 
 def _streets(rng: np.random.Generator) -> DrawnMap:
-    """Winding lines of all looks, as long together as so many road tokens."""
+    """Winding lines of all looks, as long together as so many map tokens."""
     count = round(ROAD_TOKENS * TOKEN_M / STREET_M)
     looks = np.sort(np.resize([RoadLook.LANE, RoadLook.WHITE_BROKEN, RoadLook.EDGE], count))
     along_m = np.linspace(-STREET_M / 2, STREET_M / 2, 251)

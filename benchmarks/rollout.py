@@ -11,7 +11,7 @@ so that nobody drives off the map, where there would be nothing to look at.
 
 Every row is a process of its own, so its memory is too. The last line is one JSON object.
 On a GPU seconds are the clock's. ``--sweeps`` adds what a rollout costs by the number of
-its agents, of its road tokens, by its length, and by the rollouts played at once.
+its agents, of its map tokens, by its length, and by the rollouts played at once.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from made_codebooks import made_codebooks
+from made_vocabularies import made_vocabularies
 from measuring import (
     SIZES,
     in_own_process,
@@ -42,9 +42,9 @@ from infgen.clock import CLOCK
 from infgen.config import RolloutSettings, TokenSettings
 from infgen.model.network import Network
 from infgen.model.stepping import Stepper
-from infgen.rollout.recording import Frame, Start
+from infgen.rollout.recording import Frame, RolloutStart
 from infgen.rollout.session import Session
-from infgen.rollout.simulator import Player
+from infgen.rollout.simulator import Simulator
 from infgen.scene import Scene
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.tokenizer import tokenize_scene
@@ -66,7 +66,7 @@ PLAYED: dict[str, dict[str, Any]] = {
         "density_control": 1.0,
     },
 }
-"""Settings by word: the paper's; newcomers kept off other boxes and near lanes; and as
+"""Settings by name: the paper's; with the insertion mask; and as
 profiles ``pretrained`` and ``benchmark`` play."""
 
 
@@ -81,7 +81,7 @@ class Case:
         played: One of ``PLAYED``.
         seconds: Length.
         agents: Agents at first, the nearest to the ego; 0 for all.
-        roads: Road tokens, the nearest to the ego; 0 for all.
+        roads: Map tokens, the nearest to the ego; 0 for all.
         device: Where.
         threads: Of the processor.
     """
@@ -98,11 +98,11 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Pace:
+class ThroughputMeter:
     """How lively the log of a scene is.
 
     Attributes:
-        entries: Newcomers of a half second.
+        entries: Inserted agents of a half second.
         leaves: Probability that an agent leaves in a half second.
     """
 
@@ -110,7 +110,7 @@ class Pace:
     leaves: float
 
     @classmethod
-    def of(cls, tokens: SceneTokens) -> "Pace":
+    def of(cls, tokens: SceneTokens) -> "ThroughputMeter":
         """Count what happens after now."""
         later = tokens.presence[:, tokens.now + 1 :]
         there = (later != Presence.ABSENT).sum()
@@ -120,9 +120,9 @@ class Pace:
         )
 
 
-def make_network(case: Case, pace: Pace) -> Network:
+def make_network(case: Case, pace: ThroughputMeter) -> Network:
     """Make random weights that play as lively as the log."""
-    motion, roads = made_codebooks()
+    motion, roads = made_vocabularies()
     torch.manual_seed(0)
     network = Network(SIZES[case.size], motion, roads, TokenSettings())
     assert network.cells is not None
@@ -158,9 +158,11 @@ def _last_layer(head: nn.Module) -> nn.Linear:
 
 def make_session(case: Case) -> tuple[Session, SceneTokens]:
     """Start a batch of rollouts of the scene."""
-    scene, (motion, roads) = read_scene(), made_codebooks()
+    scene, (motion, roads) = read_scene(), made_vocabularies()
     tokens = TokenSettings()
-    network = make_network(case, Pace.of(tokenize_scene(scene, motion, roads, tokens)))
+    network = make_network(
+        case, ThroughputMeter.of(tokenize_scene(scene, motion, roads, tokens))
+    )
     seen = _near(scene, case.agents, tokens)
     history = tokenize_scene(scene, motion, roads, seen, until=scene.now)
     history = _cropped(history, case.roads)
@@ -170,11 +172,11 @@ def make_session(case: Case) -> tuple[Session, SceneTokens]:
         batch_rollouts=case.batch,
         **PLAYED[case.played],
     )
-    player = Player(
+    simulator = Simulator(
         Stepper(network), motion, roads, tokens, settings, torch.device(case.device)
     )
-    starts = [Start(scene, history, at, settings.seed) for at in range(case.batch)]
-    return Session(player, starts), history
+    starts = [RolloutStart(scene, history, at, settings.seed) for at in range(case.batch)]
+    return Session(simulator, starts), history
 
 
 def _near(scene: Scene, agents: int, tokens: TokenSettings) -> TokenSettings:
@@ -191,7 +193,7 @@ def _near(scene: Scene, agents: int, tokens: TokenSettings) -> TokenSettings:
 
 
 def _cropped(history: SceneTokens, roads: int) -> SceneTokens:
-    """Keep the road tokens nearest to the ego."""
+    """Keep the map tokens nearest to the ego."""
     if not roads:
         return history
     away_m = history.map_pose[:, :2] - history.pose[history.ego, history.now, :2]
@@ -214,7 +216,9 @@ def measure(case: Case) -> dict[str, float]:
     bf16 = case.device != "cpu" and torch.cuda.is_bf16_supported()
     peak = peak_flops(case.device, bf16=bf16)
     return {
-        "agents": float(np.mean([(frame.life >= 0).sum(axis=1) for frame in frames])),
+        "agents": float(
+            np.mean([(frame.agent_number >= 0).sum(axis=1) for frame in frames])
+        ),
         "roads": float(history.num_map_tokens),
         "entered": float(np.mean([_entered(frame) for frame in frames]) * len(frames)),
         "begin_s": begin_s,
@@ -228,7 +232,7 @@ def measure(case: Case) -> dict[str, float]:
 
 
 def _entered(frame: Frame) -> float:
-    return float((frame.born >= 0).sum(axis=1).mean())
+    return float((frame.inserted_number >= 0).sum(axis=1).mean())
 
 
 def _flops_of_a_step(session: Session) -> float:

@@ -21,10 +21,10 @@ from records import BUILT_IN, SHARED
 
 from infgen.scene import Scene
 from infgen.sources.womd import iter_scenes
-from infgen.views.scene.agent_marks import Crowd
+from infgen.views.scene.agent_marks import AgentMarks
 from infgen.views.scene.style import THEMES, Theme
 from infgen.views.scene.view import all_marks, view_of
-from infgen.views.scene.view_model import make_film
+from infgen.views.scene.view_model import make_view_model
 from infgen.views.video.encoding import write_png
 from infgen.views.video.painter import Canvas
 
@@ -50,11 +50,11 @@ def _scenes(paths: Sequence[str]) -> Iterator[Scene]:
 
 def draw(scene: Scene, theme: Theme) -> UInt8[np.ndarray, "high wide 3"]:
     """Paint a scene as it is now."""
-    film = make_film(scene, ())
+    film = make_view_model(scene, ())
     (showing,) = film.showings
     view = view_of(showing, film.now, SIDE_PX, SIDE_PX)
     canvas = Canvas.plain(SIDE_PX, SIDE_PX, theme.ground)
-    canvas.paint(all_marks(film, Crowd(showing), film.now, view, theme))
+    canvas.paint(all_marks(film, AgentMarks(showing), film.now, view, theme))
     return canvas.pixels
 
 

@@ -34,24 +34,24 @@ STILL_M = 1.0
 WHOLE_PATTERN = 31
 QUANTILES = (10, 50, 90)
 
-Column = dict[str, float]
+TokenStep = dict[str, float]
 """One set's statistics by name."""
 Values = dict[str, np.ndarray]
 """One scene's values by name; of a set they are pooled."""
 
 
-def measure(scene: Scene) -> tuple[Column, Values]:
+def measure(scene: Scene) -> tuple[TokenStep, Values]:
     """Measure one scene: its counts, and values to be pooled over scenes."""
     traffic = from_log(scene, TokenSettings())
     counts = _count_agents(traffic) | _count_events(traffic) | _count_map(scene)
     return counts, _motion_of(scene, traffic) | _sight_of(traffic)
 
 
-def _count_agents(traffic: Traffic) -> Column:
+def _count_agents(traffic: Traffic) -> TokenStep:
     kind, valid = traffic.motion.kind, traffic.motion.valid[0]
     near = valid & (_apart_m(traffic) < NEAR_M)
     others = np.arange(len(kind)) != traffic.ego
-    counts: Column = {"agents ever": len(kind)}
+    counts: TokenStep = {"agents ever": len(kind)}
     for each in (AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST):
         counts[f"{each.name.lower()}s now"] = float(
             (traffic.there_now & (kind == each)).sum()
@@ -60,23 +60,23 @@ def _count_agents(traffic: Traffic) -> Column:
     return counts
 
 
-def _count_events(traffic: Traffic) -> Column:
+def _count_events(traffic: Traffic) -> TokenStep:
     """Entries and exits per half second."""
     events, num_steps = traffic.events, traffic.motion.valid.shape[2]
     tokens = CLOCK.num_tokens(num_steps) - CLOCK.token_ending_at(traffic.now) - 1
-    counts: Column = {}
+    counts: TokenStep = {}
     for words, radius_m in (("within 75 m", NEAR_M), ("anywhere", np.inf)):
         entries = count_per_token(
             events.entry_token, events.entry_distance_m, radius_m, tokens
         )
         exits = count_per_token(events.exit_token, events.exit_distance_m, radius_m, tokens)
-        # Nobody is seen to enter or leave in the last half seconds.
+        # Nobody is seen to enter or leave in the last token steps.
         counts[f"entries per half second {words}"] = float(entries[:-2].mean())
         counts[f"exits per half second {words}"] = float(exits[:-2].mean())
     return counts
 
 
-def _count_map(scene: Scene) -> Column:
+def _count_map(scene: Scene) -> TokenStep:
     road_map, kinds = scene.road_map, scene.road_map.feature_type
     lanes = kinds == FeatureType.LANE
     bike = lanes & (road_map.feature_subtype == LaneType.BIKE_LANE)
@@ -163,9 +163,9 @@ def _sight_of(traffic: Traffic) -> Values:
     }
 
 
-def column(scenes: Iterator[Scene]) -> Column:
+def column(scenes: Iterator[Scene]) -> TokenStep:
     """Means over scenes of the counts; shares and quantiles of the pooled values."""
-    counts: list[Column] = []
+    counts: list[TokenStep] = []
     pooled: dict[str, list[np.ndarray]] = {}
     for scene in scenes:
         try:
@@ -176,14 +176,14 @@ def column(scenes: Iterator[Scene]) -> Column:
         counts.append(of_scene)
         for name, some in values.items():
             pooled.setdefault(name, []).append(some)
-    found: Column = {"scenes": float(len(counts))}
+    found: TokenStep = {"scenes": float(len(counts))}
     found |= {name: float(np.mean([one[name] for one in counts])) for name in counts[0]}
     for name, parts in pooled.items():
         found |= _describe(name, np.concatenate(parts))
     return found
 
 
-def _describe(name: str, values: np.ndarray) -> Column:
+def _describe(name: str, values: np.ndarray) -> TokenStep:
     if values.dtype == bool:
         return {name: float(values.mean()) if len(values) else np.nan}
     finite = values[np.isfinite(values)]
@@ -211,7 +211,7 @@ def read(pattern: str, most: int) -> Iterator[Scene]:
         yield from islice(whole, each)
 
 
-def print_table(columns: Mapping[str, Column]) -> None:
+def print_table(columns: Mapping[str, TokenStep]) -> None:
     """Print the columns as a Markdown table."""
     print("| | " + " | ".join(columns) + " |")
     print("|---|" + "---:|" * len(columns))

@@ -29,7 +29,7 @@ from typing import Literal
 import numpy as np
 import torch
 import torch.distributed as dist
-from made_codebooks import made_codebooks
+from made_vocabularies import made_vocabularies
 from measuring import (
     SIZES,
     in_own_process,
@@ -45,8 +45,8 @@ from infgen.model.batching.batch import Batch, Limits, collate, to_device
 from infgen.model.network import Network
 from infgen.tokens.tokenizer import tokenize_scene
 from pipeline.commands.screen import show_table
-from pipeline.stages.train.optimizer_step import Descent
-from pipeline.stages.train.process_group import Team
+from pipeline.stages.train.optimizer_step import OptimizerStep
+from pipeline.stages.train.process_group import ProcessGroup
 from pipeline.stages.train.setup import repeatable
 from pipeline.storage.checkpoint import TrainingState
 
@@ -83,13 +83,13 @@ class Case:
     meeting: str = ""
 
 
-def prepare(case: Case) -> tuple[Descent, Batch, TrainingState]:
+def prepare(case: Case) -> tuple[OptimizerStep, Batch, TrainingState]:
     """Make the network, its optimiser, and a batch of one scene several times."""
     model = SIZES[case.size]
     if case.neighbours:
         model = replace(model, map_agent_neighbours=case.neighbours)
     grid, how = TokenSettings(), TrainSettings(precision=case.precision)
-    motion, roads = made_codebooks()
+    motion, roads = made_vocabularies()
     tokens = tokenize_scene(read_scene(), motion, roads, grid)
     batch = collate([tokens] * case.scenes, Limits.of(model, how, grid), 0)
     torch.manual_seed(0)
@@ -99,16 +99,16 @@ def prepare(case: Case) -> tuple[Descent, Batch, TrainingState]:
     optimiser = torch.optim.AdamW(network.parameters(), fused=True)
     average = {name: p.detach().clone() for name, p in network.named_parameters()}
     training = TrainingState(network, average, optimiser)
-    descent = Descent(training, how, team, case.team)
+    descent = OptimizerStep(training, how, team, case.team)
     return descent, to_device(batch, device), training
 
 
-def _join(case: Case) -> Team:
+def _join(case: Case) -> ProcessGroup:
     device = torch.device(case.device)
     if case.team > 1:
         where = f"file://{case.meeting}"
         dist.init_process_group("gloo", where, rank=case.rank, world_size=case.team)
-    return Team(case.rank, case.team, device)
+    return ProcessGroup(case.rank, case.team, device)
 
 
 def measure(case: Case) -> dict[str, float]:

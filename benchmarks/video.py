@@ -1,6 +1,6 @@
 """How long a video takes: 30 s at 1080p by as many processes as there are cores.
 
-A made scene of the player's promised size (128 agents, 2,000 road tokens) with its log and
+A made scene of the player's promised size (128 agents, 2,000 map tokens) with its log and
 three rollouts, each in a pane::
 
     python benchmarks/video.py [--showings N] [--size 1920x1080] [--fps 25] [--workers N]

@@ -26,9 +26,9 @@ from infgen.geometry import to_local
 from infgen.model.network import Network
 from infgen.model.stepping import Stepper
 from infgen.rollout.population import EGO_ROW, Population
-from infgen.rollout.recording import Start
+from infgen.rollout.recording import RolloutStart
 from infgen.rollout.session import Session
-from infgen.rollout.simulator import Player
+from infgen.rollout.simulator import Simulator
 from infgen.scene import FeatureType, Scene
 from infgen.tokens.scene_tokens import Presence
 from infgen.tokens.tokenizer import tokenize_scene
@@ -140,14 +140,14 @@ def gap_ahead(session: Session, before: Population, length_m: float) -> tuple[fl
         return np.inf, np.inf
     row = int(np.where(in_the_way, local[:, 0], np.inf).argmin())
     gap_m = float(local[row, 0]) - (length_m + float(now.size_lwh_m[0, row, 0])) / 2
-    same = before.life[0, row] == now.life[0, row]
+    same = before.agent_number[0, row] == now.agent_number[0, row]
     moved_m = np.linalg.norm(pose[row, :2] - before.pose[0, row, :2]) if same else 0.0
     return gap_m, float(moved_m) / CLOCK.token_s
 
 
 @dataclass(frozen=True)
 class Moment:
-    """The ego at the end of one half second.
+    """The ego at the end of one token step.
 
     Attributes:
         seconds: Since the drive began.
@@ -164,9 +164,9 @@ class Moment:
     num_others: int
 
 
-def drive(player: Player, start: Start, seconds: float) -> Iterator[Moment]:
+def drive(simulator: Simulator, start: RolloutStart, seconds: float) -> Iterator[Moment]:
     """Let the planner drive in traffic that reacts to it."""
-    session = Session(player, start)
+    session = Session(simulator, start)
     keeper = LaneKeeper.of(start.scene, desired_mps=12.0)
     before = session.population
     for step in range(CLOCK.tokens_in(seconds)):
@@ -184,9 +184,9 @@ def drive(player: Player, start: Start, seconds: float) -> Iterator[Moment]:
         )
 
 
-def make_player(network: Network, settings: RolloutSettings) -> Player:
+def make_player(network: Network, settings: RolloutSettings) -> Simulator:
     """Get a network ready to be played."""
-    return Player(
+    return Simulator(
         stepper=Stepper(network),
         vocabulary=network.motion_vocabulary(),
         roads=network.map_vocabulary(),
@@ -196,12 +196,12 @@ def make_player(network: Network, settings: RolloutSettings) -> Player:
     )
 
 
-def begin(scene: Scene, player: Player, seed: int = 0) -> Start:
+def begin(scene: Scene, simulator: Simulator, seed: int = 0) -> RolloutStart:
     """Tokenize the first second of a scene."""
     history = tokenize_scene(
-        scene, player.vocabulary, player.roads, player.tokens, until=scene.now
+        scene, simulator.vocabulary, simulator.roads, simulator.tokens, until=scene.now
     )
-    return Start(scene=scene, history=history, index=0, seed=seed)
+    return RolloutStart(scene=scene, history=history, index=0, seed=seed)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -219,10 +219,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     scene = street()
     if options.scenes:
         scene = next(islice(read_scenes(options.scenes), options.scene, None))
-    player = make_player(network, settings)
-    start = begin(scene, player, options.seed)
+    simulator = make_player(network, settings)
+    start = begin(scene, simulator, options.seed)
     print("   s      x m      y m   m/s   gap m  others")
-    for moment in drive(player, start, options.seconds):
+    for moment in drive(simulator, start, options.seconds):
         x_m, y_m, _ = moment.ego_pose
         print(
             f"{moment.seconds:4.1f} {x_m:8.1f} {y_m:8.1f} {moment.speed_mps:5.1f} "

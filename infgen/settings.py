@@ -69,7 +69,7 @@ def _word(value: Any) -> Any:
 Int = Annotated[int, BeforeValidator(_whole)]
 Float = Annotated[float, BeforeValidator(_refuse_bool)]
 Bool = Annotated[bool, BeforeValidator(_switch)]
-Word = BeforeValidator(_word)
+SequenceToken = BeforeValidator(_word)
 Count = Annotated[Int, Field(ge=0)]
 AtLeastOne = Annotated[Int, Field(ge=1)]
 NonNegative = Annotated[Float, Field(ge=0)]

@@ -20,14 +20,14 @@ UNSEEN_TOKENS = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Turnover:
+class FlowCounts:
     """Counts of some logs or rollouts.
 
     Attributes:
         came: Who was not there, and then was.
         went: Who was there, and never again.
         agents: Who was there at the end of a half second, added up over all.
-        tokens: Half seconds that were looked at.
+        tokens: Token steps that were looked at.
     """
 
     came: int = 0
@@ -35,8 +35,8 @@ class Turnover:
     agents: int = 0
     tokens: int = 0
 
-    def __add__(self, other: "Turnover") -> "Turnover":
-        return Turnover(
+    def __add__(self, other: "FlowCounts") -> "FlowCounts":
+        return FlowCounts(
             self.came + other.came,
             self.went + other.went,
             self.agents + other.agents,
@@ -48,15 +48,15 @@ class Turnover:
         return count / self.tokens if self.tokens else np.nan
 
 
-def count_turnover(
+def count_flow(
     traffic: Traffic, radius_m: float, temporal_window_tokens: int | None = None
-) -> Turnover:
+) -> FlowCounts:
     """Count who is around the ego, comes and goes after now, but in the last second.
 
     Args:
         traffic: A log or a rollout.
         radius_m: Whoever is nearer to the ego is around it.
-        temporal_window_tokens: Count as if there were so many half seconds after now, and
+        temporal_window_tokens: Count as if there were so many token steps after now, and
             as much before as there is, in as many such windows as there is room for.
             Whoever is away for a while has gone for good in a log that ends before, so long
             rollouts are compared to short logs in windows as long as these.
@@ -82,14 +82,14 @@ def _windows(tokens: int, length: int) -> Int64[np.ndarray, " window"]:
     return np.rint(np.linspace(0, tokens - length, count)).astype(np.int64)
 
 
-def _count_window(near: Bool[np.ndarray, "agent step"], now: int) -> Turnover:
+def _count_window(near: Bool[np.ndarray, "agent step"], now: int) -> FlowCounts:
     """Count in one window, given who is around the ego at which of its steps."""
     after = near.shape[1] - 1 - now
     tokens = max(0, after // CLOCK.steps_per_token - UNSEEN_TOKENS)
     ends = now + CLOCK.steps_per_token * np.arange(1, tokens + 1)
     first, last = _first_and_last(near)
     came, went = first > now, last >= now
-    return Turnover(
+    return FlowCounts(
         came=_within(first[came] - now - 1, tokens),
         went=_within(last[went] - now, tokens),
         agents=int(near[:, ends].sum()),
@@ -109,6 +109,6 @@ def _within(steps_after: Int64[np.ndarray, " event"], tokens: int) -> int:
     return int((steps_after < tokens * CLOCK.steps_per_token).sum())
 
 
-def add_up(turnovers: Iterable[Turnover]) -> Turnover:
+def add_up(turnovers: Iterable[FlowCounts]) -> FlowCounts:
     """Counts of all of them together."""
-    return sum(turnovers, Turnover())
+    return sum(turnovers, FlowCounts())

@@ -1,6 +1,6 @@
 """Entries and exits: who comes and goes in which half second, and how far from the ego.
 
-Log and simulation are read the same way. An agent enters in the half second at whose end it
+Log and simulation are read the same way. An agent enters in the token step at whose end it
 is first placed, and leaves in the last one it is seen through (SPEC 3.3). The ego and
 whoever is there now have not entered.
 """
@@ -24,9 +24,9 @@ class Events:
     """Entries and exits after now, in any order.
 
     Attributes:
-        entry_token: Half seconds after now (0 is the first) of each entry.
+        entry_token: Token steps after now (0 is the first) of each entry.
         entry_distance_m: Distance to the ego there; NaN where it is not known.
-        exit_token: Half seconds after now of each exit.
+        exit_token: Token steps after now of each exit.
         exit_distance_m: Distance to the ego there.
     """
 
@@ -59,8 +59,8 @@ def logged_events(scene: Scene, settings: TokenSettings) -> Events:
 def simulated_events(rollout: Rollout) -> Events:
     """List the entries and exits of a rollout.
 
-    A newcomer is placed at a pose that is not one of its valid steps; where it was follows
-    from the two steps after it.
+    An inserted agent is placed at a pose that is not one of its valid steps; where it was
+    follows from the two steps after it.
     """
     first = rollout.now + 1
     others = np.arange(len(rollout.id)) != rollout.ego
@@ -84,7 +84,7 @@ def count_per_token(
     radius_m: float,
     num_tokens: int,
 ) -> Int64[np.ndarray, " token"]:
-    """Count events within a radius of the ego in each half second.
+    """Count events within a radius of the ego in each token step.
 
     With an infinite radius, also those whose distance is not known.
     """

@@ -41,7 +41,7 @@ class Traffic:
 
     @property
     def future_tokens(self) -> int:
-        """Whole half seconds after now."""
+        """Whole token steps after now."""
         return (self.motion.x_m.shape[2] - 1 - self.now) // CLOCK.steps_per_token
 
     @property

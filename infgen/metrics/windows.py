@@ -1,4 +1,4 @@
-"""Sliding windows over the half seconds after now: 8 s long, one every 0.5 s."""
+"""Sliding windows over the token steps after now: 8 s long, one every 0.5 s."""
 
 from dataclasses import dataclass
 
@@ -10,12 +10,12 @@ from infgen.clock import CLOCK
 
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """Windows over a future of so many half seconds.
+    """Windows over a future of so many token steps.
 
     Attributes:
-        num_tokens: Half seconds of the future.
-        length: Half seconds of a window.
-        stride: Half seconds from one window to the next.
+        num_tokens: Token steps of the future.
+        length: Token steps of a window.
+        stride: Token steps from one window to the next.
     """
 
     num_tokens: int
@@ -34,7 +34,7 @@ class Windows:
 
     @property
     def num_steps(self) -> int:
-        """Steps of the future that lie in whole half seconds."""
+        """Steps of the future that lie in whole token steps."""
         return self.num_tokens * CLOCK.steps_per_token
 
     def sum_tokens(
@@ -56,7 +56,7 @@ class Windows:
     def covering(
         self, token: Int64[np.ndarray, " event"]
     ) -> Int64[np.ndarray, "event window"]:
-        """Tell (1 or 0) which windows hold each half second."""
+        """Tell (1 or 0) which windows hold each token step."""
         inside = (token[:, None] >= self.starts) & (
             token[:, None] < self.starts + self.length
         )
@@ -67,7 +67,7 @@ def cut_windows(num_steps: int, window_s: float, stride_s: float) -> Windows:
     """Cut a future of so many steps into windows.
 
     Raises:
-        ValueError: if a duration is not a whole number of half seconds.
+        ValueError: if a duration is not a whole number of token steps.
     """
     return Windows(
         num_tokens=num_steps // CLOCK.steps_per_token,

@@ -11,20 +11,20 @@ from torch import Tensor, nn
 from infgen.clock import CLOCK
 from infgen.model.layers import (
     Attention,
+    AttentionSources,
     FourierEmbedding,
-    Seen,
     embedding_mlp,
     gather,
     mlp,
     normed,
 )
 from infgen.model.logits import MotionOutputs
-from infgen.model.motion_head import MoveHead
+from infgen.model.motion_head import MotionHead
 from infgen.model.neighbour_attention import Shared
-from infgen.model.neighbours import Around, Reach, RoadFeatures
+from infgen.model.neighbours import NeighbourRows, NeighbourSpec, RoadFeatures
 from infgen.model.relations import Rows, direction, relation_embedding
 from infgen.model.settings import ModelSettings
-from infgen.model.signal_features import LightAhead
+from infgen.model.signal_features import SignalAhead
 from infgen.scene import AgentType
 from infgen.tokens.grid import Grid
 from infgen.tokens.scene_tokens import (
@@ -54,7 +54,7 @@ class AgentRows:
         kind: ``AgentType`` [row].
         size_lwh_m: Boxes [row, 3].
         pose: Poses [row, 3].
-        before: Poses half a second earlier [row, 3] ...
+        before: Poses one token step earlier [row, 3] ...
         known: ... and whether they were seen [row].
         move: Vocabulary row, ``FIRST_MOTION_TOKEN`` or ``NO_MOTION_TOKEN`` [row].
         presence: ``Presence`` [row].
@@ -159,21 +159,21 @@ def _last_motion(agents: AgentRows) -> Tensor:
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class AgentContext:
     """What agents see, for all blocks alike.
 
     Attributes:
         past_relation: Relations to their own past [N, K, D] ...
         past_present: ... and which of it there is [N, K].
-        roads: Road tokens around them.
+        roads: Map tokens around them.
         agents: Rows of the agents around them.
         light: What they are told of the traffic lights ahead [N, D], if they are.
     """
 
     past_relation: Shared
     past_present: Tensor
-    roads: Seen
-    agents: Around
+    roads: AttentionSources
+    agents: NeighbourRows
     light: Tensor | None
 
 
@@ -187,7 +187,7 @@ class MotionBlock(nn.Module):
         self.roads = Attention(width, heads, dropout, bipartite=True)
         self.agents = Attention(width, heads, dropout, bipartite=False)
 
-    def forward(self, x_ND: Tensor, past: Seen, sight: Sight) -> Tensor:
+    def forward(self, x_ND: Tensor, past: AttentionSources, sight: AgentContext) -> Tensor:
         """Update agents; ``past`` are they themselves at earlier tokens."""
         x_ND = self.past(x_ND, past)
         x_ND = self.roads(x_ND, sight.roads)
@@ -221,18 +221,18 @@ class MotionStack(nn.Module):
         )
         shaped = settings.motion_feature_width
         self.move = None if shaped else mlp(width, width, vocabulary.num_motion_tokens)
-        self.shaped = MoveHead(width, shaped, vocabulary) if shaped else None
+        self.shaped = MotionHead(width, shaped, vocabulary) if shaped else None
         leaves = settings.insertion_and_removal and settings.remove_token
         self.leave = mlp(width, width, 1) if leaves else None
         patterns = settings.validity_pattern_tokens
         self.pattern = mlp(width, width, NUM_PATTERNS) if patterns else None
         ahead_m = settings.signal_ahead_m
-        self.light = LightAhead(width, ahead_m) if ahead_m else None
+        self.light = SignalAhead(width, ahead_m) if ahead_m else None
 
-    def roads_reach(self) -> Reach:
+    def roads_reach(self) -> NeighbourSpec:
         """How agents see roads."""
         s = self.settings
-        return Reach.of(
+        return NeighbourSpec.of(
             s.map_agent_radius_m,
             s.map_agent_neighbours,
             self.roads_relation,
@@ -240,31 +240,33 @@ class MotionStack(nn.Module):
             across=s.map_agent_lateral_offset,
         )
 
-    def agents_reach(self) -> Reach:
+    def agents_reach(self) -> NeighbourSpec:
         """How agents see each other."""
         s = self.settings
-        return Reach.of(
+        return NeighbourSpec.of(
             s.agent_agent_radius_m, s.agent_agent_neighbours, self.agents_relation
         )
 
     def lights_ahead(
         self, roads: RoadFeatures, pose: Tensor, scene: Tensor, token: Tensor
     ) -> Tensor | None:
-        """Tell agents on maps [N] at half seconds [N] what the lights ahead show [N, D]."""
+        """Tell agents on maps [N] at token steps [N] what the lights ahead show [N, D]."""
         if self.light is None or roads.lines is None:
             return None
         told: Tensor = self.light(roads.lines, pose, scene, token)
         return told
 
-    def forward(self, x_ND: Tensor, past_index: Tensor, sight: Sight) -> Tensor:
+    def forward(self, x_ND: Tensor, past_index: Tensor, sight: AgentContext) -> Tensor:
         """Update the agents of all tokens; ``past_index`` are rows of their own past."""
         x_ND = x_ND if sight.light is None else x_ND + sight.light
         for block in self.blocks:
-            past = Seen(normed(x_ND), past_index, sight.past_relation, sight.past_present)
+            past = AttentionSources(
+                normed(x_ND), past_index, sight.past_relation, sight.past_present
+            )
             x_ND = block(x_ND, past, sight)
         return x_ND
 
-    def move_shapes(self) -> Tensor | None:
+    def motion_features(self) -> Tensor | None:
         """Evaluate the moves' features for one pass, if moves are told from them."""
         return None if self.shaped is None else self.shaped.table()
 
@@ -277,7 +279,7 @@ class MotionStack(nn.Module):
             rows: The visible agents.
             x_ND: Their updated features.
             kind: ``AgentType`` of each.
-            shapes: ``move_shapes``.
+            shapes: ``motion_features``.
         """
         return MotionOutputs(
             rows,
@@ -291,6 +293,6 @@ class MotionStack(nn.Module):
             shaped: Tensor = self.shaped(x_ND, kind, shapes)
             return shaped
         if self.move is None:
-            raise ValueError("moves are told from their shapes; pass move_shapes()")
+            raise ValueError("moves are told from their shapes; pass motion_features()")
         alone: Tensor = self.move(x_ND)
         return alone

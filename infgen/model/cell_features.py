@@ -1,4 +1,4 @@
-"""What lies where newcomers may enter: features of cells and of headings themselves.
+"""What lies where inserted agents may enter: features of cells and of headings themselves.
 
 The paper's heads choose among two thousand cells and 120 headings from one feature of the
 query, which would have to carry the whole street (SPEC 4.6). Here what is around is laid
@@ -17,20 +17,20 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from infgen.model.layers import Seen, embedding_mlp, gather
+from infgen.model.layers import AttentionSources, embedding_mlp, gather
 from infgen.model.neighbours import RoadFeatures, grid_place
 from infgen.model.relations import wrap_angle
 from infgen.tokens.grid import Grid
 from infgen.tokens.scene_tokens import NO_CELL
 
 ROAD_MIDDLE_M = 2.5
-"""From the first point of a road token to about its middle."""
+"""From the first point of a map token to about its middle."""
 BIN_REACH = 2
 """Bins to each side that what lies in a bin speaks to."""
 
 
 @dataclass(frozen=True, slots=True)
-class Lying:
+class CellSources:
     """Things around queries: roads or agents.
 
     Attributes:
@@ -46,8 +46,8 @@ class Lying:
     present: Tensor
 
     @classmethod
-    def roads(cls, roads: RoadFeatures, scene: Tensor) -> "Lying":
-        """All road tokens of the maps [N] of queries, at about their middles."""
+    def roads(cls, roads: RoadFeatures, scene: Tensor) -> "CellSources":
+        """All map tokens of the maps [N] of queries, at about their middles."""
         pose = roads.pose
         along = torch.stack([pose[..., 2].cos(), pose[..., 2].sin()], dim=-1)
         middle_m = pose[..., :2] + ROAD_MIDDLE_M * along
@@ -55,13 +55,13 @@ class Lying:
         return cls(roads.features, roads.rows.number[scene], pose[scene], roads.real[scene])
 
     @classmethod
-    def near(cls, roads: RoadFeatures, seen: Seen) -> "Lying":
-        """The road tokens that queries [N] see, at their first points."""
+    def near(cls, roads: RoadFeatures, seen: AttentionSources) -> "CellSources":
+        """The map tokens that queries [N] see, at their first points."""
         pose = roads.rows.pack(roads.pose)
         return cls(roads.features, seen.index, pose[seen.index], seen.present)
 
 
-class Ground(nn.Module):
+class CellFeatures(nn.Module):
     """Features of every cell of an ego's grid, from what lies on it and beside it."""
 
     lattice: Tensor
@@ -87,9 +87,9 @@ class Ground(nn.Module):
         self.key = nn.Linear(cell_feature_width, cell_feature_width)
         self.ask = nn.Linear(width, cell_feature_width)
 
-    def forward(self, ego_pose: Tensor, roads: Lying, agents: Lying) -> Tensor:
+    def forward(self, ego_pose: Tensor, roads: CellSources, agents: CellSources) -> Tensor:
         """Describe the cells around egos [N, 3]: features [N, cell, C]."""
-        laid = self._lay(ego_pose, roads, self.road) + self._lay(
+        laid = self._cell_sources(ego_pose, roads, self.road) + self._cell_sources(
             ego_pose, agents, self.agent
         )
         square = laid.view(len(ego_pose), self.side, self.side, laid.shape[1])
@@ -104,7 +104,9 @@ class Ground(nn.Module):
         logits: Tensor = asked @ cells_NPC.mT
         return logits
 
-    def _lay(self, ego_pose: Tensor, lying: Lying, project: nn.Linear) -> Tensor:
+    def _cell_sources(
+        self, ego_pose: Tensor, lying: CellSources, project: nn.Linear
+    ) -> Tensor:
         """Share things out between the four lattice points around each: [point, C]."""
         last = self.side - 1
         xy_m = grid_place(lying.pose, ego_pose[:, None])
@@ -118,8 +120,8 @@ class Ground(nn.Module):
 
         lower = at.floor().clamp(max=last - 1)
         share = at - lower
-        column, row = lower.long().unbind(-1)
-        first = (query * self.side + row) * self.side + column
+        token_step, row = lower.long().unbind(-1)
+        first = (query * self.side + row) * self.side + token_step
         laid = share.new_zeros((len(ego_pose) * self.side**2, features.shape[1]))
         for up in (0, 1):
             for right in (0, 1):
@@ -129,7 +131,7 @@ class Ground(nn.Module):
         return laid
 
 
-class Bearings(nn.Module):
+class HeadingFeatures(nn.Module):
     """Logits of headings, from the headings of the roads around a query."""
 
     def __init__(self, width: int, cell_feature_width: int, num_headings: int) -> None:
@@ -142,7 +144,7 @@ class Bearings(nn.Module):
         self.beside = nn.Conv1d(cell_feature_width, cell_feature_width, size, bias=False)
         self.say = nn.Conv1d(cell_feature_width, 1, size, bias=False)
 
-    def forward(self, x: Tensor, pose: Tensor, roads: Lying) -> Tensor:
+    def forward(self, x: Tensor, pose: Tensor, roads: CellSources) -> Tensor:
         """Say how much queries [N, ..., D] at poses [N, 3] are for each heading."""
         queries = x.flatten(1, -2) if x.dim() > 2 else x[:, None]  # [N, S, D]
         road = gather(self.road(roads.features), roads.row) + self.apart(

@@ -1,6 +1,6 @@
-"""Newcomers: whether one enters, in which cell, and who it is.
+"""Inserted agents: whether one enters, in which cell, and who it is.
 
-Shape letters as in ``layers``; S are the turns of newcomers within one half second.
+Shape letters as in ``layers``; S are the turns of inserted agents within one token step.
 """
 
 import math
@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from infgen.model.agents import KINDS
-from infgen.model.cell_features import Bearings, Ground, Lying
-from infgen.model.layers import Attention, Seen, embedding_mlp, mlp
-from infgen.model.logits import DetailOutputs, EntryOutputs
-from infgen.model.neighbours import Reach
+from infgen.model.cell_features import CellFeatures, CellSources, HeadingFeatures
+from infgen.model.layers import Attention, AttentionSources, embedding_mlp, mlp
+from infgen.model.logits import DetailOutputs, InsertionOutputs
+from infgen.model.neighbours import NeighbourSpec
 from infgen.model.relations import Rows, relation_embedding
 from infgen.model.settings import ModelSettings
 from infgen.tokens.grid import Grid
@@ -30,7 +30,9 @@ class QueryBlock(nn.Module):
         self.roads = Attention(width, heads, dropout, bipartite=True)
         self.agents = Attention(width, heads, dropout, bipartite=True)
 
-    def forward(self, x: Tensor, roads: Seen, agents: Seen) -> Tensor:
+    def forward(
+        self, x: Tensor, roads: AttentionSources, agents: AttentionSources
+    ) -> Tensor:
         """Update queries [N, D], or [N, S, D]."""
         updated: Tensor = self.agents(self.roads(x, roads), agents)
         return updated
@@ -39,7 +41,8 @@ class QueryBlock(nn.Module):
 class CellStack(nn.Module):
     """Ask, from the ego's pose, whether one more agent enters and where (SPEC 4.6).
 
-    Slots differ only by which newcomers they see: as neighbours, and in the occupancy,
+    Slots differ only by which inserted agents they see: as neighbours, and in the
+        occupancy,
     which is one pooled embedding of all occupied cells (not one token per cell).
     """
 
@@ -65,25 +68,29 @@ class CellStack(nn.Module):
         self.cell = mlp(width, width, grid.num_cells) if by_cell else None
         self.place = None if by_cell else mlp(width, width, 2)
         features = settings.cell_feature_width if by_cell else 0
-        self.ground = Ground(width, features, grid) if features else None
+        self.cell_features = CellFeatures(width, features, grid) if features else None
 
-    def roads_reach(self) -> Reach:
+    def roads_reach(self) -> NeighbourSpec:
         """How the query sees roads."""
         s = self.settings
-        return Reach.of(
+        return NeighbourSpec.of(
             s.position_query_radius_m, s.position_query_map_neighbours, self.roads_relation
         )
 
-    def agents_reach(self, agents: int) -> Reach:
+    def agents_reach(self, agents: int) -> NeighbourSpec:
         """How the query sees agents: all of them within its radius."""
-        return Reach.of(self.settings.position_query_radius_m, agents, self.agents_relation)
+        return NeighbourSpec.of(
+            self.settings.position_query_radius_m, agents, self.agents_relation
+        )
 
-    def forward(self, occupied: Tensor, roads: Seen, agents: Seen) -> Tensor:
+    def forward(
+        self, occupied: Tensor, roads: AttentionSources, agents: AttentionSources
+    ) -> Tensor:
         """Answer queries: features [N, S, D].
 
         Args:
             occupied: 1 where a slot sees an agent in a cell, else 0 [N, S, cell].
-            roads: Road tokens around the ego, the same for all slots.
+            roads: Map tokens around the ego, the same for all slots.
             agents: Agents around the ego; ``present`` differs by slot.
         """
         x = self.query.weight[0] + self.occupancy(occupied)
@@ -91,21 +98,27 @@ class CellStack(nn.Module):
             x = block(x, roads, agents)
         return x
 
-    def answer(self, rows: Rows, x: Tensor, ground: Tensor | None) -> EntryOutputs:
+    def answer(
+        self, rows: Rows, x: Tensor, cell_features: Tensor | None
+    ) -> InsertionOutputs:
         """Say of every row, by its updated features, whether an agent enters and where.
 
         Args:
             rows: What the features are of.
             x: The features [N, S, D].
-            ground: Features of the cells, if they are told from them [N, cell, C]. The more
-                cells somebody might come from, the likelier somebody comes: it adds what
-                they sum up to.
+            cell_features: Features of the cells, if they are told from them [N, cell, C].
+                The more cells somebody might come from, the likelier somebody comes: it
+                adds what they sum up to.
         """
         add, cell = self.add(x)[..., 0], None if self.cell is None else self.cell(x)
-        if self.ground is not None and cell is not None and ground is not None:
-            cell = cell + self.ground.choose(x, ground)
+        if (
+            self.cell_features is not None
+            and cell is not None
+            and cell_features is not None
+        ):
+            cell = cell + self.cell_features.choose(x, cell_features)
             add = add + cell.float().logsumexp(dim=-1) - math.log(self.num_cells)
-        return EntryOutputs(
+        return InsertionOutputs(
             rows,
             add,
             cell,
@@ -159,36 +172,40 @@ class DetailStack(nn.Module):
         self.turn = None if by_bin else mlp(width, width, 1)
         self.offset = mlp(width, width, 2) if settings.position_token else None
         features = settings.cell_feature_width if by_bin else 0
-        self.bearings = Bearings(width, features, grid.num_headings) if features else None
+        self.bearings = (
+            HeadingFeatures(width, features, grid.num_headings) if features else None
+        )
 
-    def roads_reach(self) -> Reach:
+    def roads_reach(self) -> NeighbourSpec:
         """How the query sees roads."""
         s = self.settings
-        return Reach.of(
+        return NeighbourSpec.of(
             s.heading_query_radius_m, s.heading_query_map_neighbours, self.roads_relation
         )
 
-    def agents_reach(self) -> Reach:
+    def agents_reach(self) -> NeighbourSpec:
         """How the query sees agents."""
         s = self.settings
-        return Reach.of(
+        return NeighbourSpec.of(
             s.heading_query_radius_m, s.heading_query_agent_neighbours, self.agents_relation
         )
 
-    def forward(self, cell: Tensor, roads: Seen, agents: Seen) -> Tensor:
+    def forward(
+        self, cell: Tensor, roads: AttentionSources, agents: AttentionSources
+    ) -> Tensor:
         """Describe the cells [N]: features [N, D]."""
         x: Tensor = self.query.weight[0] + self.cells(self.centre_m[cell])
         for block in self.blocks:
             x = block(x, roads, agents)
         return x
 
-    def asked_at(self, cell: Tensor, offset_m: Tensor) -> Tensor:
-        """Where in the ego's grid frame a known newcomer is asked for [N, 2]."""
+    def query_pose(self, cell: Tensor, offset_m: Tensor) -> Tensor:
+        """Where in the ego's grid frame a known inserted agent is asked for [N, 2]."""
         centre_m = self.centre_m[cell]
         return centre_m if self.offset is not None else centre_m + offset_m
 
     def answer(
-        self, rows: Rows, x: Tensor, kind: Tensor, pose: Tensor, roads: Lying
+        self, rows: Rows, x: Tensor, kind: Tensor, pose: Tensor, roads: CellSources
     ) -> DetailOutputs:
         """Say who enters, and how it stands once its kind is known.
 
@@ -197,7 +214,7 @@ class DetailStack(nn.Module):
             x: Updated features [N, ..., D].
             kind: ``AgentType`` of each.
             pose: Where it was asked [N, 3] ...
-            roads: ... and the road tokens seen from there.
+            roads: ... and the map tokens seen from there.
         """
         given = x + self.given_kind(kind)
         turn, offset = self.turn, self.offset

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from infgen.model.neighbour_attention import Shared, look_at_pairs
+from infgen.model.neighbour_attention import Shared, attend_to_pairs
 
 FEED_FORWARD = 4
 """The feed-forward part is so many times as wide as the features."""
@@ -110,7 +110,7 @@ class FourierEmbedding(nn.Module):
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class AttentionSources:
     """What every target sees.
 
     Attributes:
@@ -126,16 +126,20 @@ class Seen:
     present: Tensor
 
     @classmethod
-    def own(cls, features_NKD: Tensor, relation: Shared, present: Tensor) -> "Seen":
+    def own(
+        cls, features_NKD: Tensor, relation: Shared, present: Tensor
+    ) -> "AttentionSources":
         """Let every target see sources of its own [N, K, D]."""
         count = features_NKD.shape[:2].numel()
         index = torch.arange(count, device=present.device).view(features_NKD.shape[:2])
         return cls(features_NKD.flatten(0, 1), index, relation, present)
 
-    def take(self, targets: Tensor) -> "Seen":
+    def take(self, targets: Tensor) -> "AttentionSources":
         """Go on with some targets only; gradients end here."""
         relation = Shared.of(self.relation.values[targets])
-        return Seen(self.features, self.index[targets], relation, self.present[targets])
+        return AttentionSources(
+            self.features, self.index[targets], relation, self.present[targets]
+        )
 
 
 class Attention(nn.Module):
@@ -176,7 +180,7 @@ class Attention(nn.Module):
             nn.LayerNorm(width),
         )
 
-    def forward(self, target: Tensor, seen: Seen) -> Tensor:
+    def forward(self, target: Tensor, seen: AttentionSources) -> Tensor:
         """Update targets [N, D], or [N, S, D] whose slots share their neighbours."""
         slots = target if target.dim() == 3 else target[:, None]
         present = seen.present if seen.present.dim() == 3 else seen.present[:, None]
@@ -188,7 +192,7 @@ class Attention(nn.Module):
         slots = slots + self.feed_forward(slots)
         return slots.view_as(target)
 
-    def look(self, normal_NSD: Tensor, seen: Seen) -> Tensor:
+    def look(self, normal_NSD: Tensor, seen: AttentionSources) -> Tensor:
         """Sum what each slot sees: [N, S, D]; ``seen.present`` is [N, S, K]."""
         targets, slots, width = normal_NSD.shape
         heads = (targets, slots, self.heads)
@@ -198,7 +202,7 @@ class Attention(nn.Module):
         hidden = ~seen.present
         if slots > 1:
             hidden = hidden[:, :, None].expand(*heads, -1).flatten(1, 2)
-        looked = look_at_pairs(
+        looked = attend_to_pairs(
             _per_head(query, source[0]),
             _per_head(query, relation[0]),
             seen.features,

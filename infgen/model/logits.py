@@ -13,33 +13,33 @@ class MotionOutputs:
 
     Attributes:
         rows: The visible agents among [scene, token, agent].
-        move_logits: [row, move], by the vocabulary of the agent's kind.
-        leave_logit: Log-odds that the next token is the agent's last [row].
+        motion_logits: [row, move], by the vocabulary of the agent's kind.
+        remove_logit: Log-odds that the next token is the agent's last [row].
         pattern_logits: When within the next token a log would show the agent [row, 32].
     """
 
     rows: Rows
-    move_logits: Tensor
-    leave_logit: Tensor | None
+    motion_logits: Tensor
+    remove_logit: Tensor | None
     pattern_logits: Tensor | None
 
 
 @dataclass(frozen=True, slots=True)
-class EntryOutputs:
+class InsertionOutputs:
     """Whether one more agent enters, and where.
 
     Attributes:
         rows: The tokens that were asked among [scene, token].
         add_logit: Log-odds of ADD against BEGIN MOTION [row, slot].
-        cell_logits: [row, slot, cell] ...
-        place_m: ... or the place itself, in the ego's grid frame [row, slot, 2].
+        position_logits: [row, slot, cell] ...
+        position_m: ... or the place itself, in the ego's grid frame [row, slot, 2].
         radius_m: Of that grid.
     """
 
     rows: Rows
     add_logit: Tensor
-    cell_logits: Tensor | None
-    place_m: Tensor | None
+    position_logits: Tensor | None
+    position_m: Tensor | None
     radius_m: float
 
 
@@ -49,7 +49,7 @@ class DetailOutputs:
 
     Attributes:
         rows: The agents described among [scene, detail].
-        kind_logits: [row, kind].
+        agent_type_logits: [row, kind].
         size_log_m: Logarithm of length, width, height, given the kind [row, 3].
         heading_logits: Given the kind [row, heading] ...
         turned_rad: ... or the heading itself, relative to the ego's [row].
@@ -58,7 +58,7 @@ class DetailOutputs:
     """
 
     rows: Rows
-    kind_logits: Tensor
+    agent_type_logits: Tensor
     size_log_m: Tensor
     heading_logits: Tensor | None
     turned_rad: Tensor | None
@@ -67,7 +67,7 @@ class DetailOutputs:
 
 @dataclass(frozen=True, slots=True)
 class RoadOutputs:
-    """Hidden road tokens: their logits [prediction, token] and what they are."""
+    """Hidden map tokens: their logits [prediction, token] and what they are."""
 
     logits: Tensor
     token: Tensor
@@ -79,12 +79,12 @@ class Outputs:
 
     Attributes:
         motion: What agents do next.
-        entries: Whether and where newcomers enter; None without a life cycle.
+        entries: Whether and where inserted agents enter; None without a life cycle.
         details: Who they are; None without a life cycle.
-        roads: Hidden road tokens, if asked for.
+        roads: Hidden map tokens, if asked for.
     """
 
     motion: MotionOutputs
-    entries: EntryOutputs | None
+    entries: InsertionOutputs | None
     details: DetailOutputs | None
     roads: RoadOutputs | None

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from infgen.model.batching.batch import Roads
 from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.map_grid import RoadGrid
-from infgen.model.neighbours import Around, Lamps, Reach, RoadFeatures
+from infgen.model.neighbours import NeighbourRows, NeighbourSpec, RoadFeatures, SignalStates
 from infgen.model.relations import Rows, relation_embedding
 from infgen.model.settings import ModelSettings
 from infgen.model.signal_features import StopLines
@@ -19,22 +19,22 @@ from infgen.tokens.vocabulary import MapVocabulary
 
 
 @dataclass(frozen=True, slots=True)
-class RoadSight:
+class MapContext:
     """Who sees whom on the maps: the rows, and the neighbours of each."""
 
     rows: Rows
-    around: Around
+    neighbours: NeighbourRows
     grid: RoadGrid
 
-    def covered(self, roads: Roads) -> "RoadSight":
+    def covered(self, roads: Roads) -> "MapContext":
         """Let nobody see a hidden token, not even its place: it would be given away."""
         kept = ~self.rows.pack(roads.picked)
-        present = self.around.present & kept[self.around.index]
-        return replace(self, around=replace(self.around, present=present))
+        present = self.neighbours.present & kept[self.neighbours.index]
+        return replace(self, neighbours=replace(self.neighbours, present=present))
 
 
 class RoadEncoder(nn.Module):
-    """Embed road tokens and let them see their neighbours (SPEC 4.3)."""
+    """Embed map tokens and let them see their neighbours (SPEC 4.3)."""
 
     curve_m: Tensor
 
@@ -59,41 +59,41 @@ class RoadEncoder(nn.Module):
         )
         self.next_token = mlp(width, width, vocabulary.num_map_tokens)
 
-    def look(self, roads: Roads) -> RoadSight:
+    def look(self, roads: Roads) -> MapContext:
         """Find who sees whom on the maps."""
         rows, grid = Rows.where(roads.real), RoadGrid.of(roads.pose, roads.real)
-        reach = Reach.of(self.radius_m, self.neighbours, self.relation)
+        reach = NeighbourSpec.of(self.radius_m, self.neighbours, self.relation)
         pose, count = rows.pack(roads.pose), roads.real.shape[1]
         scene = rows.at // max(1, count)
         found = grid.nearest(
             pose[:, :2], scene, reach.radius_m, reach.count, itself=rows.at % max(1, count)
         )
         place, present = found.index[0], found.present[0]
-        around = Around(
+        neighbours = NeighbourRows(
             index=rows.number[scene[:, None], place],
             relation=reach.describe(pose, roads.pose[scene[:, None], place]),
             present=present,
             place=place,
         )
-        return RoadSight(rows, around, grid)
+        return MapContext(rows, neighbours, grid)
 
-    def forward(self, roads: Roads, sight: RoadSight) -> RoadFeatures:
-        """Encode every road token."""
-        around = sight.around
+    def forward(self, roads: Roads, sight: MapContext) -> RoadFeatures:
+        """Encode every map token."""
+        neighbours = sight.neighbours
         x = self._embed(roads, sight.rows)
         for block in self.blocks:
-            x = block(x, around.seen(normed(x)))
-        rows, features, lamps = sight.rows, normed(x), None
+            x = block(x, neighbours.seen(normed(x)))
+        rows, features, signal_states = sight.rows, normed(x), None
         if self.signals_each_step:
-            looks, lamps = self._lamps(roads, rows, x)
+            looks, signal_states = self._signal_states(roads, rows, x)
             features = torch.cat([features, looks])
         lines = StopLines.of(roads) if self.stop_lines else None
         return RoadFeatures(
-            rows, features, roads.pose, roads.real, sight.grid, lamps, lines
+            rows, features, roads.pose, roads.real, sight.grid, signal_states, lines
         )
 
     def predict_hidden(self, roads: Roads, covered: RoadFeatures) -> tuple[Tensor, Tensor]:
-        """Predict hidden road tokens from their predecessors, which did not see them.
+        """Predict hidden map tokens from their predecessors, which did not see them.
 
         A token is predicted if it is hidden and its predecessor is not.
 
@@ -110,7 +110,7 @@ class RoadEncoder(nn.Module):
         return self.next_token(covered.features[before]), roads.token[wanted]
 
     def _embed(self, roads: Roads, rows: Rows) -> Tensor:
-        """What each road token is, by itself [row, D]."""
+        """What each map token is, by itself [row, D]."""
         shapes = self.curve(self.curve_m.flatten(1))  # [token, D]
         embedded: Tensor = gather(shapes, rows.pack(roads.token))
         embedded = embedded + self.point_kind(rows.pack(roads.point_type))
@@ -119,11 +119,13 @@ class RoadEncoder(nn.Module):
             return embedded
         return embedded + self.signal(rows.pack(roads.signal))
 
-    def _lamps(self, roads: Roads, rows: Rows, x: Tensor) -> tuple[Tensor, Lamps]:
-        """Say what road tokens with a light look like under each class of it."""
+    def _signal_states(
+        self, roads: Roads, rows: Rows, x: Tensor
+    ) -> tuple[Tensor, SignalStates]:
+        """Say what map tokens with a light look like under each class of it."""
         lit = rows.pack(roads.light).nonzero()[:, 0]
         looks = normed(x[lit, None] + self.signal.weight)  # [lit, class, D]
         first = torch.zeros_like(rows.at)
         behind = torch.arange(len(lit), device=x.device) * looks.shape[1]
         first[lit] = len(x) + behind
-        return looks.flatten(0, 1), Lamps(first, roads.light, roads.shown)
+        return looks.flatten(0, 1), SignalStates(first, roads.light, roads.shown)

@@ -1,4 +1,4 @@
-"""The road tokens near a place, without looking at all of a map.
+"""The map tokens near a place, without looking at all of a map.
 
 A map may be a town of ten thousand tokens, of which a few hundred are near anybody. They
 are sorted into squares once per map. Who looks for the nearest looks at the squares around
@@ -18,12 +18,12 @@ from infgen.model.relations import BLOCK_PAIRS, Neighbours, nearest_listed
 SIDE_M = 10.0
 """Of a square."""
 MARGIN_M = 0.1
-"""Looked farther than asked, so that rounding loses nothing at the rim."""
+"""AttentionResult farther than asked, so that rounding loses nothing at the rim."""
 
 
 @dataclass(frozen=True, slots=True)
 class RoadGrid:
-    """Road tokens of some maps, sorted into squares.
+    """Map tokens of some maps, sorted into squares.
 
     Attributes:
         corner_m: Corner of each map's first square.
@@ -49,10 +49,10 @@ class RoadGrid:
         shown_m = torch.where(real[..., None], xy_m, torch.inf)
         corner_m = shown_m.amin(dim=1) if real.shape[1] else xy_m.new_zeros(len(xy_m), 2)
         corner_m = torch.where(corner_m.isfinite(), corner_m, 0.0)
-        column, row = _squares(xy_m - corner_m[:, None]).unbind(-1)
-        columns = 1 + int(column[real].max()) if real.any() else 1
+        token_step, row = _squares(xy_m - corner_m[:, None]).unbind(-1)
+        columns = 1 + int(token_step[real].max()) if real.any() else 1
         rows = 1 + int(row[real].max()) if real.any() else 1
-        square = torch.where(real, row * columns + column, rows * columns)
+        square = torch.where(real, row * columns + token_step, rows * columns)
         ordered, order = square.sort(dim=1, stable=True)
         squares = torch.arange(rows * columns + 1, device=pose.device)
         start = torch.searchsorted(ordered, squares.expand(len(pose), -1).contiguous())

@@ -26,7 +26,7 @@ UNIT_M = 10.0
 """Metres are told in tens, to be of the size of the waves."""
 
 
-class MoveHead(nn.Module):
+class MotionHead(nn.Module):
     """Logits of every kind's moves, from their shapes.
 
     Shape letters as in ``layers``; C is the width of the moves' features.

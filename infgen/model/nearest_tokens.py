@@ -18,7 +18,7 @@ _ROWS_AT_ONCE = 1024
 
 
 @dataclass(frozen=True, slots=True)
-class MoveEnds:
+class MotionTokenEnds:
     """Where the moves of a vocabulary end. Fields as in ``tokens.moves.MatchTable``.
 
     Attributes:
@@ -36,7 +36,7 @@ class MoveEnds:
     corners_m: Float64[Tensor, "3 move 8"]
 
     @classmethod
-    def of(cls, vocabulary: MotionVocabulary, device: torch.device) -> "MoveEnds":
+    def of(cls, vocabulary: MotionVocabulary, device: torch.device) -> "MotionTokenEnds":
         """Lay a vocabulary out on a device."""
         table = make_match_table(vocabulary)
         pose = torch.from_numpy(vocabulary.end_pose.copy()).to(device)
@@ -53,7 +53,7 @@ class MoveEnds:
 
 
 def nearest(
-    wanted: Float32[Tensor, "row 3"], kind: Int64[Tensor, " row"], ends: MoveEnds
+    wanted: Float32[Tensor, "row 3"], kind: Int64[Tensor, " row"], ends: MotionTokenEnds
 ) -> Int64[Tensor, " row"]:
     """Find the move of all that ends nearest to each pose wanted (in its start's frame).
 
@@ -70,7 +70,7 @@ def nearest_of(
     wanted: Float32[Tensor, "row 3"],
     kind: Int64[Tensor, " row"],
     choice: Int64[Tensor, "row choice"],
-    ends: MoveEnds,
+    ends: MotionTokenEnds,
 ) -> Int64[Tensor, " row"]:
     """Find the move of some that ends nearest to each pose wanted.
 
@@ -110,7 +110,7 @@ def wrap_angle(angle_rad: Tensor) -> Tensor:
     return torch.where(wrapped >= torch.pi, -torch.pi, wrapped)
 
 
-def _nearest(wanted: Tensor, number: int, ends: MoveEnds) -> Tensor:
+def _nearest(wanted: Tensor, number: int, ends: MotionTokenEnds) -> Tensor:
     """Return the nearest move of one kind to each pose wanted (float64)."""
     aim_m = _corners(wanted, ends.size_lw_m[number])
     row, move = _candidates(wanted, aim_m, number, ends)
@@ -123,7 +123,7 @@ def _nearest(wanted: Tensor, number: int, ends: MoveEnds) -> Tensor:
 
 
 def _candidates(
-    wanted: Tensor, aim_m: Tensor, number: int, ends: MoveEnds
+    wanted: Tensor, aim_m: Tensor, number: int, ends: MotionTokenEnds
 ) -> tuple[Tensor, Tensor]:
     """Return rows and moves among which each row's nearest move surely is."""
     spread = _spread(wanted, ends.reach_m[number])

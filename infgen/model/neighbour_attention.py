@@ -78,7 +78,7 @@ class _Ticket(torch.autograd.Function):
         return summed, None
 
 
-class Looked(NamedTuple):
+class AttentionResult(NamedTuple):
     """What queries saw.
 
     Attributes:
@@ -92,7 +92,7 @@ class Looked(NamedTuple):
     weight: Tensor
 
 
-def look_at_pairs(
+def attend_to_pairs(
     by_features: Tensor,
     by_relation: Tensor,
     features: Tensor,
@@ -100,7 +100,7 @@ def look_at_pairs(
     relation: Shared,
     hidden: Tensor,
     kept: Tensor | None,
-) -> Looked:
+) -> AttentionResult:
     """Weigh neighbours by the softmax of their scores, and sum them.
 
     Args:
@@ -119,7 +119,7 @@ def look_at_pairs(
     queries = by_features.contiguous(), by_relation.contiguous()
     pairs = (*queries, features.to(kind), index, *shared, hidden, kept)
     with torch.autocast(by_features.device.type, enabled=False):
-        return Looked(*_Pairs.apply(*pairs))  # type: ignore[no-untyped-call]
+        return AttentionResult(*_Pairs.apply(*pairs))  # type: ignore[no-untyped-call]
 
 
 @dataclass(frozen=True, slots=True)

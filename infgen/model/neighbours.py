@@ -1,4 +1,4 @@
-"""What agents and queries see of roads and of each other, as ``layers.Seen``.
+"""What agents and queries see of roads and of each other, as ``layers.AttentionSources``.
 
 Shared by training (all tokens at once) and simulation (one token of many rollouts), so that
 both see the same. Dims: group (a scene, a rollout, or one token of it), target, source.
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from infgen.model.layers import Seen
+from infgen.model.layers import AttentionSources
 from infgen.model.map_grid import RoadGrid
 from infgen.model.neighbour_attention import Shared
 from infgen.model.relation_tables import RelationEmbedding
@@ -20,7 +20,7 @@ from infgen.model.signal_features import StopLines
 
 
 @dataclass(frozen=True, slots=True)
-class Reach:
+class NeighbourSpec:
     """How far targets see, how many, and how what they see is embedded.
 
     Attributes:
@@ -48,7 +48,7 @@ class Reach:
         *,
         ahead_m: float = 0.0,
         across: bool = False,
-    ) -> "Reach":
+    ) -> "NeighbourSpec":
         """Evaluate the relation's table for one pass."""
         return cls(radius_m, count, relation, relation.table(), ahead_m, across)
 
@@ -73,7 +73,7 @@ class Reach:
 
 
 @dataclass(frozen=True, slots=True)
-class Around:
+class NeighbourRows:
     """Neighbours of each row, not yet with features.
 
     Attributes:
@@ -88,9 +88,9 @@ class Around:
     present: Tensor
     place: Tensor
 
-    def seen(self, features: Tensor) -> Seen:
+    def seen(self, features: Tensor) -> AttentionSources:
         """Join with the features of all rows [row, D]."""
-        return Seen(features, self.index, self.relation, self.present)
+        return AttentionSources(features, self.index, self.relation, self.present)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,9 +101,10 @@ class RoadFeatures:
         rows: Which places of the padded maps they are.
         features: Normed features [row, D].
         pose: Poses of the padded maps [scene, road, 3].
-        real: Which places of the padded maps hold a road token [scene, road].
+        real: Which places of the padded maps hold a map token [scene, road].
         grid: The same tokens by where they are.
-        lamps: What those with a traffic light look like, if that is seen as it changes.
+        signal_states: What those with a traffic light look like, if that is seen as it
+            changes.
         lines: Where lights stop traffic, if agents are told of those ahead.
     """
 
@@ -112,25 +113,25 @@ class RoadFeatures:
     pose: Tensor
     real: Tensor
     grid: RoadGrid
-    lamps: "Lamps | None"
+    signal_states: "SignalStates | None"
     lines: StopLines | None
 
     def at(self, scene: Tensor, place: Tensor, token: Tensor | None) -> Tensor:
-        """Rows [N, K] of the features of places [N, K] of maps [N], at half seconds [N]."""
+        """Rows [N, K] of the features of places [N, K] of maps [N], at token steps [N]."""
         row = self.rows.number[scene[:, None], place]
-        if self.lamps is None or token is None:
+        if self.signal_states is None or token is None:
             return row
-        return self.lamps.lit(row, scene, place, token)
+        return self.signal_states.lit(row, scene, place, token)
 
 
 @dataclass(frozen=True, slots=True)
-class Lamps:
-    """Road tokens as they look under each class of light: rows behind those of the maps.
+class SignalStates:
+    """Map tokens as they look under each class of light: rows behind those of the maps.
 
     Attributes:
-        first: Row of the first class of each road token's looks [row].
+        first: Row of the first class of each map token's looks [row].
         light: Its light, counted from 1; 0 for none [scene, road].
-        shown: ``SignalClass`` of those by the half second, ``REMEMBERED`` or not; the last
+        shown: ``SignalClass`` of those by the token step, ``REMEMBERED`` or not; the last
             one lasts [scene, light, token].
     """
 
@@ -139,7 +140,7 @@ class Lamps:
     shown: Tensor
 
     def lit(self, row: Tensor, scene: Tensor, place: Tensor, token: Tensor) -> Tensor:
-        """Rows of road tokens under their lights at half seconds [N]; others as given."""
+        """Rows of map tokens under their lights at token steps [N]; others as given."""
         if not self.shown.numel():
             return row
         scene = scene[:, None]
@@ -148,14 +149,14 @@ class Lamps:
         return torch.where(light > 0, self.first[row] + shown, row)
 
 
-def look_around(
-    reach: Reach,
+def find_neighbours(
+    reach: NeighbourSpec,
     targets: Rows,
     target_pose: Float32[Tensor, "group target 3"],
     source_pose: Float32[Tensor, "group source 3"],
     source_row: Int64[Tensor, "group source"],
     allowed: Bool[Tensor, " group #target source"],
-) -> Around:
+) -> NeighbourRows:
     """Find what every target row sees of its group's sources.
 
     Args:
@@ -175,7 +176,7 @@ def look_around(
     )
     place, present = targets.pack(found.index), targets.pack(found.present)
     group = (targets.at // found.index.shape[1])[:, None]
-    return Around(
+    return NeighbourRows(
         index=source_row[group, place],
         relation=reach.describe(targets.pack(target_pose), source_pose[group, place]),
         present=present,
@@ -183,15 +184,15 @@ def look_around(
     )
 
 
-def see_roads(
-    reach: Reach,
+def find_map_neighbours(
+    reach: NeighbourSpec,
     targets: Rows,
     target_pose: Float32[Tensor, "group target 3"],
     roads: RoadFeatures,
     scene: Int64[Tensor, " group"],
     token: Int64[Tensor, " row"] | None = None,
-) -> Seen:
-    """Show every target row the road tokens around it.
+) -> AttentionSources:
+    """Show every target row the map tokens around it.
 
     Args:
         reach: How far and how many.
@@ -204,7 +205,7 @@ def see_roads(
     pose, on = targets.pack(target_pose), scene[targets.at // target_pose.shape[1]]
     found = roads.grid.nearest(reach.centre_m(pose), on, reach.radius_m, reach.count)
     place, present = found.index[0], found.present[0]
-    return Seen(
+    return AttentionSources(
         roads.features,
         roads.at(on, place, token),
         reach.describe(pose, roads.pose[on[:, None], place]),

@@ -7,21 +7,26 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from infgen.clock import CLOCK
-from infgen.model.agents import AgentEmbedding, AgentRows, MotionStack, Sight
+from infgen.model.agents import AgentContext, AgentEmbedding, AgentRows, MotionStack
 from infgen.model.batching.batch import Agents, Batch
-from infgen.model.cell_features import Lying
+from infgen.model.cell_features import CellSources
 from infgen.model.insertion import CellStack, DetailStack
 from infgen.model.layers import initialise, normed
 from infgen.model.logits import (
     DetailOutputs,
-    EntryOutputs,
+    InsertionOutputs,
     MotionOutputs,
     Outputs,
     RoadOutputs,
 )
 from infgen.model.map import RoadEncoder
 from infgen.model.neighbour_attention import Shared
-from infgen.model.neighbours import RoadFeatures, cell_pose, look_around, see_roads
+from infgen.model.neighbours import (
+    RoadFeatures,
+    cell_pose,
+    find_map_neighbours,
+    find_neighbours,
+)
 from infgen.model.relations import Rows, relations
 from infgen.model.settings import ModelSettings
 from infgen.tokens.grid import Grid, make_grid
@@ -33,7 +38,7 @@ EGO = 0
 
 
 class Network(nn.Module):
-    """Roads, agents and newcomers in one network (SPEC 4).
+    """Roads, agents and inserted agents in one network (SPEC 4).
 
     It carries its vocabularies, so weights on disk need nothing beside them.
     """
@@ -77,7 +82,7 @@ class Network(nn.Module):
         return MotionVocabulary(*(self.get_buffer(n).numpy(force=True) for n in names))
 
     def map_vocabulary(self) -> MapVocabulary:
-        """Return the shapes of road tokens."""
+        """Return the shapes of map tokens."""
         names = ("road_curve_m", "road_real")
         return MapVocabulary(*(self.get_buffer(n).numpy(force=True) for n in names))
 
@@ -86,7 +91,7 @@ class Network(nn.Module):
 
         Args:
             batch: The scenes.
-            hidden_roads: Also predict hidden road tokens. While training, everyone sees the
+            hidden_roads: Also predict hidden map tokens. While training, everyone sees the
                 features of the pass that hides them, as a kind of dropout; otherwise they
                 are predicted in a pass of their own.
         """
@@ -120,11 +125,13 @@ class Network(nn.Module):
         others = ~torch.eye(visible.shape[1], dtype=torch.bool, device=visible.device)
         past_index, past_present, past_relation = self._past(agents, rows)
         reach, token = self.motion.roads_reach(), _tokens(agents, rows)
-        sight = Sight(
+        sight = AgentContext(
             past_relation,
             past_present,
-            see_roads(reach, by_scene, agents.pose.flatten(1, 2), roads, scene, token),
-            look_around(
+            find_map_neighbours(
+                reach, by_scene, agents.pose.flatten(1, 2), roads, scene, token
+            ),
+            find_neighbours(
                 self.motion.agents_reach(),
                 by_token,
                 pose,
@@ -138,7 +145,7 @@ class Network(nn.Module):
         )
         x = self.motion(x, past_index, sight)
         kind = rows.pack(agents.kind[:, None].expand(agents.visible.shape))
-        return self.motion.foretell(rows, x, kind, self.motion.move_shapes())
+        return self.motion.foretell(rows, x, kind, self.motion.motion_features())
 
     def _past(self, agents: Agents, rows: Rows) -> tuple[Tensor, Tensor, Shared]:
         """Rows, presence and relations of every row's own past, oldest first [N, K]."""
@@ -159,13 +166,13 @@ class Network(nn.Module):
 
 def _entries(
     stack: CellStack, batch: Batch, rows: Rows, raw: Tensor, roads: RoadFeatures
-) -> EntryOutputs:
-    """Ask for the newcomers of every token, each slot seeing those before it."""
+) -> InsertionOutputs:
+    """Ask for the inserted agents of every token, each slot seeing those before it."""
     agents, entries = batch.agents, batch.entries
     asked = Rows.where(entries.asked)
     alone = Rows(asked.at, asked.number.flatten()[:, None])
     ego_pose = agents.pose[:, :, EGO]
-    around = look_around(
+    around = find_neighbours(
         stack.agents_reach(agents.kind.shape[1]),
         alone,
         ego_pose.flatten(0, 1)[:, None],
@@ -180,16 +187,20 @@ def _entries(
     seen = replace(seen, present=seen.present[:, None] & (turn < slot))
     occupied = stack.occupied(cell.expand_as(seen.present), seen.present)
     reach, scene = stack.roads_reach(), _count(agents.kind)
-    roads_seen = see_roads(reach, asked, ego_pose, roads, scene)
-    ground = None
-    if stack.ground is not None:
-        there = agents.visible & (agents.turn < 0)  # Newcomers differ by slot: left out.
-        lying = Lying(
+    roads_seen = find_map_neighbours(reach, asked, ego_pose, roads, scene)
+    cell_features = None
+    if stack.cell_features is not None:
+        there = agents.visible & (
+            agents.turn < 0
+        )  # Inserted agents differ by slot: left out.
+        lying = CellSources(
             raw, *(asked.pack(each) for each in (rows.number, agents.pose, there))
         )
         map_of = asked.at // agents.pose.shape[1]
-        ground = stack.ground(asked.pack(ego_pose), Lying.roads(roads, map_of), lying)
-    return stack.answer(asked, stack(occupied, roads_seen, seen), ground)
+        cell_features = stack.cell_features(
+            asked.pack(ego_pose), CellSources.roads(roads, map_of), lying
+        )
+    return stack.answer(asked, stack(occupied, roads_seen, seen), cell_features)
 
 
 def _details(
@@ -201,14 +212,14 @@ def _details(
     scene = wanted.at // details.present.shape[1]
     token, cell = wanted.pack(details.token), wanted.pack(details.cell)
     ego_pose = agents.pose[scene, token, EGO]
-    pose = cell_pose(ego_pose, stack.asked_at(cell, wanted.pack(details.offset_m)))
+    pose = cell_pose(ego_pose, stack.query_pose(cell, wanted.pack(details.offset_m)))
     each = Rows(_count(pose), _count(pose)[:, None])
 
     place = torch.arange(agents.kind.shape[1], device=raw.device)
     turn = wanted.pack(details.turn)[:, None]
     allowed = agents.visible[scene, token] & (agents.turn[scene, token] < turn)
     allowed &= place != wanted.pack(details.agent)[:, None]
-    around = look_around(
+    around = find_neighbours(
         stack.agents_reach(),
         each,
         pose[:, None],
@@ -217,10 +228,10 @@ def _details(
         allowed[:, None],
     )
     reach = stack.roads_reach()
-    roads_seen = see_roads(reach, each, pose[:, None], roads, scene)
+    roads_seen = find_map_neighbours(reach, each, pose[:, None], roads, scene)
     x = stack(cell, roads_seen, around.seen(raw))
     kind = wanted.pack(details.kind)
-    return stack.answer(wanted, x, kind, pose, Lying.near(roads, roads_seen))
+    return stack.answer(wanted, x, kind, pose, CellSources.near(roads, roads_seen))
 
 
 def _tokens(agents: Agents, rows: Rows) -> Tensor:
@@ -234,7 +245,7 @@ def _count(like: Tensor) -> Tensor:
 
 
 def _agent_rows(agents: Agents, rows: Rows) -> AgentRows:
-    """All visible agents, with where they were half a second earlier."""
+    """All visible agents, with where they were one token step earlier."""
     visible = agents.visible
     seen_before = torch.zeros_like(visible)
     seen_before[:, 1:] = visible[:, :-1]

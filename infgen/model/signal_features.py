@@ -1,6 +1,6 @@
 """The light ahead: what it shows an agent on its own lane, and since when.
 
-Among all the road tokens that an agent sees, those of its own lane's light are few, and
+Among all the map tokens that an agent sees, those of its own lane's light are few, and
 when it last changed stands nowhere. So each agent is told both of the stop lines ahead.
 """
 
@@ -25,7 +25,7 @@ ASIDE_M = 2.0
 TURNED_RAD = math.radians(30)
 """Lanes that differ more in direction are not the agent's own."""
 LONG_SINCE = 4
-"""Half seconds after which it makes no difference how long a light has shown the same."""
+"""Token steps after which it makes no difference how long a light has shown the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +35,9 @@ class StopLines:
     Attributes:
         pose: Poses; padding is anywhere [scene, line, 3].
         light: Light of each, counted from 1; 0 for padding [scene, line].
-        shown: ``SignalClass`` by the half second, ``REMEMBERED`` or not; the last one
+        shown: ``SignalClass`` by the token step, ``REMEMBERED`` or not; the last one
             lasts [scene, light, token].
-        since: Half seconds it has shown it, up to ``LONG_SINCE`` [scene, light, token].
+        since: Token steps it has shown it, up to ``LONG_SINCE`` [scene, light, token].
     """
 
     pose: Float32[Tensor, "scene line 3"]
@@ -47,7 +47,7 @@ class StopLines:
 
     @classmethod
     def of(cls, roads: Roads) -> "StopLines":
-        """Find the lines of maps: the first road tokens of lanes with a light."""
+        """Find the lines of maps: the first map tokens of lanes with a light."""
         starts = roads.real & (roads.light > 0) & ~roads.follows
         lines = int(starts.sum(dim=1).max()) if starts.numel() else 0
         first = starts.to(torch.int8).argsort(dim=1, descending=True, stable=True)
@@ -77,7 +77,7 @@ class StopLines:
         Returns:
             Of each class whether some line shows it, how near the nearest is (1 at the
             agent, 0 at ``reach_m``), and whether the latest has done so for more than 0,
-            1, ... half seconds.
+            1, ... token steps.
         """
         if not self.shown.numel() or not self.light.shape[1]:
             return pose.new_zeros(len(pose), features())
@@ -115,7 +115,7 @@ def features() -> int:
     return CLASSES * (2 + LONG_SINCE)
 
 
-class LightAhead(nn.Module):
+class SignalAhead(nn.Module):
     """Embed what the lights ahead show."""
 
     def __init__(self, width: int, reach_m: float) -> None:
@@ -132,7 +132,7 @@ class LightAhead(nn.Module):
 
 
 def _since(shown: Int64[Tensor, "scene light token"]) -> Int64[Tensor, "scene light token"]:
-    """Half seconds that lights have shown the same, looked at or not.
+    """Token steps that lights have shown the same, looked at or not.
 
     Before the first one they did so for long, as nobody can tell.
     """

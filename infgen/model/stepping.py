@@ -1,7 +1,7 @@
-"""The network played one half second at a time, for many rollouts at once.
+"""The network played one token step at a time, for many rollouts at once.
 
-The same logits as ``Network.forward``, without ever computing a past column again. One half
-second ``c`` of a closed loop::
+The same logits as ``Network.forward``, without ever computing a past column again. One
+token step ``c`` of a closed loop::
 
     stepper = Stepper(network)                       # eval, tables built once
     memory = stepper.begin(roads, scene, rows=128)   # map encoded once per scene
@@ -11,13 +11,13 @@ second ``c`` of a closed loop::
     while some rollout goes on:
         query = stepper.entry_query(entries)         # add?  which cell?
         details = stepper.entry_details(entries, cell)   # kind; the rest given the kind
-        column = (column with newcomers as rows: INSERTED, FIRST_MOTION_TOKEN,
-        observed=False) entries = stepper.entry_add(entries, column)
+        column = ...  # with inserted agents as rows: ENTERING, not observed
+        entries = stepper.entry_add(entries, column)
     motion = stepper.motion_step(memory, column)     # next move, leaving next?
 
 Dims: ``rollout`` is any mix of scenes and rollouts of them, ``row`` the places for agents.
 Row 0 is always the ego. A row that is ABSENT costs nothing. A row that is INSERTED starts
-with an empty past, so a freed row can be given to a newcomer as it is.
+with an empty past, so a freed row can be given to an inserted agent as it is.
 """
 
 from dataclasses import dataclass, replace
@@ -26,115 +26,38 @@ import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
-from infgen.model.agents import AgentRows, Sight
+from infgen.model.agents import AgentContext, AgentRows
 from infgen.model.batching.batch import Roads
-from infgen.model.cell_features import Lying
+from infgen.model.cell_features import CellSources
 from infgen.model.insertion import CellStack, DetailStack
-from infgen.model.layers import Seen, normed
+from infgen.model.layers import AttentionSources, normed
 from infgen.model.neighbour_attention import Shared
-from infgen.model.neighbours import Reach, RoadFeatures, cell_pose, look_around, see_roads
+from infgen.model.neighbours import (
+    NeighbourSpec,
+    cell_pose,
+    find_map_neighbours,
+    find_neighbours,
+)
 from infgen.model.network import EGO, Network
 from infgen.model.relations import Rows, relations, within_radius
-from infgen.model.token_step import Column, EntryDetails, EntryQuery, MotionStep
+from infgen.model.step_memory import Insertions, StepMemory
+from infgen.model.token_step import InsertionDetails, MotionStep, PositionOutputs, TokenStep
 from infgen.tokens.scene_tokens import Presence
 
 
-@dataclass(slots=True)
-class Memory:
-    """What the past leaves behind. ``motion_step`` writes into it.
-
-    The ring holds the last ``window`` columns; column c is at place c modulo window.
-
-    Attributes:
-        roads: Encoded maps, one per scene.
-        scene: Map of each rollout [rollout].
-        columns: Columns given so far.
-        pose: Poses of past columns [rollout, row, place, 3].
-        visible: Who could be seen in them, as the same agent [rollout, row, place].
-        features: Normed features of them before each block [block, rollout, row, place, D].
-    """
-
-    roads: RoadFeatures
-    scene: Tensor
-    columns: int
-    pose: Tensor
-    visible: Tensor
-    features: Tensor
-
-    @property
-    def window(self) -> int:
-        """Past columns that are kept."""
-        return self.visible.shape[2]
-
-    def last(self) -> tuple[Tensor, Tensor]:
-        """Pose and visibility of every row in the last column."""
-        place = (self.columns - 1) % self.window
-        return self.pose[:, :, place], self.visible[:, :, place]
-
-
 @dataclass(frozen=True, slots=True)
-class Entries:
-    """One half second as the entry stage sees it.
-
-    Attributes:
-        token: The half second.
-        rollout: Rollouts that still ask for newcomers, by their place in the batch.
-        map: Encoded maps.
-        scene: Map of each of those rollouts.
-        before: Poses [rollout, row, 3] half a second earlier ...
-        known: ... and who was seen then [rollout, row].
-        column: The agents so far.
-        raw: Normed embeddings of all rows, zero where nobody is [rollout, row, D].
-        relation: How all rows stand to the ego [rollout, row, D].
-        within: Which of them the ego's query sees [rollout, row].
-        roads: Road tokens around the ego.
-        ground: Features of the cells around it, if they are told from them
-            [rollout, cell, C].
-    """
-
-    token: int
-    rollout: Tensor
-    map: RoadFeatures
-    scene: Tensor
-    before: Tensor
-    known: Tensor
-    column: Column
-    raw: Tensor
-    relation: Tensor
-    within: Tensor
-    roads: Seen
-    ground: Tensor | None
-
-    def take(self, places: Int64[Tensor, " kept"]) -> "Entries":
-        """Go on with some of the rollouts only: nothing more is computed for the others."""
-        return replace(
-            self,
-            rollout=self.rollout[places],
-            scene=self.scene[places],
-            before=self.before[places],
-            known=self.known[places],
-            column=self.column.take(places),
-            raw=self.raw[places],
-            relation=self.relation[places],
-            within=self.within[places],
-            roads=self.roads.take(places),
-            ground=None if self.ground is None else self.ground[places],
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class _Asking:
-    """What asks for newcomers, and how it sees."""
+class _InsertionBlocks:
+    """What asks for inserted agents, and how it sees."""
 
     cells: CellStack
     details: DetailStack
-    cell_roads: Reach
-    cell_agents: Reach
-    detail_roads: Reach
-    detail_agents: Reach
+    cell_roads: NeighbourSpec
+    cell_agents: NeighbourSpec
+    detail_roads: NeighbourSpec
+    detail_agents: NeighbourSpec
 
     @classmethod
-    def of(cls, cells: CellStack, details: DetailStack) -> "_Asking":
+    def of(cls, cells: CellStack, details: DetailStack) -> "_InsertionBlocks":
         return cls(
             cells,
             details,
@@ -156,12 +79,12 @@ class Stepper:
         self.network = network.eval()
         self._tables = network.embed.tables()
         self._past_table = network.motion.past_relation.table()
-        self._shapes = network.motion.move_shapes()
+        self._shapes = network.motion.motion_features()
         self._roads_reach = network.motion.roads_reach()
         self._agents_reach = network.motion.agents_reach()
-        self._asking: _Asking | None = None
+        self._asking: _InsertionBlocks | None = None
         if network.cells is not None and network.details is not None:
-            self._asking = _Asking.of(network.cells, network.details)
+            self._asking = _InsertionBlocks.of(network.cells, network.details)
 
     @property
     def insertion_and_removal(self) -> bool:
@@ -174,7 +97,9 @@ class Stepper:
         return self.network.motion.leave is not None
 
     @torch.no_grad()
-    def begin(self, roads: Roads, scene: Int64[Tensor, " rollout"], rows: int) -> Memory:
+    def begin(
+        self, roads: Roads, scene: Int64[Tensor, " rollout"], rows: int
+    ) -> StepMemory:
         """Encode maps and start with an empty past.
 
         Args:
@@ -186,7 +111,7 @@ class Stepper:
         shape = (len(scene), rows, settings.temporal_window_tokens)
         pose = torch.zeros((*shape, 3), device=scene.device)
         features = pose.new_zeros((settings.motion_blocks, *shape, settings.width))
-        return Memory(
+        return StepMemory(
             roads=self.network.roads(roads, self.network.roads.look(roads)),
             scene=scene,
             columns=0,
@@ -196,157 +121,165 @@ class Stepper:
         )
 
     @torch.no_grad()
-    def motion_step(self, memory: Memory, column: Column) -> MotionStep:
+    def motion_step(self, memory: StepMemory, token_step: TokenStep) -> MotionStep:
         """Append a column to the past and say what follows it. Once per column."""
         motion = self.network.motion
-        visible = column.visible
+        visible = token_step.visible
         rows = Rows.where(visible)
-        memory.visible &= (column.presence != Presence.INSERTED)[..., None]
-        x = self._embed(*memory.last(), column, rows)
-        sight = self._sight(memory, column, rows)
+        memory.visible &= (token_step.presence != Presence.INSERTED)[..., None]
+        x = self._embed(*memory.last(), token_step, rows)
+        sight = self._context(memory, token_step, rows)
         x = x if sight.light is None else x + sight.light
         place = memory.columns % memory.window
         for block, past in zip(motion.blocks, memory.features, strict=True):
             before = normed(x)
-            own = Seen.own(rows.pack(past), sight.past_relation, sight.past_present)
+            own = AttentionSources.own(
+                rows.pack(past), sight.past_relation, sight.past_present
+            )
             x = block(x, own, sight)
             past[:, :, place] = rows.spread(before)
-        memory.pose[:, :, place] = column.pose
+        memory.pose[:, :, place] = token_step.pose
         memory.visible[:, :, place] = visible
         memory.columns += 1
-        return MotionStep(motion.foretell(rows, x, rows.pack(column.kind), self._shapes))
+        return MotionStep(
+            motion.foretell(rows, x, rows.pack(token_step.kind), self._shapes)
+        )
 
     @torch.no_grad()
-    def entry_begin(self, memory: Memory, column: Column) -> Entries:
-        """Look at the map and the agents around the ego, before any newcomer.
+    def entry_begin(self, memory: StepMemory, token_step: TokenStep) -> Insertions:
+        """Look at the map and the agents around the ego, before any inserted agent.
 
-        ``column`` must not have been given to ``motion_step`` yet.
+        ``token_step`` must not have been given to ``motion_step`` yet.
         """
-        rollouts, rows = column.presence.shape
+        rollouts, rows = token_step.presence.shape
         raw = memory.features.new_zeros((rollouts, rows, memory.features.shape[-1]))
-        ego_pose = column.pose[:, EGO, None]
+        ego_pose = token_step.pose[:, EGO, None]
         each = torch.arange(rollouts, device=raw.device)
-        roads = see_roads(
+        roads = find_map_neighbours(
             self._asked().cell_roads,
             Rows(each, each[:, None]),
             ego_pose,
             memory.roads,
             memory.scene,
         )
-        within = torch.zeros_like(column.observed)
+        within = torch.zeros_like(token_step.observed)
         nobody = replace(
-            column, presence=torch.zeros_like(column.presence), observed=within
+            token_step, presence=torch.zeros_like(token_step.presence), observed=within
         )
         before, known = memory.last()
-        empty = Entries(
+        empty = Insertions(
             token=memory.columns,
             rollout=each,
             map=memory.roads,
             scene=memory.scene,
             before=before,
             known=known,
-            column=nobody,
+            token_step=nobody,
             raw=raw,
             relation=torch.zeros_like(raw),
             within=within,
             roads=roads,
-            ground=None,
+            cell_features=None,
         )
-        entries = self.entry_add(empty, column)
-        return replace(entries, ground=self._ground(entries))
+        entries = self.entry_add(empty, token_step)
+        return replace(entries, cell_features=self._cell_features(entries))
 
     @torch.no_grad()
-    def entry_add(self, entries: Entries, column: Column) -> Entries:
-        """Go on with newcomers as further visible rows of the same column."""
-        fresh = Rows.where(column.visible & ~entries.column.visible)
+    def entry_add(self, entries: Insertions, token_step: TokenStep) -> Insertions:
+        """Go on with inserted agents as further visible rows of the same column."""
+        fresh = Rows.where(token_step.visible & ~entries.token_step.visible)
         came = fresh.spread(torch.ones(len(fresh.at), device=fresh.at.device)) > 0
-        embedded = self._embed(entries.before, entries.known, column, fresh)
+        embedded = self._embed(entries.before, entries.known, token_step, fresh)
         raw = fresh.spread(normed(embedded))
-        ego_pose = column.pose[:, EGO, None].expand_as(column.pose)
-        described = relations(fresh.pack(ego_pose), fresh.pack(column.pose)[:, None])
+        ego_pose = token_step.pose[:, EGO, None].expand_as(token_step.pose)
+        described = relations(fresh.pack(ego_pose), fresh.pack(token_step.pose)[:, None])
         reach = self._asked().cell_agents
         related = reach.relation.look_up(described, reach.table)[:, 0]
-        within = came & within_radius(ego_pose, column.pose, reach.radius_m)
+        within = came & within_radius(ego_pose, token_step.pose, reach.radius_m)
         return replace(
             entries,
-            column=column,
+            token_step=token_step,
             raw=torch.where(came[..., None], raw, entries.raw),
             relation=torch.where(came[..., None], fresh.spread(related), entries.relation),
             within=entries.within | within,
         )
 
     @torch.no_grad()
-    def entry_query(self, entries: Entries) -> EntryQuery:
-        """Ask for the next newcomer of every rollout."""
+    def entry_query(self, entries: Insertions) -> PositionOutputs:
+        """Ask for the next inserted agent of every rollout."""
         cells = self._asked().cells
-        occupied = cells.occupied(entries.column.cell, entries.within)
+        occupied = cells.occupied(entries.token_step.cell, entries.within)
         relation = Shared.of(entries.relation)
-        agents = Seen.own(entries.raw, relation, entries.within)
+        agents = AttentionSources.own(entries.raw, relation, entries.within)
         x = cells(occupied[:, None], entries.roads, agents)[:, 0]
         each = torch.arange(len(x), device=x.device)
-        said = cells.answer(Rows(each, each), x[:, None], entries.ground)
-        return EntryQuery(
+        said = cells.answer(Rows(each, each), x[:, None], entries.cell_features)
+        return PositionOutputs(
             said.add_logit[:, 0],
-            None if said.cell_logits is None else said.cell_logits[:, 0],
-            None if said.place_m is None else said.place_m[:, 0],
+            None if said.position_logits is None else said.position_logits[:, 0],
+            None if said.position_m is None else said.position_m[:, 0],
         )
 
     @torch.no_grad()
     def entry_details(
         self,
-        entries: Entries,
+        entries: Insertions,
         cell: Int64[Tensor, " rollout"],
-        place_m: Float32[Tensor, "rollout 2"] | None = None,
-    ) -> EntryDetails:
+        position_m: Float32[Tensor, "rollout 2"] | None = None,
+    ) -> InsertionDetails:
         """Ask who enters at a cell of every rollout.
 
         Args:
-            entries: The half second.
+            entries: The token step.
             cell: The cells.
-            place_m: Where in them, in the ego's grid frame; their centres if None.
+            position_m: Where in them, in the ego's grid frame; their centres if None.
         """
-        asking, column = self._asked(), entries.column
+        asking, token_step = self._asked(), entries.token_step
         details = asking.details
-        place_m = details.centre_m[cell] if place_m is None else place_m
-        pose = cell_pose(column.pose[:, EGO], place_m)[:, None]
+        position_m = details.centre_m[cell] if position_m is None else position_m
+        pose = cell_pose(token_step.pose[:, EGO], position_m)[:, None]
         each = torch.arange(len(cell), device=cell.device)
         rows = Rows(each, each[:, None])
-        source = torch.arange(column.presence.numel(), device=cell.device)
-        around = look_around(
+        source = torch.arange(token_step.presence.numel(), device=cell.device)
+        around = find_neighbours(
             asking.detail_agents,
             rows,
             pose,
-            column.pose,
-            source.view_as(column.presence),
-            column.visible[:, None],
+            token_step.pose,
+            source.view_as(token_step.presence),
+            token_step.visible[:, None],
         )
-        roads = see_roads(asking.detail_roads, rows, pose, entries.map, entries.scene)
+        roads = find_map_neighbours(
+            asking.detail_roads, rows, pose, entries.map, entries.scene
+        )
         x = details(cell, roads, around.seen(entries.raw.flatten(0, 1)))
         kinds = torch.arange(details.given_kind.num_embeddings, device=cell.device)
-        near = Lying.near(entries.map, roads)
+        near = CellSources.near(entries.map, roads)
         said = details.answer(rows, x[:, None], kinds, pose[:, 0], near)
-        return EntryDetails(
-            said.kind_logits[:, 0],
+        return InsertionDetails(
+            said.agent_type_logits[:, 0],
             said.size_log_m.exp(),
             said.heading_logits,
             said.turned_rad,
             said.offset_m,
         )
 
-    def _ground(self, entries: Entries) -> Tensor | None:
-        """Describe the cells around every ego, before any newcomer."""
-        ground, column = self._asked().cells.ground, entries.column
-        if ground is None:
+    def _cell_features(self, entries: Insertions) -> Tensor | None:
+        """Describe the cells around every ego, before any inserted agent."""
+        cell_features, token_step = self._asked().cells.cell_features, entries.token_step
+        if cell_features is None:
             return None
-        row = torch.arange(column.presence.numel(), device=column.pose.device)
-        there = column.visible & (column.presence != Presence.INSERTED)
+        row = torch.arange(token_step.presence.numel(), device=token_step.pose.device)
+        there = token_step.visible & (token_step.presence != Presence.INSERTED)
         features = entries.raw.flatten(0, 1)
-        lying = Lying(features, row.view_as(column.presence), column.pose, there)
-        roads = Lying.roads(entries.map, entries.scene)
-        described: Tensor = ground(column.pose[:, EGO], roads, lying)
+        lying = CellSources(
+            features, row.view_as(token_step.presence), token_step.pose, there
+        )
+        roads = CellSources.roads(entries.map, entries.scene)
+        described: Tensor = cell_features(token_step.pose[:, EGO], roads, lying)
         return described
 
-    def _asked(self) -> _Asking:
+    def _asked(self) -> _InsertionBlocks:
         if self._asking is None:
             raise ValueError(
                 "these weights know motion only (model.insertion_and_removal is false): "
@@ -354,39 +287,43 @@ class Stepper:
             )
         return self._asking
 
-    def _embed(self, before: Tensor, known: Tensor, column: Column, rows: Rows) -> Tensor:
+    def _embed(
+        self, before: Tensor, known: Tensor, token_step: TokenStep, rows: Rows
+    ) -> Tensor:
         """Embed some rows of a column, given where who was known to be before it."""
         agents = AgentRows(
-            kind=rows.pack(column.kind),
-            size_lwh_m=rows.pack(column.size_lwh_m),
-            pose=rows.pack(column.pose),
+            kind=rows.pack(token_step.kind),
+            size_lwh_m=rows.pack(token_step.size_lwh_m),
+            pose=rows.pack(token_step.pose),
             before=rows.pack(before),
             known=rows.pack(known),
-            move=rows.pack(column.move),
-            presence=rows.pack(column.presence),
-            cell=rows.pack(column.cell),
-            ego=rows.at % column.cell.shape[-1] == EGO,
+            move=rows.pack(token_step.move),
+            presence=rows.pack(token_step.presence),
+            cell=rows.pack(token_step.cell),
+            ego=rows.at % token_step.cell.shape[-1] == EGO,
         )
         embedded: Tensor = self.network.embed(agents, self._tables)
         return embedded
 
-    def _sight(self, memory: Memory, column: Column, rows: Rows) -> Sight:
+    def _context(
+        self, memory: StepMemory, token_step: TokenStep, rows: Rows
+    ) -> AgentContext:
         """What the visible rows of a column see."""
-        visible = column.visible
+        visible = token_step.visible
         others = ~torch.eye(visible.shape[1], dtype=torch.bool, device=visible.device)
-        around = look_around(
+        around = find_neighbours(
             self._agents_reach,
             rows,
-            column.pose,
-            column.pose,
+            token_step.pose,
+            token_step.pose,
             rows.number,
             visible[:, None] & visible[:, :, None] & others,
         )
-        pose, token = rows.pack(column.pose), torch.full_like(rows.at, memory.columns)
+        pose, token = rows.pack(token_step.pose), torch.full_like(rows.at, memory.columns)
         scene = memory.scene[rows.at // visible.shape[1]]
         light = self.network.motion.lights_ahead(memory.roads, pose, scene, token)
-        roads = see_roads(
-            self._roads_reach, rows, column.pose, memory.roads, memory.scene, token
+        roads = find_map_neighbours(
+            self._roads_reach, rows, token_step.pose, memory.roads, memory.scene, token
         )
         place = torch.arange(memory.window, device=visible.device)
         ago = (place - memory.columns) % memory.window - memory.window  # -window ... -1
@@ -396,4 +333,4 @@ class Stepper:
             torch.cat([described, ago], dim=-1), self._past_table
         )
         past = rows.pack(memory.visible)
-        return Sight(Shared.of(related), past, roads, around, light)
+        return AgentContext(Shared.of(related), past, roads, around, light)

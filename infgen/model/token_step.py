@@ -1,4 +1,4 @@
-"""One half second of many rollouts: what the network is shown, and what it says of it.
+"""One token step of many rollouts: what the network is shown, and what it says of it.
 
 Dims as in ``steps``. What a network has no head for is None in its answers.
 """
@@ -13,8 +13,8 @@ from infgen.tokens.scene_tokens import Presence
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
-    """All agents of all rollouts at the end of one half second.
+class TokenStep:
+    """All agents of all rollouts at the end of one token step.
 
     Attributes:
         kind: ``AgentType``.
@@ -40,9 +40,9 @@ class Column:
         """Who can be seen: who is observed, or just entering."""
         return self.observed | (self.presence == Presence.INSERTED)
 
-    def take(self, rollouts: Int64[Tensor, " kept"]) -> "Column":
+    def take(self, rollouts: Int64[Tensor, " kept"]) -> "TokenStep":
         """Go on with some rollouts only."""
-        return Column(*(getattr(self, each.name)[rollouts] for each in fields(self)))
+        return TokenStep(*(getattr(self, each.name)[rollouts] for each in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,14 +57,14 @@ class MotionStep:
     packed: MotionOutputs
 
     @property
-    def move_logits(self) -> Float32[Tensor, "rollout row move"]:
+    def motion_logits(self) -> Float32[Tensor, "rollout row move"]:
         """Next move, by the row's own kind's vocabulary."""
-        return self.packed.rows.spread(self.packed.move_logits)
+        return self.packed.rows.spread(self.packed.motion_logits)
 
     @property
-    def leave_logit(self) -> Float32[Tensor, "rollout row"] | None:
+    def remove_logit(self) -> Float32[Tensor, "rollout row"] | None:
         """Log-odds that the next token is the agent's last (REMOVED)."""
-        logit = self.packed.leave_logit
+        logit = self.packed.remove_logit
         return None if logit is None else self.packed.rows.spread(logit)
 
     @property
@@ -75,23 +75,23 @@ class MotionStep:
 
 
 @dataclass(frozen=True, slots=True)
-class EntryQuery:
+class PositionOutputs:
     """Whether one more agent enters at this column, and where.
 
     Attributes:
         add_logit: Log-odds of ADD against BEGIN MOTION.
-        cell_logits: Cell of the ego's grid, given ADD ...
-        place_m: ... or the place itself, in the ego's grid frame.
+        position_logits: Cell of the ego's grid, given ADD ...
+        position_m: ... or the place itself, in the ego's grid frame.
     """
 
     add_logit: Float32[Tensor, " rollout"]
-    cell_logits: Float32[Tensor, "rollout cell"] | None
-    place_m: Float32[Tensor, "rollout 2"] | None
+    position_logits: Float32[Tensor, "rollout cell"] | None
+    position_m: Float32[Tensor, "rollout 2"] | None
 
-    def take(self, rollouts: Int64[Tensor, " kept"]) -> "EntryQuery":
+    def take(self, rollouts: Int64[Tensor, " kept"]) -> "PositionOutputs":
         """Go on with some rollouts only."""
-        cell, place = self.cell_logits, self.place_m
-        return EntryQuery(
+        cell, place = self.position_logits, self.position_m
+        return PositionOutputs(
             self.add_logit[rollouts],
             None if cell is None else cell[rollouts],
             None if place is None else place[rollouts],
@@ -99,11 +99,11 @@ class EntryQuery:
 
 
 @dataclass(frozen=True, slots=True)
-class EntryDetails:
+class InsertionDetails:
     """Who enters at a place: sample a kind, then take that kind's row of the others.
 
     Attributes:
-        kind_logits: ``AgentType`` given the cell.
+        agent_type_logits: ``AgentType`` given the cell.
         size_lwh_m: Box, given the kind.
         heading_logits: Heading bin relative to the ego, given the kind ...
         turned_rad: ... or the heading itself, relative to the ego.
@@ -111,7 +111,7 @@ class EntryDetails:
             None where the place was known already.
     """
 
-    kind_logits: Float32[Tensor, "rollout kind"]
+    agent_type_logits: Float32[Tensor, "rollout kind"]
     size_lwh_m: Float32[Tensor, "rollout kind 3"]
     heading_logits: Float32[Tensor, "rollout kind heading"] | None
     turned_rad: Float32[Tensor, "rollout kind"] | None

@@ -1,7 +1,8 @@
-"""Where a newcomer may stand: in nobody's way, and a vehicle near a lane.
+"""Where an inserted agent may stand: in nobody's way, and a vehicle near a lane.
 
-In somebody's way is whoever stands where its box is, or will be in half a second if it goes
-on as in the last one. Pedestrians may stand on pedestrians: groups walk closer than boxes.
+In somebody's way is whoever stands where its box is, or will be in one token step if it
+goes on as in the last one. Pedestrians may stand on pedestrians: groups walk closer than
+boxes.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from infgen.geometry import boxes_overlap, to_world
-from infgen.rollout.population import EGO_ROW, Newcomers, Population, entry_pose
+from infgen.rollout.population import EGO_ROW, InsertedAgents, Population, insertion_pose
 from infgen.scene import AgentType
 from infgen.tokens.map import PolylineType
 from infgen.tokens.scene_tokens import Presence, SceneTokens
@@ -22,7 +23,7 @@ NOWHERE_M = np.float32(1e9)
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
+class InsertionMask:
     """Lanes of the maps that a batch of rollouts plays on, as straight pieces.
 
     Attributes:
@@ -39,22 +40,22 @@ class Room:
     lane_m: float
     end_pose: Float32[np.ndarray, "3 move 3"]
 
-    def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "Room":
+    def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "InsertionMask":
         """Go on with some rollouts only."""
         return replace(self, scene=self.scene[rollouts])
 
     def allows(
-        self, population: Population, newcomers: Newcomers
+        self, population: Population, inserted: InsertedAgents
     ) -> Bool[np.ndarray, " rollout"]:
-        """Tell which newcomers may stand where they are to enter."""
-        pose = entry_pose(population.pose[:, EGO_ROW], newcomers)
-        on_foot = newcomers.kind == AgentType.PEDESTRIAN
+        """Tell which inserted agents may stand where they are to enter."""
+        pose = insertion_pose(population.pose[:, EGO_ROW], inserted)
+        on_foot = inserted.kind == AgentType.PEDESTRIAN
         passed = on_foot[:, None] & (population.kind == AgentType.PEDESTRIAN)
         in_the_way = np.zeros(len(pose), dtype=bool)
         for everyone in (population.pose, self._soon(population)):
             on_somebody = boxes_overlap(
                 pose[:, None],
-                newcomers.size_lwh_m[:, None, :2],
+                inserted.size_lwh_m[:, None, :2],
                 everyone,
                 population.size_lwh_m[..., :2],
             )
@@ -62,11 +63,11 @@ class Room:
             in_the_way |= on_somebody.any(axis=1)
         laneless = (self.start_m == NOWHERE_M).all(axis=(1, 2))[self.scene]
         by_a_lane = self.lane_distance_m(pose[:, :2]) <= self.lane_m
-        by_a_lane |= laneless | (newcomers.kind != AgentType.VEHICLE)
+        by_a_lane |= laneless | (inserted.kind != AgentType.VEHICLE)
         return by_a_lane & ~in_the_way
 
     def _soon(self, population: Population) -> Float32[np.ndarray, "rollout row 3"]:
-        """Where everybody is in half a second who moves as in the last; others stand."""
+        """Where everybody is in one token step who moves as in the last; others stand."""
         moves = population.move >= 0
         move = np.where(moves, population.move, 0)
         step = self.end_pose[population.kind, move] * moves[..., None]
@@ -84,12 +85,12 @@ class Room:
         return gap_m.min(axis=1, initial=np.inf)
 
 
-def make_room(
+def make_insertion_mask(
     maps: Sequence[SceneTokens],
     books: tuple[MotionVocabulary, MapVocabulary],
     scene: Int64[np.ndarray, " rollout"],
     lane_m: float,
-) -> Room:
+) -> InsertionMask:
     """Lay out the lanes of some maps; ``scene`` is the map of each rollout."""
     moves, roads = books
     lanes = [_lanes(tokens, roads) for tokens in maps]
@@ -99,7 +100,7 @@ def make_room(
     for at, (first_m, step_m) in enumerate(lanes):
         start_m[at, : len(first_m)] = first_m
         along_m[at, : len(first_m)] = step_m
-    return Room(start_m, along_m, scene, lane_m, moves.end_pose)
+    return InsertionMask(start_m, along_m, scene, lane_m, moves.end_pose)
 
 
 def _lanes(tokens: SceneTokens, roads: MapVocabulary) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,8 @@
 """Everyone in a batch of rollouts: they enter, move and leave.
 
 Rows are places. An agent keeps its row for its life; after it has left, the row is free for
-the next newcomer. Row 0 is always the ego. Plain arrays; the network sees them as a
-``Column``.
+the next inserted agent. Row 0 is always the ego. Plain arrays; the network sees them as a
+``TokenStep``.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int16, Int32, Int64
 
 from infgen.geometry import to_world, wrap_angle
-from infgen.rollout.recording import NOBODY, Start
+from infgen.rollout.recording import NOBODY, RolloutStart
 from infgen.tokens.grid import Grid, encode_cell, from_grid, to_grid
 from infgen.tokens.scene_tokens import (
     FIRST_MOTION_TOKEN,
@@ -28,11 +28,11 @@ EGO_ROW = 0
 
 @dataclass(frozen=True, slots=True)
 class Population:
-    """All agents of all rollouts of a batch at the end of one half second.
+    """All agents of all rollouts of a batch at the end of one token step.
 
     Attributes:
-        life: Number of the agent in its rollout, or ``NOBODY`` in a free row.
-        born: Lives so far in each rollout.
+        agent_number: Number of the agent in its rollout, or ``NOBODY`` in a free row.
+        num_agents_so_far: Lives so far in each rollout.
         kind: ``AgentType``.
         size_lwh_m: Boxes.
         pose: x, y, heading in the scene's frame.
@@ -42,8 +42,8 @@ class Population:
         observed: False where absent, entering, or (in the history) not seen by the log.
     """
 
-    life: Int32[np.ndarray, "rollout row"]
-    born: Int32[np.ndarray, " rollout"]
+    agent_number: Int32[np.ndarray, "rollout row"]
+    num_agents_so_far: Int32[np.ndarray, " rollout"]
     kind: Int8[np.ndarray, "rollout row"]
     size_lwh_m: Float32[np.ndarray, "rollout row 3"]
     pose: Float32[np.ndarray, "rollout row 3"]
@@ -54,7 +54,7 @@ class Population:
     @property
     def num_agents(self) -> Int64[np.ndarray, " rollout"]:
         """Agents of each rollout."""
-        return (self.life != NOBODY).sum(axis=1)
+        return (self.agent_number != NOBODY).sum(axis=1)
 
     def cells(self, grid: Grid) -> Int16[np.ndarray, "rollout row"]:
         """Cell [rollout, row] of the ego's grid that holds each agent, or ``NO_CELL``."""
@@ -70,7 +70,7 @@ class Population:
 
     def without_free_rows(self) -> "Population":
         """Cut off the rows that are free in every rollout, but those between others."""
-        used = (self.life != NOBODY).any(axis=0)
+        used = (self.agent_number != NOBODY).any(axis=0)
         rows = len(used) - int(used[::-1].argmax())
         cut = {f.name: getattr(self, f.name) for f in fields(self)}
         return Population(
@@ -92,33 +92,35 @@ class Population:
 
 
 @dataclass(frozen=True, slots=True)
-class Newcomers:
-    """At most one newcomer per rollout.
+class InsertedAgents:
+    """At most one inserted agent per rollout.
 
     Attributes:
         who: Rollouts that have one; the other entries mean nothing.
-        place_m: Where in the ego's grid frame.
+        position_m: Where in the ego's grid frame.
         turned_rad: Heading relative to the ego.
         kind: ``AgentType``.
         size_lwh_m: Box.
     """
 
     who: Bool[np.ndarray, " rollout"]
-    place_m: Float32[np.ndarray, "rollout 2"]
+    position_m: Float32[np.ndarray, "rollout 2"]
     turned_rad: Float32[np.ndarray, " rollout"]
     kind: Int8[np.ndarray, " rollout"]
     size_lwh_m: Float32[np.ndarray, "rollout 3"]
 
-    def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "Newcomers":
+    def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "InsertedAgents":
         """Take some rollouts."""
         return _take(self, rollouts)
 
-    def put(self, rollouts: Int64[np.ndarray, " kept"], others: "Newcomers") -> "Newcomers":
+    def put(
+        self, rollouts: Int64[np.ndarray, " kept"], others: "InsertedAgents"
+    ) -> "InsertedAgents":
         """Put others in the place of those of some rollouts. Inverse of ``take``."""
         return _put(self, rollouts, others)
 
 
-R = TypeVar("R", Population, Newcomers)
+R = TypeVar("R", Population, InsertedAgents)
 
 
 def _take(record: R, rollouts: np.ndarray) -> R:
@@ -134,7 +136,7 @@ def _put(record: R, rollouts: np.ndarray, others: R) -> R:
     return replace(record, **changed)
 
 
-def settle(starts: Sequence[Start], min_rows: int) -> list[Population]:
+def place_logged_agents(starts: Sequence[RolloutStart], min_rows: int) -> list[Population]:
     """Give every agent of the histories a row, the ego first, then near to far.
 
     Returns:
@@ -148,17 +150,17 @@ def settle(starts: Sequence[Start], min_rows: int) -> list[Population]:
     if any(start.history.now != now for start in starts):
         raise ValueError("a batch of rollouts must start from histories of one length")
     rows = max(min_rows, *(start.history.num_agents for start in starts))
-    return [_settle_at(starts, rows, token) for token in range(now + 1)]
+    return [_place_logged_at(starts, rows, token) for token in range(now + 1)]
 
 
-def _settle_at(starts: Sequence[Start], rows: int, token: int) -> Population:
+def _place_logged_at(starts: Sequence[RolloutStart], rows: int, token: int) -> Population:
     empty = _empty(len(starts), rows)
     for at, start in enumerate(starts):
         history = start.history
         order = _near_to_far(start)
         place = slice(0, len(order))
-        empty.life[at, place] = order
-        empty.born[at] = len(order)
+        empty.agent_number[at, place] = order
+        empty.num_agents_so_far[at] = len(order)
         empty.kind[at, place] = history.agent_type[order]
         empty.size_lwh_m[at, place] = history.size_lwh_m[order]
         empty.pose[at, place] = history.pose[order, token]
@@ -171,7 +173,7 @@ def _settle_at(starts: Sequence[Start], rows: int, token: int) -> Population:
     return empty
 
 
-def _near_to_far(start: Start) -> Int64[np.ndarray, " agent"]:
+def _near_to_far(start: RolloutStart) -> Int64[np.ndarray, " agent"]:
     history = start.history
     xy_m = history.pose[:, history.now, :2]
     distance_m = np.linalg.norm(xy_m - xy_m[history.ego], axis=1)
@@ -182,8 +184,8 @@ def _near_to_far(start: Start) -> Int64[np.ndarray, " agent"]:
 def _empty(rollouts: int, rows: int) -> Population:
     shape = (rollouts, rows)
     return Population(
-        life=np.full(shape, NOBODY, dtype=np.int32),
-        born=np.zeros(rollouts, dtype=np.int32),
+        agent_number=np.full(shape, NOBODY, dtype=np.int32),
+        num_agents_so_far=np.zeros(rollouts, dtype=np.int32),
         kind=np.zeros(shape, dtype=np.int8),
         size_lwh_m=np.zeros((*shape, 3), dtype=np.float32),
         pose=np.zeros((*shape, 3), dtype=np.float32),
@@ -193,18 +195,18 @@ def _empty(rollouts: int, rows: int) -> Population:
     )
 
 
-def move_on(
+def advance_agents(
     population: Population,
     move: Int64[np.ndarray, "rollout row"],
-    leave: Bool[np.ndarray, "rollout row"],
+    remove: Bool[np.ndarray, "rollout row"],
     vocabulary: MotionVocabulary,
 ) -> tuple[Population, Float32[np.ndarray, "rollout row 5 3"]]:
-    """Move everyone by half a second; whoever was leaving is gone, its row free.
+    """Move everyone by one token step; whoever was leaving is gone, its row free.
 
     Args:
         population: At the end of a half second.
         move: Next move of each row.
-        leave: Rows whose agent will be there for the last time. The ego never is.
+        remove: Rows whose agent will be there for the last time. The ego never is.
         vocabulary: The moves.
 
     Returns:
@@ -213,14 +215,14 @@ def move_on(
     """
     gone = population.presence == Presence.REMOVED
     there = (population.presence != Presence.ABSENT) & ~gone
-    leave = leave & there
-    leave[:, EGO_ROW] = False
+    remove = remove & there
+    remove[:, EGO_ROW] = False
     steps = vocabulary.path[population.kind, move][:, :, 1:]
     path = to_world(steps, population.pose[:, :, None]) * there[..., None, None]
-    presence = np.where(leave, Presence.REMOVED, Presence.PRESENT) * there
+    presence = np.where(remove, Presence.REMOVED, Presence.PRESENT) * there
     moved = replace(
         population,
-        life=np.where(there, population.life, NOBODY).astype(np.int32),
+        agent_number=np.where(there, population.agent_number, NOBODY).astype(np.int32),
         pose=path[:, :, -1],
         move=np.where(there, move, NO_MOTION_TOKEN).astype(np.int16),
         presence=presence.astype(np.int8),
@@ -229,13 +231,13 @@ def move_on(
     return moved, path
 
 
-def leave_beyond(before: Population, moved: Population, radius_m: float) -> Population:
+def remove_beyond(before: Population, moved: Population, radius_m: float) -> Population:
     """Let whoever crosses a circle around the ego outwards be there for the last time.
 
     Who was outside all the time stays: the ego may come nearer.
 
     Args:
-        before: Half a second earlier.
+        before: One token step earlier.
         moved: Now.
         radius_m: Of the circle.
     """
@@ -250,26 +252,26 @@ def _ego_distance_m(population: Population) -> Float32[np.ndarray, "rollout row"
     return np.hypot(away_m[..., 0], away_m[..., 1])
 
 
-def enter(
-    population: Population, newcomers: Newcomers
+def add_inserted(
+    population: Population, inserted: InsertedAgents
 ) -> tuple[Population, Int64[np.ndarray, " rollout"]]:
-    """Give each newcomer the first free row of its rollout.
+    """Give each inserted agent the first free row of its rollout.
 
     Returns:
-        The population with them, and the row that each rollout's newcomer got (-1 where
-        there is none). A newcomer of a full rollout is turned away.
+        The population with them, and the row that each rollout's inserted agent got (-1
+        where there is none). An inserted agent of a full rollout is turned away.
     """
-    free = population.life == NOBODY
-    fits = newcomers.who & free.any(axis=1)
+    free = population.agent_number == NOBODY
+    fits = inserted.who & free.any(axis=1)
     rollout = np.flatnonzero(fits)
     row = free.argmax(axis=1)[rollout]
 
     new = population.take(np.arange(len(fits)))  # A copy.
-    new.born[fits] += 1
-    new.life[rollout, row] = population.born[rollout]
-    new.kind[rollout, row] = newcomers.kind[rollout]
-    new.size_lwh_m[rollout, row] = newcomers.size_lwh_m[rollout]
-    new.pose[rollout, row] = entry_pose(population.pose[:, EGO_ROW], newcomers)[rollout]
+    new.num_agents_so_far[fits] += 1
+    new.agent_number[rollout, row] = population.num_agents_so_far[rollout]
+    new.kind[rollout, row] = inserted.kind[rollout]
+    new.size_lwh_m[rollout, row] = inserted.size_lwh_m[rollout]
+    new.pose[rollout, row] = insertion_pose(population.pose[:, EGO_ROW], inserted)[rollout]
     new.move[rollout, row] = FIRST_MOTION_TOKEN
     new.presence[rollout, row] = Presence.INSERTED
     new.observed[rollout, row] = False
@@ -278,9 +280,9 @@ def enter(
     return new, rows
 
 
-def entry_pose(
-    ego_pose: Float32[np.ndarray, "rollout 3"], newcomers: Newcomers
+def insertion_pose(
+    ego_pose: Float32[np.ndarray, "rollout 3"], inserted: InsertedAgents
 ) -> Float32[np.ndarray, "rollout 3"]:
-    """Poses [rollout, 3] of newcomers in the scene's frame."""
-    heading_rad = wrap_angle(newcomers.turned_rad + ego_pose[:, 2])
-    return np.column_stack([from_grid(newcomers.place_m, ego_pose), heading_rad])
+    """Poses [rollout, 3] of inserted agents in the scene's frame."""
+    heading_rad = wrap_angle(inserted.turned_rad + ego_pose[:, 2])
+    return np.column_stack([from_grid(inserted.position_m, ego_pose), heading_rad])

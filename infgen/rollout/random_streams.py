@@ -46,7 +46,7 @@ class Stream:
             token: Half second that the draw is made in.
             purpose: What it decides.
             count: How many; a longer draw starts with the shorter one.
-            turn: Which draw of that purpose in this half second (the n-th newcomer).
+            turn: Which draw of that purpose in this token step (the n-th inserted agent).
         """
         # The lowest word counts within a draw; the others name the draw.
         counter = [0, turn, token, int(purpose)]
@@ -55,7 +55,7 @@ class Stream:
         )
 
 
-def uniforms(
+def draw_uniforms(
     streams: Sequence[Stream], token: int, purpose: Purpose, count: int, turn: int = 0
 ) -> Float64[np.ndarray, "stream count"]:
     """Draw [stream, count] numbers, a row from each stream."""

@@ -1,4 +1,4 @@
-"""Frames as they are played, and the rollouts they add up to.
+"""Frames as they are simulated, and the rollouts they add up to.
 
 A batch plays several rollouts at once. Rows of a batch are used again after their agent has
 left, so each agent has a *life*: its number within its rollout, logged agents first.
@@ -23,33 +23,33 @@ NOBODY = -1
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Half a second of a batch of rollouts.
+    """One token step of a batch of rollouts.
 
     Attributes:
-        token: The half second: steps ``5 token + 1`` to ``5 token + 5``.
-        life: Who is in each row during it, or ``NOBODY``.
+        token: The token step: steps ``5 token + 1`` to ``5 token + 5``.
+        agent_number: Who is in each row during it, or ``NOBODY``.
         path: x, y, heading of every row at its five steps.
         shown: At which of them a detector would see it; always, but for weights that have
             learned validity patterns.
-        leaving: Rows whose agent is there for the last time.
-        born: Life of an agent placed at the end of this half second, else ``NOBODY``; its
-            row is free in ``life``.
-        kind: ``AgentType`` of every row after this half second.
-        size_lwh_m: Box of every row after this half second.
+        removed: Rows whose agent is there for the last time.
+        inserted_number: Life of an agent placed at the end of this token step, else
+            ``NOBODY``; its row is free in ``agent_number``.
+        kind: ``AgentType`` of every row after this token step.
+        size_lwh_m: Box of every row after this token step.
     """
 
     token: int
-    life: Int32[np.ndarray, "rollout row"]
+    agent_number: Int32[np.ndarray, "rollout row"]
     path: Float32[np.ndarray, "rollout row 5 3"]
     shown: Bool[np.ndarray, "rollout row 5"]
-    leaving: Bool[np.ndarray, "rollout row"]
-    born: Int32[np.ndarray, "rollout row"]
+    removed: Bool[np.ndarray, "rollout row"]
+    inserted_number: Int32[np.ndarray, "rollout row"]
     kind: Int8[np.ndarray, "rollout row"]
     size_lwh_m: Float32[np.ndarray, "rollout row 3"]
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class RolloutStart:
     """What a rollout continues: a log and its tokenized history.
 
     Attributes:
@@ -57,7 +57,7 @@ class Start:
         history: Its tokens up to now, nothing later in them.
         index: Which of the scene's rollouts this is.
         seed: Seed of its random streams.
-        lights: What traffic lights show in every half second from the history's first on,
+        lights: What traffic lights show in every token step from the history's first on,
             for weights that see it; None to leave them as they were last.
     """
 
@@ -76,8 +76,8 @@ class Start:
 
 
 def number_maps(
-    starts: Sequence[Start],
-) -> tuple[list[Start], Int64[np.ndarray, " rollout"]]:
+    starts: Sequence[RolloutStart],
+) -> tuple[list[RolloutStart], Int64[np.ndarray, " rollout"]]:
     """One start on each map, however many rollouts it has, and the map of each rollout."""
     maps = {start.scene.scenario_id: start for start in starts}
     number = {name: at for at, name in enumerate(maps)}
@@ -86,7 +86,7 @@ def number_maps(
 
 
 def collect(
-    starts: Sequence[Start],
+    starts: Sequence[RolloutStart],
     frames: Sequence[Frame],
     weights: str,
     places: Sequence[int] | None = None,
@@ -101,11 +101,11 @@ def collect(
             agent at every step, so long ones are better put together a few at a time.
     """
     places = range(len(starts)) if places is None else places
-    return [_rollout(starts[at], _lives(starts[at], frames, at), weights) for at in places]
+    return [_rollout(starts[at], _record(starts[at], frames, at), weights) for at in places]
 
 
 @dataclass(frozen=True, slots=True)
-class _Lives:
+class _RecordedAgents:
     """One row per life of a rollout, filled frame by frame.
 
     Who is ``there`` has a pose; who is ``valid`` is seen as well.
@@ -120,11 +120,13 @@ class _Lives:
     exit_step: Int16[np.ndarray, " life"]
 
 
-def _lives(start: Start, frames: Sequence[Frame], at: int) -> _Lives:
+def _record(start: RolloutStart, frames: Sequence[Frame], at: int) -> _RecordedAgents:
     logged = start.history.num_agents
-    count = 1 + max([logged - 1, *(int(frame.born[at].max()) for frame in frames)])
+    count = 1 + max(
+        [logged - 1, *(int(frame.inserted_number[at].max()) for frame in frames)]
+    )
     steps = CLOCK.end_step(frames[-1].token) + 1
-    lives = _Lives(
+    recorded = _RecordedAgents(
         pose=np.zeros((count, steps, 3), dtype=np.float32),
         there=np.zeros((count, steps), dtype=bool),
         valid=np.zeros((count, steps), dtype=bool),
@@ -133,43 +135,43 @@ def _lives(start: Start, frames: Sequence[Frame], at: int) -> _Lives:
         entry_step=np.zeros(count, dtype=np.int16),
         exit_step=np.full(count, NEVER, dtype=np.int16),
     )
-    _write_history(lives, start)
+    _write_history(recorded, start)
     for frame in frames:
-        _write_frame(lives, frame, at)
-    return lives
+        _write_frame(recorded, frame, at)
+    return recorded
 
 
-def _write_history(lives: _Lives, start: Start) -> None:
+def _write_history(recorded: _RecordedAgents, start: RolloutStart) -> None:
     tracks, rows, now = start.scene.tracks, start.logged_row, start.scene.now
     logged, span = len(rows), slice(0, now + 1)
     seen = tracks.valid[rows, span]
-    lives.there[:logged, span] = lives.valid[:logged, span] = seen
-    lives.pose[:logged, span, :2] = tracks.xyz_m[rows, span, :2] * seen[..., None]
-    lives.pose[:logged, span, 2] = tracks.heading_rad[rows, span] * seen
-    lives.kind[:logged] = start.history.agent_type
-    lives.size_lwh_m[:logged] = start.history.size_lwh_m
-    lives.entry_step[:logged] = seen.argmax(axis=1)
+    recorded.there[:logged, span] = recorded.valid[:logged, span] = seen
+    recorded.pose[:logged, span, :2] = tracks.xyz_m[rows, span, :2] * seen[..., None]
+    recorded.pose[:logged, span, 2] = tracks.heading_rad[rows, span] * seen
+    recorded.kind[:logged] = start.history.agent_type
+    recorded.size_lwh_m[:logged] = start.history.size_lwh_m
+    recorded.entry_step[:logged] = seen.argmax(axis=1)
 
 
-def _write_frame(lives: _Lives, frame: Frame, at: int) -> None:
+def _write_frame(recorded: _RecordedAgents, frame: Frame, at: int) -> None:
     end = CLOCK.end_step(frame.token)
     span = slice(CLOCK.start_step(frame.token) + 1, end + 1)
-    life, born = frame.life[at], frame.born[at]
-    there, new = life != NOBODY, born != NOBODY
-    lives.pose[life[there], span] = frame.path[at][there]
-    lives.there[life[there], span] = True
-    lives.valid[life[there], span] = frame.shown[at][there]
-    lives.exit_step[life[frame.leaving[at]]] = end
-    lives.kind[born[new]] = frame.kind[at][new]
-    lives.size_lwh_m[born[new]] = frame.size_lwh_m[at][new]
-    lives.entry_step[born[new]] = end
+    agent_number, inserted_number = frame.agent_number[at], frame.inserted_number[at]
+    there, new = agent_number != NOBODY, inserted_number != NOBODY
+    recorded.pose[agent_number[there], span] = frame.path[at][there]
+    recorded.there[agent_number[there], span] = True
+    recorded.valid[agent_number[there], span] = frame.shown[at][there]
+    recorded.exit_step[agent_number[frame.removed[at]]] = end
+    recorded.kind[inserted_number[new]] = frame.kind[at][new]
+    recorded.size_lwh_m[inserted_number[new]] = frame.size_lwh_m[at][new]
+    recorded.entry_step[inserted_number[new]] = end
 
 
-def _rollout(start: Start, lives: _Lives, weights: str) -> Rollout:
-    count, logged = len(lives.kind), start.history.num_agents
+def _rollout(start: RolloutStart, recorded: _RecordedAgents, weights: str) -> Rollout:
+    count, logged = len(recorded.kind), start.history.num_agents
     first_id = int(start.scene.tracks.id.max()) + 1
     inserted_id = np.arange(first_id, first_id + count - logged, dtype=np.int32)
-    z_m = _heights(start, lives)
+    z_m = _heights(start, recorded)
     return Rollout(
         scenario_id=start.scene.scenario_id,
         index=start.index,
@@ -179,19 +181,21 @@ def _rollout(start: Start, lives: _Lives, weights: str) -> Rollout:
         now=start.scene.now,
         ego=start.history.ego,
         id=np.concatenate([start.history.track_id, inserted_id]),
-        kind=lives.kind,
-        size_lwh_m=lives.size_lwh_m,
-        xyz_m=np.concatenate([lives.pose[..., :2], z_m[..., None]], axis=-1)
-        * lives.valid[..., None],
-        heading_rad=lives.pose[..., 2] * lives.valid,
-        valid=lives.valid,
+        kind=recorded.kind,
+        size_lwh_m=recorded.size_lwh_m,
+        xyz_m=np.concatenate([recorded.pose[..., :2], z_m[..., None]], axis=-1)
+        * recorded.valid[..., None],
+        heading_rad=recorded.pose[..., 2] * recorded.valid,
+        valid=recorded.valid,
         logged=np.arange(count) < logged,
-        entry_step=lives.entry_step,
-        exit_step=lives.exit_step,
+        entry_step=recorded.entry_step,
+        exit_step=recorded.exit_step,
     )
 
 
-def _heights(start: Start, lives: _Lives) -> Float32[np.ndarray, "life step"]:
+def _heights(
+    start: RolloutStart, recorded: _RecordedAgents
+) -> Float32[np.ndarray, "life step"]:
     """Heights of box centres: the log's in the history, then road plus clearance.
 
     The clearance of a logged agent is what it had over the road at now, that of an inserted
@@ -199,27 +203,29 @@ def _heights(start: Start, lives: _Lives) -> Float32[np.ndarray, "life step"]:
     """
     tracks, rows, now = start.scene.tracks, start.logged_row, start.scene.now
     logged, stride = len(rows), CLOCK.steps_per_token
-    ground_m = _ground_at_knots(start, lives)
-    clearance_m = lives.size_lwh_m[:, 2] / 2
+    ground_m = _ground_at_knots(start, recorded)
+    clearance_m = recorded.size_lwh_m[:, 2] / 2
     clearance_m[:logged] = tracks.xyz_m[rows, now, 2] - ground_m[:logged, 0]
 
-    later = np.arange(lives.valid.shape[1] - now)
+    later = np.arange(recorded.valid.shape[1] - now)
     left = later // stride
     right = np.minimum(left + 1, ground_m.shape[1] - 1)
     share = (later % stride / stride).astype(np.float32)
-    z_m = np.zeros(lives.valid.shape, dtype=np.float32)
+    z_m = np.zeros(recorded.valid.shape, dtype=np.float32)
     z_m[:, now:] = ground_m[:, left] * (1 - share) + ground_m[:, right] * share
     z_m[:, now:] += clearance_m[:, None]
     z_m[:logged, : now + 1] = tracks.xyz_m[rows, : now + 1, 2]
     return z_m
 
 
-def _ground_at_knots(start: Start, lives: _Lives) -> Float32[np.ndarray, "life knot"]:
-    """Road height at the end of every half second from now on, held where nobody is."""
-    knots = np.arange(start.scene.now, lives.valid.shape[1], CLOCK.steps_per_token)
-    history, there = start.history, lives.there[:, knots]
+def _ground_at_knots(
+    start: RolloutStart, recorded: _RecordedAgents
+) -> Float32[np.ndarray, "life knot"]:
+    """Road height at the end of every token step from now on, held where nobody is."""
+    knots = np.arange(start.scene.now, recorded.valid.shape[1], CLOCK.steps_per_token)
+    history, there = start.history, recorded.there[:, knots]
     ground_m = np.zeros(there.shape, dtype=np.float32)
-    xy_m = lives.pose[:, knots, :2][there]
+    xy_m = recorded.pose[:, knots, :2][there]
     ground_m[there] = ground_z_m(xy_m, history.map_pose[:, :2], history.map_z_m)
     # Hold the last known height after an exit, the first known one before an entry.
     last = np.maximum.accumulate(np.where(there, np.arange(len(knots)), -1), axis=1)

@@ -62,6 +62,6 @@ def _last(likely: Tensor) -> Tensor:
     return (likely * places).amax(dim=-1)
 
 
-def happens(logit: Tensor, uniform: Tensor, bias: float | Tensor = 0.0) -> Tensor:
+def sample_event(logit: Tensor, uniform: Tensor, bias: float | Tensor = 0.0) -> Tensor:
     """Decide events [...] of given log-odds plus a bias: True with their probability."""
     return uniform < torch.sigmoid(logit.double() + bias)

@@ -1,4 +1,4 @@
-"""The closed loop, half a second at a time, for a batch of rollouts.
+"""The closed loop, one token step at a time, for a batch of rollouts.
 
 ::
 
@@ -7,7 +7,7 @@
         frame = session.step(ego_pose)      # or session.step(): the network drives
 
 The order within a half second is SPEC 12.2's: everyone moves, whoever leaves is marked,
-then newcomers enter one by one until the network says that motion begins.
+then inserted agents enter one by one until the network says that motion begins.
 """
 
 import math
@@ -24,24 +24,24 @@ from infgen.geometry import wrap_angle
 from infgen.model.batching.batch import Roads, collate_roads
 from infgen.model.relations import Rows
 from infgen.model.signal_features import StopLines
-from infgen.model.stepping import Memory
+from infgen.model.step_memory import StepMemory
 from infgen.model.token_step import MotionStep
-from infgen.rollout.insertion import Asking, add_newcomers
-from infgen.rollout.insertion_mask import make_room
+from infgen.rollout.insertion import InsertionRequest, insert_agents
+from infgen.rollout.insertion_mask import make_insertion_mask
 from infgen.rollout.population import (
     EGO_ROW,
     Population,
-    leave_beyond,
-    move_on,
-    settle,
+    advance_agents,
+    place_logged_agents,
+    remove_beyond,
 )
 from infgen.rollout.random_streams import Purpose, Stream
-from infgen.rollout.recording import NOBODY, Frame, Start, number_maps
-from infgen.rollout.rules.density import Fullness
-from infgen.rollout.rules.rejection import look_out
-from infgen.rollout.rules.stalls import Patience
-from infgen.rollout.sampling import choose, happens
-from infgen.rollout.simulator import Player
+from infgen.rollout.recording import NOBODY, Frame, RolloutStart, number_maps
+from infgen.rollout.rules.density import DensityControl
+from infgen.rollout.rules.rejection import make_motion_check
+from infgen.rollout.rules.stalls import StallRule
+from infgen.rollout.sampling import choose, sample_event
+from infgen.rollout.simulator import Simulator
 from infgen.tokens.motion_tokens import follow, make_match_table
 from infgen.tokens.scene_tokens import Presence
 
@@ -54,36 +54,38 @@ class Session:
 
     Attributes:
         population: Everyone at the end of the last half second.
-        token: That half second.
+        token: That token step.
     """
 
     @torch.inference_mode()
-    def __init__(self, player: Player, starts: Start | Sequence[Start]) -> None:
+    def __init__(
+        self, simulator: Simulator, starts: RolloutStart | Sequence[RolloutStart]
+    ) -> None:
         """Play the history.
 
         Args:
-            player: Network and settings.
+            simulator: Network and settings.
             starts: Scenes to continue; several rollouts of one scene share its map.
         """
-        starts = [starts] if isinstance(starts, Start) else list(starts)
-        self._player = player
+        starts = [starts] if isinstance(starts, RolloutStart) else list(starts)
+        self._simulator = simulator
         self._streams = [Stream.of(s.seed, s.scene.scenario_id, s.index) for s in starts]
-        history = settle(starts, player.settings.max_agents)
-        roads = _lay_out(starts)
-        self._memory, self._asking = _begin(
-            player, roads, starts, self._streams, history[0]
+        history = place_logged_agents(starts, simulator.settings.max_agents)
+        roads = _collate_maps(starts)
+        self._memory, self._asking = _start(
+            simulator, roads, starts, self._streams, history[0]
         )
-        self._fullness = _keep_full(player, starts, history[-1])
-        self._patience = _be_patient(player, roads, starts)
+        self._density = _make_density_control(simulator, starts, history[-1])
+        self._stall_rule = _make_stall_rule(simulator, roads, starts)
         for population in history[:-1]:
-            player.stepper.motion_step(self._memory, player.column(population))
+            simulator.stepper.motion_step(self._memory, simulator.token_step(population))
         self.population = history[-1]
         self.token = starts[0].history.now
-        self._table = make_match_table(player.vocabulary)
-        self._lookout = look_out(
-            starts, player.vocabulary, reject_off_road=player.settings.reject_off_road
+        self._table = make_match_table(simulator.vocabulary)
+        self._motion_check = make_motion_check(
+            starts, simulator.vocabulary, reject_off_road=simulator.settings.reject_off_road
         )
-        self._standing = player.tensor(player.vocabulary.stationary)
+        self._standing = simulator.tensor(simulator.vocabulary.stationary)
         self._driven_to: np.ndarray | None = None
 
     @property
@@ -99,37 +101,41 @@ class Session:
 
         Args:
             ego_pose: Where the ego drives, in the scene's frame: its pose [3] at the end of
-                the half second, or at each of its five steps [5, 3]. For a batch with the
+                the token step, or at each of its five steps [5, 3]. For a batch with the
                 rollouts as first dimension. The network sees it as moves of its vocabulary,
                 each of which makes up for what the last one left out. None lets the network
                 drive.
         """
-        player, token = self._player, self.token + 1
+        simulator, token = self._simulator, self.token + 1
         path = None if ego_pose is None else self._ego_path(ego_pose)
-        before = self._at_the_wheel(path)
-        said = player.stepper.motion_step(self._memory, player.column(before))
+        before = self._drive_ego(path)
+        said = simulator.stepper.motion_step(self._memory, simulator.token_step(before))
         moved, paths = self._move(before, said, path, token)
         after = moved
-        if player.inserts:
-            after = add_newcomers(self._ask(moved), self._memory, moved, token)
+        if simulator.inserts:
+            after = insert_agents(self._query_network(moved), self._memory, moved, token)
         self.population, self.token = after, token
         self._driven_to = None if path is None else path[:, -1]
         return Frame(
             token=token,
-            life=moved.life,
+            agent_number=moved.agent_number,
             path=paths,
-            shown=self._shown(before, moved, said, token),
-            leaving=moved.presence == Presence.REMOVED,
-            born=np.where(after.life != moved.life, after.life, np.int32(NOBODY)),
+            shown=self._sample_validity(before, moved, said, token),
+            removed=moved.presence == Presence.REMOVED,
+            inserted_number=np.where(
+                after.agent_number != moved.agent_number,
+                after.agent_number,
+                np.int32(NOBODY),
+            ),
             kind=after.kind,
             size_lwh_m=after.size_lwh_m,
         )
 
-    def _ask(self, moved: Population) -> Asking:
-        """Who asks for newcomers around the egos where they are now."""
-        if self._fullness is None:
+    def _query_network(self, moved: Population) -> InsertionRequest:
+        """Who asks for inserted agents around the egos where they are now."""
+        if self._density is None:
             return self._asking
-        wanted = self._fullness.wanted(moved.pose[:, EGO_ROW, :2])
+        wanted = self._density.wanted(moved.pose[:, EGO_ROW, :2])
         return replace(self._asking, wanted=wanted)
 
     def _ego_path(self, ego_pose: np.ndarray) -> Float32[np.ndarray, "rollout step 3"]:
@@ -157,7 +163,7 @@ class Session:
         path[:, -1] = given
         return path
 
-    def _at_the_wheel(self, path: np.ndarray | None) -> Population:
+    def _drive_ego(self, path: np.ndarray | None) -> Population:
         """Everyone as the network sees them; it takes over from where the ego really is."""
         if self._driven_to is None or path is not None:
             return self.population
@@ -169,26 +175,26 @@ class Session:
         self, before: Population, said: MotionStep, ego_path: np.ndarray | None, token: int
     ) -> tuple[Population, np.ndarray]:
         """Sample everyone's move, and who leaves; drive the egos that are driven."""
-        player, settings = self._player, self._player.settings
+        simulator, settings = self._simulator, self._simulator.settings
         move = self._moves(before, said, token)
-        move = self._hurry(before, said, token, move)
+        move = self._release_stalled(before, said, token, move)
         if ego_path is not None:
             target, pose = ego_path[:, -1], before.pose[:, EGO_ROW]
             kind = before.kind[:, EGO_ROW]
             move[:, EGO_ROW], _ = follow(target, pose, kind, self._table)
-        leave = self._leaves(said, token)
+        leave = self._sample_removals(said, token)
         driven = np.zeros(move.shape, dtype=bool)
         driven[:, EGO_ROW] = ego_path is not None
-        move = self._take_care(before, said, token, move, driven)
-        moved, path = move_on(before, move, leave, player.vocabulary)
+        move = self._apply_rules(before, said, token, move, driven)
+        moved, path = advance_agents(before, move, leave, simulator.vocabulary)
         if settings.removes and settings.removal_radius_m:
-            moved = leave_beyond(before, moved, settings.removal_radius_m)
+            moved = remove_beyond(before, moved, settings.removal_radius_m)
         if ego_path is not None:
             path = path.copy()  # The population goes on from where the moves led.
             path[:, EGO_ROW] = ego_path
         return moved, path
 
-    def _take_care(
+    def _apply_rules(
         self,
         before: Population,
         said: MotionStep,
@@ -197,23 +203,25 @@ class Session:
         driven: Bool[np.ndarray, "rollout row"],
     ) -> Int64[np.ndarray, "rollout row"]:
         """Draw moves again that lead into somebody or off the road."""
-        tries, again = self._player.settings.max_motion_samples, ~driven
+        tries, again = self._simulator.settings.max_motion_samples, ~driven
         slowest, changed = move.copy(), again
         for attempt in range(1, tries):
             # Whom the road and the others leave no way out is to spare the others.
             road = attempt <= tries // 2
-            hits, departs = self._lookout.go_wrong(before, move, changed, road=road)
+            hits, departs = self._motion_check.rejects(before, move, changed, road=road)
             again, steers = (hits | departs) & ~driven, departs & ~hits
-            slower = self._lookout.is_slower(before, move, slowest)
+            slower = self._motion_check.is_slower(before, move, slowest)
             slowest = np.where(slower & steers, move, slowest)
             changed = again  # Whose move will be another; those who brake among them.
             if attempt == tries // 2:
                 # Who is too fast for every way that it drew takes the slowest of them.
-                brakes = steers & again & self._lookout.is_fast(before, move)
+                brakes = steers & again & self._motion_check.is_fast(before, move)
                 move, again = np.where(brakes, slowest, move), again & ~brakes
             if not again.any():
                 break
-            move = self._moves_again(before, said, token, attempt, move, again, steers)
+            move = self._resample_rejected(
+                before, said, token, attempt, move, again, steers
+            )
         return move
 
     def _moves(
@@ -221,12 +229,12 @@ class Session:
     ) -> Int64[np.ndarray, "rollout row"]:
         """Sample everyone's move."""
         packed = said.packed
-        kind = packed.rows.pack(self._player.tensor(before.kind).long())
-        luck = self._luck(packed.rows, token, Purpose.MOVE)
-        drawn = self._draw(packed.move_logits, kind, luck)
+        kind = packed.rows.pack(self._simulator.tensor(before.kind).long())
+        uniforms = self._uniforms(packed.rows, token, Purpose.MOVE)
+        drawn = self._sample(packed.motion_logits, kind, uniforms)
         return packed.rows.spread(drawn).cpu().numpy()
 
-    def _moves_again(
+    def _resample_rejected(
         self,
         before: Population,
         said: MotionStep,
@@ -237,17 +245,17 @@ class Session:
         steers: Bool[np.ndarray, "rollout row"],
     ) -> Int64[np.ndarray, "rollout row"]:
         """Sample the moves of some rows anew; who only has to steer does not stop."""
-        player, rows = self._player, said.packed.rows
-        which = rows.pack(player.tensor(again))
-        luck = self._luck(rows, token, Purpose.MOVE, attempt)[which]
-        kind = rows.pack(player.tensor(before.kind).long())[which]
-        drawn = rows.pack(player.tensor(move))
-        stops = rows.pack(player.tensor(steers))[which, None] & self._standing[kind]
-        logits = said.packed.move_logits[which].masked_fill(stops, -torch.inf)
-        drawn[which] = self._draw(logits, kind, luck)
+        simulator, rows = self._simulator, said.packed.rows
+        which = rows.pack(simulator.tensor(again))
+        uniforms = self._uniforms(rows, token, Purpose.MOVE, attempt)[which]
+        kind = rows.pack(simulator.tensor(before.kind).long())[which]
+        drawn = rows.pack(simulator.tensor(move))
+        stops = rows.pack(simulator.tensor(steers))[which, None] & self._standing[kind]
+        logits = said.packed.motion_logits[which].masked_fill(stops, -torch.inf)
+        drawn[which] = self._sample(logits, kind, uniforms)
         return rows.spread(drawn).cpu().numpy()
 
-    def _hurry(
+    def _release_stalled(
         self,
         before: Population,
         said: MotionStep,
@@ -255,57 +263,64 @@ class Session:
         move: Int64[np.ndarray, "rollout row"],
     ) -> Int64[np.ndarray, "rollout row"]:
         """Let those set off who have stood in a lane for too long."""
-        if self._patience is None:
+        if self._stall_rule is None:
             return move
-        stalled = self._patience.stalled(before, token - 1)
-        stalled &= self._player.vocabulary.stationary[before.kind, move]
+        stalled = self._stall_rule.stalled(before, token - 1)
+        stalled &= self._simulator.vocabulary.stationary[before.kind, move]
         if not stalled.any():
             return move
         attempt = (
-            self._player.settings.max_motion_samples
+            self._simulator.settings.max_motion_samples
         )  # A number that no other draw has.
-        return self._moves_again(before, said, token, attempt, move, stalled, stalled)
+        return self._resample_rejected(before, said, token, attempt, move, stalled, stalled)
 
-    def _draw(self, logits: Tensor, kind: Tensor, luck: Tensor) -> Tensor:
+    def _sample(self, logits: Tensor, kind: Tensor, uniforms: Tensor) -> Tensor:
         """Sample a move. Who seldom sets off still does: standing has its own nucleus."""
-        settings = self._player.settings
+        settings = self._simulator.settings
         return choose(
             logits,
-            luck,
+            uniforms,
             settings.motion_top_k,
             nucleus=settings.motion_top_p,
             temperature=settings.motion_temperature,
             apart=self._standing[kind] if settings.motion_top_p < 1 else None,
         )
 
-    def _leaves(self, said: MotionStep, token: int) -> Bool[np.ndarray, "rollout row"]:
-        settings, packed = self._player.settings, said.packed
-        if packed.leave_logit is None or not settings.removes:
-            return np.zeros(self.population.life.shape, dtype=bool)
-        luck = self._luck(packed.rows, token, Purpose.LEAVE)
-        leave = happens(packed.leave_logit, luck, settings.remove_bias)
+    def _sample_removals(
+        self, said: MotionStep, token: int
+    ) -> Bool[np.ndarray, "rollout row"]:
+        settings, packed = self._simulator.settings, said.packed
+        if packed.remove_logit is None or not settings.removes:
+            return np.zeros(self.population.agent_number.shape, dtype=bool)
+        uniforms = self._uniforms(packed.rows, token, Purpose.LEAVE)
+        leave = sample_event(packed.remove_logit, uniforms, settings.remove_bias)
         return packed.rows.spread(leave).cpu().numpy()
 
-    def _luck(self, rows: Rows, token: int, purpose: Purpose, attempt: int = 0) -> Tensor:
+    def _uniforms(
+        self, rows: Rows, token: int, purpose: Purpose, attempt: int = 0
+    ) -> Tensor:
         """Draw a number for each of some rows; it does not depend on the others."""
-        each = self.population.life.shape[1]
-        return rows.pack(self._player.luck(self._streams, token, purpose, each, attempt))
+        each = self.population.agent_number.shape[1]
+        return rows.pack(
+            self._simulator.draw_uniforms(self._streams, token, purpose, each, attempt)
+        )
 
-    def _shown(
+    def _sample_validity(
         self, before: Population, moved: Population, said: MotionStep, token: int
     ) -> Bool[np.ndarray, "rollout row 5"]:
         """When a detector would see everyone.
 
-        The ego always, a newcomer as soon as it is in, whoever leaves to the end: so an
+        The ego always, an inserted agent as soon as it is in, whoever leaves to the end: so
+            an
         entry and an exit are where they are said to be.
         """
         steps = CLOCK.steps_per_token
-        shown = np.ones((*moved.life.shape, steps), dtype=bool)
+        shown = np.ones((*moved.agent_number.shape, steps), dtype=bool)
         packed = said.packed
-        if packed.pattern_logits is None or not self._player.settings.validity_patterns:
+        if packed.pattern_logits is None or not self._simulator.settings.validity_patterns:
             return shown
-        luck = self._luck(packed.rows, token, Purpose.PATTERN)
-        drawn = choose(packed.pattern_logits, luck)
+        uniforms = self._uniforms(packed.rows, token, Purpose.PATTERN)
+        drawn = choose(packed.pattern_logits, uniforms)
         pattern = packed.rows.spread(drawn).cpu().numpy()
         shown &= (pattern[..., None] >> np.arange(steps) & 1).astype(bool)
         shown[:, EGO_ROW] = True
@@ -314,7 +329,7 @@ class Session:
         return shown
 
 
-def _lay_out(starts: Sequence[Start]) -> Roads:
+def _collate_maps(starts: Sequence[RolloutStart]) -> Roads:
     """Put the maps of rollouts side by side, each once."""
     maps, _ = number_maps(starts)
     histories = [start.history for start in maps]
@@ -325,40 +340,46 @@ def _lay_out(starts: Sequence[Start]) -> Roads:
     )
 
 
-def _be_patient(player: Player, roads: Roads, starts: Sequence[Start]) -> Patience | None:
+def _make_stall_rule(
+    simulator: Simulator, roads: Roads, starts: Sequence[RolloutStart]
+) -> StallRule | None:
     """Remember who stands, if nobody is to stand for ever."""
-    tokens = math.ceil(player.settings.max_stall_s / CLOCK.token_s)
+    tokens = math.ceil(simulator.settings.max_stall_s / CLOCK.token_s)
     if not tokens:
         return None
     maps, scene = number_maps(starts)
-    return Patience([one.scene for one in maps], scene, StopLines.of(roads), tokens)
+    return StallRule([one.scene for one in maps], scene, StopLines.of(roads), tokens)
 
 
-def _keep_full(player: Player, starts: Sequence[Start], now: Population) -> Fullness | None:
+def _make_density_control(
+    simulator: Simulator, starts: Sequence[RolloutStart], now: Population
+) -> DensityControl | None:
     """Remember how full the street is at now, if it is to stay so."""
-    if not (player.inserts and player.settings.density_control):
+    if not (simulator.inserts and simulator.settings.density_control):
         return None
-    return Fullness.of(starts, now, player.grid.radius_m)
+    return DensityControl.of(starts, now, simulator.grid.radius_m)
 
 
-def _begin(
-    player: Player,
+def _start(
+    simulator: Simulator,
     roads: Roads,
-    starts: Sequence[Start],
+    starts: Sequence[RolloutStart],
     streams: Sequence[Stream],
     first: Population,
-) -> tuple[Memory, Asking]:
+) -> tuple[StepMemory, InsertionRequest]:
     """Encode every map once, however many rollouts of it there are."""
     maps, scene = number_maps(starts)
     histories = [start.history for start in maps]
-    memory = player.stepper.begin(roads, player.tensor(scene), first.life.shape[1])
-    settings, room = player.settings, None
+    memory = simulator.stepper.begin(
+        roads, simulator.tensor(scene), first.agent_number.shape[1]
+    )
+    settings, insertion_mask = simulator.settings, None
     if settings.insertion_mask:
-        room = make_room(
+        insertion_mask = make_insertion_mask(
             histories,
-            (player.vocabulary, player.roads),
+            (simulator.vocabulary, simulator.roads),
             scene,
             settings.insertion_lane_distance_m,
         )
     most = np.maximum(settings.max_agents, first.num_agents)
-    return memory, Asking(player, streams, room, most)
+    return memory, InsertionRequest(simulator, streams, insertion_mask, most)

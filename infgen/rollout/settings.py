@@ -126,7 +126,7 @@ class RolloutSettings:
     seconds of the past forgets how dense traffic was. Where a map ends fewer are aimed
     at."""
     insertion_mask: Bool = True
-    """Whether agents are inserted only clear of other boxes, now and half a second later,
+    """Whether agents are inserted only clear of other boxes, now and one token step later,
     and vehicles only near lanes. In the paper they are inserted anywhere."""
     insertion_lane_distance_m: NonNegative = 15.0
     """Largest distance from a lane's centre at which a vehicle is inserted. Most insertions

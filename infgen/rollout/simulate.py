@@ -3,18 +3,18 @@
 from collections.abc import Iterator, Sequence
 
 from infgen.clock import CLOCK
-from infgen.rollout.recording import Frame, Start
+from infgen.rollout.recording import Frame, RolloutStart
 from infgen.rollout.session import Session
-from infgen.rollout.simulator import Player
+from infgen.rollout.simulator import Simulator
 
 
-def simulate(player: Player, starts: Sequence[Start]) -> Iterator[Frame]:
+def simulate(simulator: Simulator, starts: Sequence[RolloutStart]) -> Iterator[Frame]:
     """Play a batch of rollouts, one frame per half second.
 
     Args:
-        player: Network and settings.
+        simulator: Network and settings.
         starts: Scenes to continue; several rollouts of one scene share its map.
     """
-    session = Session(player, starts)
-    for _ in range(CLOCK.tokens_in(player.settings.duration_s)):
+    session = Session(simulator, starts)
+    for _ in range(CLOCK.tokens_in(simulator.settings.duration_s)):
         yield session.step()

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from infgen.model.stepping import Stepper
-from infgen.model.token_step import Column
+from infgen.model.token_step import TokenStep
 from infgen.rollout.population import Population
-from infgen.rollout.random_streams import Purpose, Stream, uniforms
+from infgen.rollout.random_streams import Purpose, Stream, draw_uniforms
 from infgen.rollout.settings import RolloutSettings
 from infgen.tokens.grid import Grid, make_grid
 from infgen.tokens.settings import TokenSettings
@@ -18,13 +18,13 @@ from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 
 @dataclass(frozen=True, slots=True)
-class Player:
+class Simulator:
     """What plays: a network, the words it speaks, and how its choices are sampled.
 
     Attributes:
         stepper: The network, ready to be played.
         vocabulary: Its moves.
-        roads: Its road tokens.
+        roads: Its map tokens.
         tokens: How histories are tokenized for it.
         settings: Length, sampling and caps.
         device: Where the network is.
@@ -39,7 +39,7 @@ class Player:
 
     @property
     def grid(self) -> Grid:
-        """Cells and headings that newcomers are placed in."""
+        """Cells and headings that inserted agents are placed in."""
         return make_grid(self.tokens)
 
     @property
@@ -48,7 +48,7 @@ class Player:
         return self.settings.inserts and self.stepper.insertion_and_removal
 
     @property
-    def plays(self) -> str:
+    def simulates(self) -> str:
         """What these weights and settings play, in words."""
         removes = self.stepper.leaves or self.settings.removal_radius_m > 0
         words = [
@@ -65,7 +65,7 @@ class Player:
         """Bring an array to the network's device."""
         return torch.from_numpy(values).to(self.device)
 
-    def luck(
+    def draw_uniforms(
         self,
         streams: Sequence[Stream],
         token: int,
@@ -74,11 +74,11 @@ class Player:
         turn: int = 0,
     ) -> Tensor:
         """Draw [rollout, count] uniform numbers on the network's device."""
-        return self.tensor(uniforms(streams, token, purpose, count, turn))
+        return self.tensor(draw_uniforms(streams, token, purpose, count, turn))
 
-    def column(self, population: Population) -> Column:
+    def token_step(self, population: Population) -> TokenStep:
         """Show a population to the network."""
-        return Column(
+        return TokenStep(
             kind=self.tensor(population.kind).long(),
             size_lwh_m=self.tensor(population.size_lwh_m),
             pose=self.tensor(population.pose),

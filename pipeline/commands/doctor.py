@@ -34,7 +34,7 @@ class Check:
 
 
 def examine(root: Root) -> Iterator[Check]:
-    """Look at everything a run relies on."""
+    """RootSnapshot at everything a run relies on."""
     yield Check("python", "ok", f"{platform.python_version()} on {platform.platform()}")
     for name in PACKAGES:
         yield _package(name)

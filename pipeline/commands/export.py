@@ -23,7 +23,7 @@ from pipeline.commands.export_job import (
     Unit,
     begin,
     find_units,
-    not_played,
+    not_simulated,
     parts_of,
     tell_export,
 )
@@ -44,7 +44,7 @@ class Form(NamedTuple):
     Attributes:
         name: File of a rollout, by scenario id and index.
         write: Writes the files of some rollouts of a scene below a folder, told what lights
-            showed while they were played.
+            showed while they were simulated.
     """
 
     name: Callable[[str, int], str]
@@ -97,7 +97,7 @@ def _export_folder(order: Order, units: Sequence[Unit], steps: Steps) -> Exporte
         before=before,
         filled={},
         unused=0,
-        not_played=not_played(order.rollouts),
+        not_simulated=not_simulated(order.rollouts),
     )
 
 

@@ -93,7 +93,7 @@ class Exported:
         filled: Agents that no model plays and that keep their velocity, by scene; of a
             submission only.
         unused: Rollouts beyond those that a submission holds.
-        not_played: What the stage of the rollouts could not play, with the reasons.
+        not_simulated: What the stage of the rollouts could not play, with the reasons.
     """
 
     format: str
@@ -105,7 +105,7 @@ class Exported:
     before: int
     filled: Mapping[str, int]
     unused: int
-    not_played: Sequence[str]
+    not_simulated: Sequence[str]
 
     def to_json(self) -> dict[str, Any]:
         """Everything, by name."""
@@ -211,7 +211,7 @@ def parts_of(unit: Unit) -> Iterator[Part]:
         yield Part(name, rollouts)
 
 
-def not_played(rollouts: Path) -> list[str]:
+def not_simulated(rollouts: Path) -> list[str]:
     """Say what the stage of some rollouts could not play."""
     if not (rollouts / MANIFEST).is_file():
         return []

@@ -25,7 +25,7 @@ from pipeline.commands.export_job import (
     Steps,
     Unit,
     begin,
-    not_played,
+    not_simulated,
     parts_of,
 )
 from pipeline.engine import signals
@@ -100,7 +100,7 @@ def export_submission(order: Order, units: Sequence[Unit], steps: Steps) -> Expo
         before=before,
         filled={scene: n for tally in tallies for scene, n in tally["filled"].items()},
         unused=sum(unit.num_rollouts for unit in units) - steps.total * NUM_ROLLOUTS,
-        not_played=not_played(order.rollouts),
+        not_simulated=not_simulated(order.rollouts),
     )
 
 

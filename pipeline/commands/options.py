@@ -38,7 +38,7 @@ StrictCode = Annotated[
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class RequestOptions:
     """What names a request; what is not named is as in the root's last run."""
 
     root: RootFolder = WORK
@@ -88,7 +88,7 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Running:
+class RunFlags:
     """How to run; none of it decides what comes out."""
 
     dry_run: Annotated[
@@ -152,7 +152,7 @@ class Running:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparing:
+class ComparisonOptions:
     """Which methods are trained, played and scored to be compared."""
 
     preset: Annotated[
@@ -187,24 +187,26 @@ class Comparing:
         """Arms that are named."""
         return [name.strip() for name in (self.arms or "").split(",") if name.strip()]
 
-    def comparison(self, asked: Asked, targets: Sequence[str]) -> Comparison:
+    def comparison(
+        self, request_options: RequestOptions, targets: Sequence[str]
+    ) -> Comparison:
         """Find the preset, and lay over it what else is asked.
 
         Raises:
             ConfigError: for a preset that does not exist.
         """
-        root, name = find_root(asked.root), self.preset or ""
+        root, name = find_root(request_options.root), self.preset or ""
         before = read_request(root, f"{PRESET}.{name}")
-        path = find_file(asked.file, before)
+        path = find_file(request_options.file, before)
         file = load_stages(path, os.environ)
-        records = [absolute(pattern) for pattern in asked.named_records]
+        records = [absolute(pattern) for pattern in request_options.named_records]
         return Comparison(
             root=root,
             path=path,
             file=file,
             preset=file.preset(name),
-            profile=asked.profile,
-            overrides=tuple(asked.set or ()),
+            profile=request_options.profile,
+            overrides=tuple(request_options.set or ()),
             records=tuple(records or before.get("records", ())),
             targets=tuple(targets) or (REPORT,),
         )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.commands.doctor import Check
 from pipeline.commands.screen import LiveTable, console, gibibytes, show_table
-from pipeline.commands.watch import Look, Row
+from pipeline.commands.watch import RootSnapshot, Row
 from pipeline.comparison.runs import PAGE, SHOWN
 from pipeline.engine.garbage import Garbage
 from pipeline.engine.layout import KEY_DIGITS, Root, read_json
@@ -19,8 +19,8 @@ from pipeline.engine.status import StageStatus
 if TYPE_CHECKING:
     from pipeline.commands.export_job import Exported
     from pipeline.commands.wosac import Official
-    from pipeline.comparison.dry_run import Outlook
-    from pipeline.comparison.execution import Ran
+    from pipeline.comparison.dry_run import DryRun
+    from pipeline.comparison.execution import ExecutedRun
     from pipeline.settings.described import Section
     from pipeline.storage.towns import Written
 
@@ -31,7 +31,7 @@ _AT_ONCE = ("claims", "against-the-logs")
 """Tables of a comparison that are printed; all are in its folder."""
 
 
-def show_standings(found: Sequence[StageStatus]) -> None:
+def show_statuses(found: Sequence[StageStatus]) -> None:
     """Print how stages stand."""
     rows = [
         (each.stage, each.state, each.progress, each.key[:KEY_DIGITS], each.why)
@@ -46,7 +46,7 @@ _WATCHED = (
 )
 
 
-def show_look(table: LiveTable, look: Look) -> None:
+def show_snapshot(table: LiveTable, look: RootSnapshot) -> None:
     """Show how stages stand at one moment, in place or in lines."""
     runs = dict.fromkeys(row.run for row in look.rows if row.run)
     words = "\n".join([*runs, look.trouble]).strip()
@@ -124,17 +124,17 @@ def show_results(root: Root, results: Sequence[StageResult], log: Path) -> None:
     _show_scores(root, results)
 
 
-def show_outlook(found: "Sequence[Outlook]") -> None:
+def show_dry_run(found: "Sequence[DryRun]") -> None:
     """Print what the runs of a preset would make."""
     rows = [(each.run, ", ".join(each.makes) or "nothing", each.note) for each in found]
     show_table(f"{len(found)} runs", ("run", "to make", "note"), rows)
 
 
-def show_runs(ran: "Sequence[Ran]", shown: Path | None, log: Path) -> None:
+def show_runs(ran: "Sequence[ExecutedRun]", shown: Path | None, log: Path) -> None:
     """Print what became of the runs of a preset, and what they add up to."""
     rows = [
         (
-            each.leg.words,
+            each.arm_run.words,
             each.state,
             sum(result.made for result in each.results),
             each.seconds,
@@ -142,7 +142,7 @@ def show_runs(ran: "Sequence[Ran]", shown: Path | None, log: Path) -> None:
         for each in ran
     ]
     show_table("runs", ("run", "state", "units made now", "seconds"), rows)
-    missing = [f"{each.leg.words}: {each.why}" for each in ran if not each.is_whole]
+    missing = [f"{each.arm_run.words}: {each.why}" for each in ran if not each.is_whole]
     for line in missing:
         _warn(line)
     if missing:
@@ -217,7 +217,7 @@ def show_exported(found: "Exported") -> None:
         agents = f"{sum(found.filled.values())} in {len(found.filled)} scenes"
         rows.append(("agents that no model plays and that keep their velocity", agents))
     show_table(f"export to {found.format}", ("what", "value"), rows)
-    for line in found.not_played:
+    for line in found.not_simulated:
         _warn(f"not played, so not in it: {line}")
 
 

@@ -26,7 +26,7 @@ app = typer.Typer()
 
 
 @dataclass(frozen=True, slots=True)
-class Scoring:
+class WosacOptions:
     """What is scored by the official metric, and how."""
 
     records: Annotated[
@@ -52,7 +52,7 @@ class Scoring:
 
 
 @dataclass(frozen=True, slots=True)
-class Building:
+class TownsOptions:
     """Which towns are built, and where to."""
 
     out: Annotated[Path, typer.Option(help="Folder to write to.")]
@@ -73,7 +73,7 @@ class Building:
 
 
 @dataclass(frozen=True, slots=True)
-class Exporting:
+class ExportOptions:
     """What is exported, in whose format and to where."""
 
     to: Annotated[
@@ -115,7 +115,7 @@ class Exporting:
 
 
 @dataclass(frozen=True, slots=True)
-class Viewing:
+class ViewOptions:
     """What is watched, and what is written of it."""
 
     source: Annotated[
@@ -191,8 +191,8 @@ def _size(word: str) -> tuple[int, int]:
 
 
 @app.command()
-@gathers(building=Building)
-def towns(json_: Json = False, *, building: Building) -> None:
+@gathers(building=TownsOptions)
+def towns(json_: Json = False, *, building: TownsOptions) -> None:
     """Write synthetic driving logs as WOMD records (needs SUMO: the extra towns).
 
     Example: infgen towns --out towns --scenes 200 --seconds 31.1 --split validation
@@ -208,8 +208,8 @@ def towns(json_: Json = False, *, building: Building) -> None:
 
 
 @app.command()
-@gathers(scoring=Scoring)
-def wosac(json_: Json = False, *, scoring: Scoring) -> None:
+@gathers(scoring=WosacOptions)
+def wosac(json_: Json = False, *, scoring: WosacOptions) -> None:
     """Score rollouts by the metric of the Waymo Open Sim Agents Challenge.
 
     Example: infgen wosac 'validation.tfrecord-*' submission.tar.gz --per-scene
@@ -225,8 +225,8 @@ def wosac(json_: Json = False, *, scoring: Scoring) -> None:
 
 
 @app.command()
-@gathers(exporting=Exporting)
-def export(json_: Json = False, *, exporting: Exporting) -> None:
+@gathers(exporting=ExportOptions)
+def export(json_: Json = False, *, exporting: ExportOptions) -> None:
     """Write rollouts in the format of others.
 
     Example: infgen export --to wosac --about about.yaml --out submission.tar.gz --root R
@@ -245,8 +245,8 @@ def export(json_: Json = False, *, exporting: Exporting) -> None:
 
 
 @app.command()
-@gathers(viewing=Viewing)
-def view(json_: Json = False, *, viewing: Viewing) -> None:
+@gathers(viewing=ViewOptions)
+def view(json_: Json = False, *, viewing: ViewOptions) -> None:
     """Write a page that plays a scene: its rollouts and its log, side by side.
 
     Example: infgen view R --scene 637f20 --rollouts 0,1,2

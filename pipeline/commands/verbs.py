@@ -15,13 +15,13 @@ import typer
 
 from infgen.errors import ConfigError
 from pipeline.commands import tables
-from pipeline.commands.options import Asked, Comparing, Running
+from pipeline.commands.options import ComparisonOptions, RequestOptions, RunFlags
 from pipeline.commands.screen import LiveTable, Screen
-from pipeline.commands.watch import Look, Watcher
-from pipeline.comparison.dry_run import Outlook, look_ahead
-from pipeline.comparison.execution import Ran, run_legs
+from pipeline.commands.watch import RootSnapshot, Watcher
+from pipeline.comparison.dry_run import DryRun, plan_dry_run
+from pipeline.comparison.execution import ExecutedRun, execute_arm_runs
 from pipeline.comparison.records import find_records
-from pipeline.comparison.runs import REPORT, Comparison, legs_of
+from pipeline.comparison.runs import REPORT, Comparison, arm_runs_of
 from pipeline.engine import signals
 from pipeline.engine.atomic import StoreError
 from pipeline.engine.events import Events
@@ -41,7 +41,7 @@ MOST_NAMED = 3
 
 
 def run_stages(
-    request: Request, targets: Sequence[str], running: Running, *, as_json: bool
+    request: Request, targets: Sequence[str], running: RunFlags, *, as_json: bool
 ) -> None:
     """Run, show what became of it, and leave with the exit code that says so."""
     plan = request.plan(targets, os.environ)
@@ -49,7 +49,7 @@ def run_stages(
     if running.dry_run:
         found = stage_statuses(plan, request.made(), strict_code=running.strict_code)
         again = plan.after(run_options.force)
-        tell_standings([_asked_again(each, again) for each in found], as_json=as_json)
+        print_statuses([_asked_again(each, again) for each in found], as_json=as_json)
         return
     with request.remembered(plan), signals.handling_signals(), Screen() as screen:
         events = Events(request.root, (screen,))
@@ -65,34 +65,38 @@ def run_stages(
 
 
 def compare_arms(
-    asked: Asked,
-    comparing: Comparing,
+    request_options: RequestOptions,
+    comparing: ComparisonOptions,
     targets: Sequence[str],
-    running: Running,
+    running: RunFlags,
     *,
     as_json: bool,
 ) -> None:
     """Run every arm of a preset, set them side by side, and leave with an exit code."""
-    comparison = comparing.comparison(asked, targets)
+    comparison = comparing.comparison(request_options, targets)
     preset = comparison.preset
     arms = preset.chosen(comparing.arm_names)
-    legs = legs_of(comparison, arms, comparing.seeds or preset.seeds)
-    for leg in legs:
-        comparison.sketch(leg)  # What is wrong with the settings is told before all else.
+    arm_runs = arm_runs_of(comparison, arms, comparing.seeds or preset.seeds)
+    for arm_run in arm_runs:
+        comparison.sketch(
+            arm_run
+        )  # What is wrong with the settings is told before all else.
     if running.dry_run:
-        _tell_outlook(look_ahead(comparison, legs), as_json=as_json)
+        _print_dry_run(plan_dry_run(comparison, arm_runs), as_json=as_json)
         return
     with signals.handling_signals(), Screen() as screen:
         events = Events(comparison.root, (screen,))
         ready = find_records(comparison, screen)
         comparison.remember({})
-        ran = run_legs(ready, legs, _orders(running, comparison, targets), events)
+        ran = execute_arm_runs(
+            ready, arm_runs, _orders(running, comparison, targets), events
+        )
         shown = None
         if REPORT in comparison.targets:
             from pipeline.comparison.write import write_comparison  # noqa: PLC0415
 
             shown = write_comparison(comparison, ran, again=running.force)
-    _tell_runs(ran, shown, events, as_json=as_json)
+    _print_runs(ran, shown, events, as_json=as_json)
     if not all(each.is_whole for each in ran):
         raise typer.Exit(FAILED)
     results = {result.key: result for each in ran for result in each.results}
@@ -100,7 +104,7 @@ def compare_arms(
 
 
 def _orders(
-    running: Running, comparison: Comparison, targets: Sequence[str]
+    running: RunFlags, comparison: Comparison, targets: Sequence[str]
 ) -> Callable[[Plan], RunOptions]:
     def order(plan: Plan) -> RunOptions:
         # What some runs do not come by is no mistake, if others do.
@@ -111,15 +115,15 @@ def _orders(
     return order
 
 
-def _tell_outlook(found: Sequence[Outlook], *, as_json: bool) -> None:
+def _print_dry_run(found: Sequence[DryRun], *, as_json: bool) -> None:
     if as_json:
         print_json({"runs": [asdict(each) for each in found]})
     else:
-        tables.show_outlook(found)
+        tables.show_dry_run(found)
 
 
-def _tell_runs(
-    ran: Sequence[Ran], shown: Path | None, events: Events, *, as_json: bool
+def _print_runs(
+    ran: Sequence[ExecutedRun], shown: Path | None, events: Events, *, as_json: bool
 ) -> None:
     if as_json:
         runs = [{**each.to_json(), "state": each.state} for each in ran]
@@ -134,30 +138,32 @@ def _asked_again(standing: StageStatus, again: Container[str]) -> StageStatus:
     return replace(standing, state="stale", why="made again, as it is asked to be", made=0)
 
 
-def tell_standings(found: Sequence[StageStatus], *, as_json: bool) -> None:
+def print_statuses(found: Sequence[StageStatus], *, as_json: bool) -> None:
     """Print how stages stand."""
     if as_json:
         print_json({"stages": [asdict(standing) for standing in found]})
     else:
-        tables.show_standings(found)
+        tables.show_statuses(found)
 
 
-def find_standings(request: Request, *, strict_code: bool) -> list[StageStatus]:
+def find_statuses(request: Request, *, strict_code: bool) -> list[StageStatus]:
     """Find how all stages stand."""
     plan = request.plan([], os.environ)
     return stage_statuses(plan, request.made(), strict_code=strict_code)
 
 
-def watch_stages(asked: Asked, every_s: float, *, as_json: bool, check: bool) -> None:
+def watch_stages(
+    request_options: RequestOptions, every_s: float, *, as_json: bool, check: bool
+) -> None:
     """Show how stages stand, again and again: until a signal comes, or nothing runs.
 
     Args:
-        asked: What is watched.
+        request_options: What is watched.
         every_s: Seconds between two looks.
         as_json: One line of JSON per look.
         check: End when nothing runs (any more), with the code that says if any is stale.
     """
-    watcher = Watcher(asked.request, os.environ)
+    watcher = Watcher(request_options.request, os.environ)
     show, shown = _lookers(as_json=as_json)
     with signals.handling_signals(), shown:
         idle = 0  # Looks in a row. Between two stages, too, nothing runs for a moment.
@@ -174,12 +180,12 @@ def watch_stages(asked: Asked, every_s: float, *, as_json: bool, check: bool) ->
 
 def _lookers(
     *, as_json: bool
-) -> tuple[Callable[[Look], None], AbstractContextManager[object]]:
+) -> tuple[Callable[[RootSnapshot], None], AbstractContextManager[object]]:
     """Who shows a look, and what is to be left when there is no more to show."""
     if as_json:
         return lambda look: typer.echo(json.dumps(asdict(look))), nullcontext()
     table = LiveTable()
-    return partial(tables.show_look, table), table
+    return partial(tables.show_snapshot, table), table
 
 
 def _check_quarantine(root: Root, results: Sequence[StageResult], max_bad: float) -> None:

@@ -26,7 +26,7 @@ from pipeline.storage.scenes import file_name
 from pipeline.storage.source_files import BUILTIN, RECORDS_IN_FOLDER
 
 if TYPE_CHECKING:
-    from infgen.views.scene.view_model import Film
+    from infgen.views.scene.view_model import ViewModel
     from infgen.views.video.layout import Format
 
 FPS, GIF_FPS = 25, 10
@@ -123,37 +123,37 @@ def view(wanted: Wanted, tell: Callable[[Event], None] = lambda _: None) -> Show
         MissingExtraError: if a package that paints or encodes is not installed.
     """
     form = wanted.form  # Wrong words are told before any work.
-    film = find_film(wanted)
+    view_model = find_view_model(wanted)
     page, files = wanted.page, []
     if page is None and not (wanted.video or wanted.strip):
-        page = Path(f"{file_name(film.scenario_id)}.html")
+        page = Path(f"{file_name(view_model.scenario_id)}.html")
     if page is not None:
-        files.append(write_page(film, page))
+        files.append(write_page(view_model, page))
     if wanted.strip is not None:
-        files.append(write_strip(film, wanted.strip, wanted.theme, wanted.every_s))
+        files.append(write_strip(view_model, wanted.strip, wanted.theme, wanted.every_s))
     if wanted.video is not None:
-        files.append(write_video(film, wanted.video, form, tell))
+        files.append(write_video(view_model, wanted.video, form, tell))
     return Shown(
-        scene=film.scenario_id,
-        showings=[showing.name for showing in film.showings],
+        scene=view_model.scenario_id,
+        showings=[showing.name for showing in view_model.showings],
         files=[(str(path), path.stat().st_size) for path in files],
     )
 
 
-def find_film(wanted: Wanted) -> "Film":
+def find_view_model(wanted: Wanted) -> "ViewModel":
     """Gather what is wanted of a scene.
 
     Raises:
         ConfigError: if there is no such scene or rollout.
     """
-    from infgen.views.scene.view_model import make_film  # noqa: PLC0415
+    from infgen.views.scene.view_model import make_view_model  # noqa: PLC0415
     from pipeline.commands.view_scenes import find_in_records, find_in_root  # noqa: PLC0415
 
     if wanted.records:
-        return make_film(find_in_records(wanted.records, wanted.scene), ())
+        return make_view_model(find_in_records(wanted.records, wanted.scene), ())
     scene, rollouts = find_in_root(wanted.root, wanted.scene, wanted.rollouts)
     # Without rollouts there is only the log to see.
-    return make_film(scene, rollouts, log=wanted.log or not rollouts)
+    return make_view_model(scene, rollouts, log=wanted.log or not rollouts)
 
 
 def is_root(folder: Path) -> bool:
@@ -176,10 +176,10 @@ def check_records(word: str) -> None:
         )
 
 
-def write_page(film: "Film", path: Path) -> Path:
+def write_page(view_model: "ViewModel", path: Path) -> Path:
     """Write the page that plays a film."""
     from infgen.views.player import player_page  # noqa: PLC0415
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, player_page(film).encode())
+    write_file(path, player_page(view_model).encode())
     return path

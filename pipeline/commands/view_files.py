@@ -22,7 +22,7 @@ from pipeline.engine.atomic import write_file
 from pipeline.engine.events import Event
 
 if TYPE_CHECKING:
-    from infgen.views.scene.view_model import Film
+    from infgen.views.scene.view_model import ViewModel
     from infgen.views.video.layout import Format
 
 Tell = Callable[[Event], None]
@@ -53,12 +53,16 @@ def check_ending(path: Path, endings: Sequence[str]) -> None:
 
 
 def write_strip(
-    film: "Film", path: Path, theme: str, every_s: float, times_s: Sequence[float] = ()
+    view_model: "ViewModel",
+    path: Path,
+    theme: str,
+    every_s: float,
+    times_s: Sequence[float] = (),
 ) -> Path:
     """Write a strip as SVG or PNG.
 
     Args:
-        film: What is shown.
+        view_model: What is shown.
         path: The file.
         theme: ``light`` or ``dark``.
         every_s: Seconds from picture to picture.
@@ -79,20 +83,20 @@ def write_strip(
     )
 
     check_ending(path, STRIPS)
-    times = times_s or strip_times(film, every_s)
+    times = times_s or strip_times(view_model, every_s)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".svg":
-        strip = make_strip(film, times, THEMES[theme])
+        strip = make_strip(view_model, times, THEMES[theme])
         write_file(path, strip_svg(strip, THEMES[theme]).encode())
         return path
-    strip = make_strip(film, times, THEMES[theme], STRIP_SCALE)
+    strip = make_strip(view_model, times, THEMES[theme], STRIP_SCALE)
     with _whole(path) as partial_path:
         write_png(partial_path, strip_picture(strip, THEMES[theme]))
     return path
 
 
 def write_video(
-    film: "Film",
+    view_model: "ViewModel",
     path: Path,
     form: "Format",
     tell: Tell = lambda _: None,
@@ -101,7 +105,7 @@ def write_video(
     """Write a video from now to the end of the longest showing.
 
     Args:
-        film: What is shown.
+        view_model: What is shown.
         path: An MP4 or a GIF.
         form: Size, speed and colours.
         tell: Hears how far it is.
@@ -118,15 +122,15 @@ def write_video(
     gif = path.suffix.lower() == ".gif"
     _check_packages("PIL", "aggdraw", *(() if gif else ("av",)))
     path.parent.mkdir(parents=True, exist_ok=True)
-    frames = num_frames(film, form)
+    frames = num_frames(view_model, form)
     with tempfile.TemporaryDirectory(prefix="infgen-video-") as folder:
         pieces = [
             _Piece(first, min(PIECE_FRAMES, frames - first), Path(folder) / f"{first:06d}")
             for first in range(0, frames, PIECE_FRAMES)
         ]
-        palette = _palette(film, form) if gif else None
+        palette = _palette(view_model, form) if gif else None
         _make_pieces(
-            partial(_make_piece, film, form, palette), pieces, frames, tell, workers
+            partial(_make_piece, view_model, form, palette), pieces, frames, tell, workers
         )
         with _whole(path) as partial_path:
             if gif:
@@ -145,12 +149,14 @@ def _check_packages(*names: str) -> None:
         wanted(name)
 
 
-def _make_piece(film: "Film", form: "Format", palette: Any, piece: _Piece) -> int:
+def _make_piece(
+    view_model: "ViewModel", form: "Format", palette: Any, piece: _Piece
+) -> int:
     """Paint and encode some frames; returns how many."""
     from infgen.views.video.encoding import encode_piece, to_palette  # noqa: PLC0415
     from infgen.views.video.frames import paint_frames  # noqa: PLC0415
 
-    frames = paint_frames(film, form, piece.first, piece.length)
+    frames = paint_frames(view_model, form, piece.first, piece.length)
     if palette is None:
         encode_piece(piece.path, frames, form.fps)
     else:
@@ -205,14 +211,14 @@ def _ignore_signals() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _palette(film: "Film", form: "Format") -> Any:
+def _palette(view_model: "ViewModel", form: "Format") -> Any:
     """Choose a GIF's colours by a few frames of the whole length."""
     from infgen.views.video.encoding import gif_palette  # noqa: PLC0415
     from infgen.views.video.frames import num_frames, paint_frames  # noqa: PLC0415
 
-    last = max(0, num_frames(film, form) - 1)
+    last = max(0, num_frames(view_model, form) - 1)
     places = sorted({last * at // (PALETTE_SAMPLES - 1) for at in range(PALETTE_SAMPLES)})
-    samples = [next(paint_frames(film, form, at, 1)) for at in places]
+    samples = [next(paint_frames(view_model, form, at, 1)) for at in places]
     return gif_palette(samples, list(asdict(form.colours).values()))
 
 

@@ -63,7 +63,7 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class RootSnapshot:
     """All stages at one moment.
 
     Attributes:
@@ -101,7 +101,7 @@ class Watcher:
         self._runs: dict[Path, RunLog] = {}
         self._set_aside: dict[Path, int | None] = {}
 
-    def look(self) -> Look:
+    def look(self) -> RootSnapshot:
         """See how all stages stand.
 
         Raises:
@@ -119,7 +119,7 @@ class Watcher:
             trouble = str(error)
         if not self._rows and not trouble:
             trouble = NOTHING_YET
-        return Look(self._clock(), self._rows or (), trouble)
+        return RootSnapshot(self._clock(), self._rows or (), trouble)
 
     def _see(self, request: Request) -> tuple[Row, ...]:
         named = request.records or request.profile

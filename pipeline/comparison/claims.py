@@ -2,7 +2,7 @@
 
 from infgen.views.published import PAPER, Published
 from infgen.views.sheets import Measured, Sheet, SheetCell
-from pipeline.comparison.result import LONG, MOTION_ONLY, OFFICIAL_PLAY, Compared
+from pipeline.comparison.result import LONG, MOTION_ONLY, OFFICIAL_PLAY, ComparisonResult
 from pipeline.settings.presets import Arm
 from pipeline.stages.report.tables import COMPOSITES
 
@@ -10,7 +10,7 @@ PROTOCOLS = ("paper", "corrected")
 _COMPOSITE, _WITHOUT_PLACEMENT = COMPOSITES
 
 
-def claims(found: Compared) -> Sheet:
+def claims(found: ComparisonResult) -> Sheet:
     """What the paper claims, as ratios of its method to each other one."""
     subject = found.subject
     others = [arm for arm in found.methods if arm is not subject]
@@ -35,7 +35,7 @@ def claims(found: Compared) -> Sheet:
     )
 
 
-def _claimed(found: Compared) -> list[tuple[str, str, str]]:
+def _claimed(found: ComparisonResult) -> list[tuple[str, str, str]]:
     """Rows of the claims: what it is, kind of play, and name of the number."""
     ace = f"{found.preset.count_error}_near"
     rows = [

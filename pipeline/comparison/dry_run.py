@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from pipeline.comparison.records import waits_for_towns, with_towns
-from pipeline.comparison.runs import TRAIN, Comparison, Leg
+from pipeline.comparison.runs import TRAIN, ArmRun, Comparison
 from pipeline.engine.plan import Plan
 
 
 @dataclass(frozen=True, slots=True)
-class Outlook:
+class DryRun:
     """What one run would make.
 
     Attributes:
@@ -23,7 +23,7 @@ class Outlook:
     note: str
 
 
-def look_ahead(comparison: Comparison, legs: Sequence[Leg]) -> list[Outlook]:
+def plan_dry_run(comparison: Comparison, arm_runs: Sequence[ArmRun]) -> list[DryRun]:
     """Tell what each run would make.
 
     Raises:
@@ -31,12 +31,12 @@ def look_ahead(comparison: Comparison, legs: Sequence[Leg]) -> list[Outlook]:
     """
     files = waits_for_towns(comparison)
     note = f"after {files} files of towns are written" if files else ""
-    ahead = _Ahead(comparison if files else with_towns(comparison), bool(files))
-    return [ahead.look(leg, note) for leg in legs]
+    ahead = _DryRunner(comparison if files else with_towns(comparison), bool(files))
+    return [ahead.look(arm_run, note) for arm_run in arm_runs]
 
 
 @dataclass(frozen=True, slots=True)
-class _Ahead:
+class _DryRunner:
     """What runs would have made before others.
 
     Attributes:
@@ -51,14 +51,16 @@ class _Ahead:
     done: set[tuple[str, str]] = field(default_factory=set)
     weights: dict[tuple[str, int], str] = field(default_factory=dict)
 
-    def look(self, leg: Leg, note: str) -> Outlook:
+    def look(self, arm_run: ArmRun, note: str) -> DryRun:
         """Tell what one run would make; it counts as made for those after it."""
-        start = self.weights.get((leg.arm.starts_from or "", leg.seed))
-        plan = self._plan(leg, start)
+        start = self.weights.get((arm_run.arm.starts_from or "", arm_run.seed))
+        plan = self._plan(arm_run, start)
         keys = {name: planned.key for name, planned in plan.stages.items()}
-        waits = leg.arm.starts_from is not None and start is None and TRAIN in keys
+        waits = arm_run.arm.starts_from is not None and start is None and TRAIN in keys
         if waits:  # Its keys follow from weights that are not there; these stand for them.
-            keys |= {name: f"{leg.arm.name} {keys[name]}" for name in plan.after([TRAIN])}
+            keys |= {
+                name: f"{arm_run.arm.name} {keys[name]}" for name in plan.after([TRAIN])
+            }
         root = self.comparison.root
         makes = tuple(
             name
@@ -66,10 +68,12 @@ class _Ahead:
             if (name, key) not in self.done and not root.is_finished(name, key)
         )
         if TRAIN in keys and root.is_finished(TRAIN, keys[TRAIN]):
-            self.weights[leg.arm.name, leg.seed] = keys[TRAIN]
+            self.weights[arm_run.arm.name, arm_run.seed] = keys[TRAIN]
         self.done.update(keys.items())
-        return Outlook(leg.words, makes, f"after {leg.arm.starts_from}" if waits else note)
+        return DryRun(
+            arm_run.words, makes, f"after {arm_run.arm.starts_from}" if waits else note
+        )
 
-    def _plan(self, leg: Leg, start: str | None) -> Plan:
+    def _plan(self, arm_run: ArmRun, start: str | None) -> Plan:
         sketched, comparison = self.sketched, self.comparison
-        return comparison.sketch(leg) if sketched else comparison.plan(leg, start)
+        return comparison.sketch(arm_run) if sketched else comparison.plan(arm_run, start)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from pipeline.comparison.runs import TRAIN, Comparison, Leg
+from pipeline.comparison.runs import TRAIN, ArmRun, Comparison
 from pipeline.engine.atomic import StoreError
 from pipeline.engine.events import Events
 from pipeline.engine.plan import Plan
@@ -17,18 +17,18 @@ State = Literal["cached", "made", "failed", "skipped"]
 
 
 @dataclass(frozen=True, slots=True)
-class Ran:
+class ExecutedRun:
     """What became of one run.
 
     Attributes:
-        leg: Which.
+        arm_run: Which.
         state: ``made`` if anything was, ``skipped`` if it could not be begun.
         why: What failed, or what it waits for.
         plan: Its stages; None if it could not be planned.
         results: What became of them.
     """
 
-    leg: Leg
+    arm_run: ArmRun
     state: State
     why: str = ""
     plan: Plan | None = None
@@ -52,25 +52,25 @@ class Ran:
     def to_json(self) -> dict[str, Any]:
         """Which it is, its keys, and what is wrong: the same whenever it was made."""
         return {
-            "arm": self.leg.arm.name,
-            "seed": self.leg.seed,
-            "play": self.leg.play,
+            "arm": self.arm_run.arm.name,
+            "seed": self.arm_run.seed,
+            "play": self.arm_run.play,
             "keys": self.keys,
             "missing": self.why if not self.is_whole else "",
         }
 
 
-def run_legs(
+def execute_arm_runs(
     comparison: Comparison,
-    legs: Sequence[Leg],
+    arm_runs: Sequence[ArmRun],
     run_options: Callable[[Plan], RunOptions],
     events: Events,
-) -> list[Ran]:
+) -> list[ExecutedRun]:
     """Make all runs that can be made.
 
     Args:
         comparison: How they are planned.
-        legs: The runs, each after those whose weights it goes on from.
+        arm_runs: The runs, each after those whose weights it goes on from.
         run_options: How each is run.
         events: Told of everything.
 
@@ -78,15 +78,20 @@ def run_legs(
         ConfigError: for settings that cannot be, of any of them, before the first.
         LockedError: if another run makes one of their stages.
     """
-    for leg in legs:  # Days may lie before the last of them.
-        comparison.plan(leg, None)
+    for arm_run in arm_runs:  # Days may lie before the last of them.
+        comparison.plan(arm_run, None)
     runs = _Runs(comparison, run_options, events)
-    ran: list[Ran] = []
-    for leg in legs:
-        events.emit("leg-started", leg=leg.words, number=len(ran) + 1, legs=len(legs))
-        ran.append(runs.run(leg))
+    ran: list[ExecutedRun] = []
+    for arm_run in arm_runs:
+        events.emit(
+            "leg-started",
+            arm_run=arm_run.words,
+            number=len(ran) + 1,
+            arm_runs=len(arm_runs),
+        )
+        ran.append(runs.run(arm_run))
         if ran[-1].why:
-            events.emit("leg-failed", leg=leg.words, why=ran[-1].why)
+            events.emit("leg-failed", arm_run=arm_run.words, why=ran[-1].why)
     return ran
 
 
@@ -107,22 +112,26 @@ class _Runs:
     failed: dict[tuple[str, str], str] = field(default_factory=dict)
     remade: set[tuple[str, str]] = field(default_factory=set)
 
-    def run(self, leg: Leg) -> Ran:
+    def run(self, arm_run: ArmRun) -> ExecutedRun:
         start = None
-        if leg.arm.starts_from is not None and TRAIN in self.comparison.stages:
-            start = self.weights.get((leg.arm.starts_from, leg.seed))
+        if arm_run.arm.starts_from is not None and TRAIN in self.comparison.stages:
+            start = self.weights.get((arm_run.arm.starts_from, arm_run.seed))
             if start is None:
-                return Ran(leg, "skipped", f"there are no weights of {leg.arm.starts_from}")
-        plan = self.comparison.plan(leg, start)
+                return ExecutedRun(
+                    arm_run, "skipped", f"there are no weights of {arm_run.arm.starts_from}"
+                )
+        plan = self.comparison.plan(arm_run, start)
         for stage, planned in plan.stages.items():
             if (stage, planned.key) in self.failed:
-                return Ran(leg, "skipped", self.failed[stage, planned.key], plan)
+                return ExecutedRun(
+                    arm_run, "skipped", self.failed[stage, planned.key], plan
+                )
         try:
-            with self.comparison.request(leg, start).remembered(plan, leg.name):
+            with self.comparison.request(arm_run, start).remembered(plan, arm_run.name):
                 results = run(plan, self._orders(plan), self.events)
         except StoreError as error:
-            return Ran(leg, "failed", str(error), plan)
-        return self._note(leg, plan, results)
+            return ExecutedRun(arm_run, "failed", str(error), plan)
+        return self._note(arm_run, plan, results)
 
     def _orders(self, plan: Plan) -> RunOptions:
         """Make nothing again that was made again in this call."""
@@ -131,7 +140,9 @@ class _Runs:
         left = {name for name in again if (name, plan[name].key) not in self.remade}
         return replace(run_options, force=frozenset(left))
 
-    def _note(self, leg: Leg, plan: Plan, results: Sequence[StageResult]) -> Ran:
+    def _note(
+        self, arm_run: ArmRun, plan: Plan, results: Sequence[StageResult]
+    ) -> ExecutedRun:
         why = ""
         for result in results:
             key = (result.stage, result.key)
@@ -142,7 +153,7 @@ class _Runs:
             if result.state == "made":
                 self.remade.add(key)
             if result.stage == TRAIN and result.state in ("cached", "made"):
-                self.weights[leg.arm.name, leg.seed] = result.key
+                self.weights[arm_run.arm.name, arm_run.seed] = result.key
         made = any(result.state == "made" for result in results)
         state: State = "failed" if why else "made" if made else "cached"
-        return Ran(leg, state, why, plan, tuple(results))
+        return ExecutedRun(arm_run, state, why, plan, tuple(results))

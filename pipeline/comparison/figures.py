@@ -8,7 +8,7 @@ from infgen.views.charts.comparison import comparison_chart
 from infgen.views.charts.figures import Series
 from infgen.views.sheets import Sheet
 from pipeline.comparison.claims import PROTOCOLS
-from pipeline.comparison.result import LONG, Compared
+from pipeline.comparison.result import LONG, ComparisonResult
 from pipeline.comparison.scores import Scored, middle_s
 from pipeline.comparison.statistics import mean_curve
 from pipeline.stages.report.tables import BUCKETS
@@ -22,7 +22,7 @@ _TRAFFIC = (
 )
 
 
-def figures(found: Compared) -> list[str]:
+def figures(found: ComparisonResult) -> list[str]:
     """Draw the count errors, the traffic, and each bucket's score, window by window."""
     ace = f"ace/{found.preset.count_error}_near"
     drawn = [_chart(found, ace, "Agent count error (ACE)", "agents", logs=False)]
@@ -38,7 +38,7 @@ def figures(found: Compared) -> list[str]:
     return [drawing for drawing in drawn if drawing]
 
 
-def curve_sheet(found: Compared) -> Sheet:
+def curve_sheet(found: ComparisonResult) -> Sheet:
     """All that the figures show, as numbers: a row per method, metric and window."""
     names = [f"ace/{found.preset.count_error}_near", *[name for name, *_ in _TRAFFIC]]
     names += [f"{each}/{name}" for each in PROTOCOLS for name in ("composite", *BUCKETS)]
@@ -54,7 +54,7 @@ def curve_sheet(found: Compared) -> Sheet:
 
 
 def _chart(
-    found: Compared,
+    found: ComparisonResult,
     name: str,
     title: str,
     unit: str,
@@ -75,7 +75,7 @@ def _chart(
     )
 
 
-def _lines(found: Compared, name: str) -> list[Series]:
+def _lines(found: ComparisonResult, name: str) -> list[Series]:
     """One line per arm and long play: the mean over its seeds."""
     lines = []
     for arm in found.arms:
@@ -89,7 +89,7 @@ def _lines(found: Compared, name: str) -> list[Series]:
     return lines
 
 
-def _logged(found: Compared, name: str) -> Series | None:
+def _logged(found: ComparisonResult, name: str) -> Series | None:
     """The same of the logs that were continued; None without any."""
     curve = found.logs.curves().get(name)
     if curve is None or np.isnan(curve.value).all():

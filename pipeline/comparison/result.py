@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Any
 
 from infgen.views.sheets import Measured
-from pipeline.comparison.execution import Ran
+from pipeline.comparison.execution import ExecutedRun
 from pipeline.comparison.scores import Scored, read_logs, read_scored
 from pipeline.comparison.statistics import Numbers, combine, ratio
 from pipeline.settings.presets import Arm, Preset
@@ -19,18 +19,18 @@ SUBJECT = "InfGen"
 
 
 @dataclass(frozen=True)
-class Compared:
+class ComparisonResult:
     """What the runs of a preset have scored.
 
     Attributes:
         preset: The comparison.
         ran: All its runs.
         scored: Those that are whole, and played something.
-        logs: Scores of the logs whose scenes were played.
+        logs: Scores of the logs whose scenes were simulated.
     """
 
     preset: Preset
-    ran: Sequence[Ran]
+    ran: Sequence[ExecutedRun]
     scored: Sequence[Scored]
     logs: Tally
 
@@ -42,7 +42,7 @@ class Compared:
     @property
     def missing(self) -> list[str]:
         """Runs that there are no numbers of, each with the reason."""
-        return [f"{ran.leg.words}: {ran.why}" for ran in self.ran if not ran.is_whole]
+        return [f"{ran.arm_run.words}: {ran.why}" for ran in self.ran if not ran.is_whole]
 
     @property
     def seeds(self) -> list[int]:
@@ -67,7 +67,7 @@ class Compared:
         return [arm for arm in self.preset.arms.values() if arm.name in have]
 
     def runs(self, arm: Arm, mode: str) -> dict[str, list[Scored]]:
-        """Runs of an arm that were played in one mode, by play."""
+        """Runs of an arm that were simulated in one mode, by play."""
         found: dict[str, list[Scored]] = {}
         for one in self.scored:
             if one.arm == arm.name and one.mode == mode:
@@ -132,13 +132,13 @@ class Compared:
         )
 
 
-def compare(preset: Preset, ran: Sequence[Ran]) -> Compared:
+def compare(preset: Preset, ran: Sequence[ExecutedRun]) -> ComparisonResult:
     """Read what all whole runs have scored.
 
     Raises:
         StoreError: if it is damaged.
     """
-    scored = [read_scored(each) for each in ran if each.is_whole and each.leg.play]
+    scored = [read_scored(each) for each in ran if each.is_whole and each.arm_run.play]
     scenes = dict.fromkeys(scene for one in scored for scene in one.tally.means)
     logs = read_logs(scored[0].ran, list(scenes)) if scored else Tally()
-    return Compared(preset, ran, scored, logs)
+    return ComparisonResult(preset, ran, scored, logs)

@@ -26,7 +26,7 @@ _NO_SEED = "the seeds of a preset are numbered from 0: --seeds says how many"
 
 
 @dataclass(frozen=True, slots=True)
-class Leg:
+class ArmRun:
     """One arm with one seed, and one of its plays.
 
     Attributes:
@@ -87,20 +87,20 @@ class Comparison:
         """Replace the source files."""
         return replace(self, records=tuple(records))
 
-    def plan(self, leg: Leg, start: str | None = None) -> Plan:
+    def plan(self, arm_run: ArmRun, start: str | None = None) -> Plan:
         """Plan one run.
 
         Args:
-            leg: Which.
+            arm_run: Which.
             start: Key of the weights that it goes on from.
 
         Raises:
             ConfigError: for settings that cannot be, or source files that are not there.
         """
-        chosen = self._chosen(leg, start)
-        return make_plan(self.root, self.file.stages, chosen, self._targets(leg))
+        chosen = self._chosen(arm_run, start)
+        return make_plan(self.root, self.file.stages, chosen, self._targets(arm_run))
 
-    def sketch(self, leg: Leg) -> Plan:
+    def sketch(self, arm_run: ArmRun) -> Plan:
         """Plan one run as if there were no records; its keys are only good to compare.
 
         Raises:
@@ -110,15 +110,17 @@ class Comparison:
             name: replace(entry, deps=tuple(dep for dep in entry.deps if dep != SOURCES))
             for name, entry in self.file.stages.items()
         }
-        return make_plan(self.root, stages, self._chosen(leg, None), self._targets(leg))
+        return make_plan(
+            self.root, stages, self._chosen(arm_run, None), self._targets(arm_run)
+        )
 
-    def request(self, leg: Leg, start: str | None = None) -> Request:
+    def request(self, arm_run: ArmRun, start: str | None = None) -> Request:
         """Write one run as if it had been asked for by itself."""
-        over = merge_overlays(self._over(leg, start))
+        over = merge_overlays(self._over(arm_run, start))
         return Request(
             root=self.root,
             file=self.path,
-            profile=self._profile(leg),
+            profile=self._profile(arm_run),
             records=self.records or over.sources,
             overrides=over.words,
         )
@@ -145,41 +147,41 @@ class Comparison:
         """The targets; what a report would show is for the comparison to show."""
         return [SCORE if target == REPORT else target for target in self.targets]
 
-    def _targets(self, leg: Leg) -> list[str]:
-        weights_only = not leg.play and ROLLOUT in self.stages
+    def _targets(self, arm_run: ArmRun) -> list[str]:
+        weights_only = not arm_run.play and ROLLOUT in self.stages
         return [TRAIN] if weights_only else self._last
 
-    def _chosen(self, leg: Leg, start: str | None) -> Overlay:
-        over = self._over(leg, start)
-        chosen = self.file.choose(self._profile(leg), between=over)
+    def _chosen(self, arm_run: ArmRun, start: str | None) -> Overlay:
+        over = self._over(arm_run, start)
+        chosen = self.file.choose(self._profile(arm_run), between=over)
         return chosen.with_sources(self.records) if self.records else chosen
 
-    def _profile(self, leg: Leg) -> str | None:
-        return ",".join([*self.preset.profile, *leg.arm.profile]) or None
+    def _profile(self, arm_run: ArmRun) -> str | None:
+        return ",".join([*self.preset.profile, *arm_run.arm.profile]) or None
 
-    def _over(self, leg: Leg, start: str | None) -> list[Overlay]:
+    def _over(self, arm_run: ArmRun, start: str | None) -> list[Overlay]:
         """What is laid over the profiles, from the bottom up."""
         own: dict[str, dict[str, SettingValue]] = {
-            section: {"seed": SettingValue(leg.seed, f"--seeds: {section}")}
+            section: {"seed": SettingValue(arm_run.seed, f"--seeds: {section}")}
             for section in _SEEDED
         }
         if start is not None:
             own[TRAIN]["initial_weights"] = SettingValue(
-                start, f"weights of arm {leg.arm.starts_from}: {TRAIN}"
+                start, f"weights of arm {arm_run.arm.starts_from}: {TRAIN}"
             )
         words = read_overrides(self.overrides, self.file.sections)
         for section in _SEEDED:
             if "seed" in words.values.get(section, {}):
                 raise ConfigError(f"-s {section}.seed: {_NO_SEED}")
         return [
-            leg.settings,
+            arm_run.settings,
             *self.file.profile_overlays(self.profile),
             words,
             Overlay((), own),
         ]
 
 
-def legs_of(comparison: Comparison, arms: Sequence[Arm], seeds: int) -> list[Leg]:
+def arm_runs_of(comparison: Comparison, arms: Sequence[Arm], seeds: int) -> list[ArmRun]:
     """List all runs, in an order in which each finds the weights that it goes on from.
 
     Every seed is done with before the next one: there is something to look at early.
@@ -195,10 +197,10 @@ def legs_of(comparison: Comparison, arms: Sequence[Arm], seeds: int) -> list[Leg
     for seed in range(seeds):
         for arm in comparison.preset.arms.values():
             if arm in starts or (arm in arms and not plays):
-                found.append(Leg(comparison.preset.name, arm, seed))
+                found.append(ArmRun(comparison.preset.name, arm, seed))
             elif arm in arms:
                 found += [
-                    Leg(comparison.preset.name, arm, seed, play)
+                    ArmRun(comparison.preset.name, arm, seed, play)
                     for play in arm.rollout_sets
                 ]
     return found

@@ -9,7 +9,7 @@ import numpy as np
 from infgen.config import ReferenceSettings, RolloutSettings, ScoreSettings
 from infgen.metrics.long_term.table import make_row
 from infgen.views.sheets import Measured
-from pipeline.comparison.execution import Ran
+from pipeline.comparison.execution import ExecutedRun
 from pipeline.comparison.runs import ROLLOUT, SCORE, TRAIN
 from pipeline.engine.inputs import FinishedInputs, finished_units
 from pipeline.engine.layout import read_json
@@ -31,7 +31,7 @@ class Scored:
     Attributes:
         ran: The run.
         mode: Kind of rollouts: ``long``, ``motion-only`` or ``wosac``.
-        weights: Fingerprint of the weights that were played.
+        weights: Fingerprint of the weights that were simulated.
         scenes: Scenes that were scored.
         rollouts: Rollouts that were scored.
         official: Scenes that the official metric could score.
@@ -42,7 +42,7 @@ class Scored:
         measures: How rollouts and logs were measured.
     """
 
-    ran: Ran
+    ran: ExecutedRun
     mode: str
     weights: str
     scenes: int
@@ -57,17 +57,17 @@ class Scored:
     @property
     def arm(self) -> str:
         """Name of its arm."""
-        return self.ran.leg.arm.name
+        return self.ran.arm_run.arm.name
 
     @property
     def seed(self) -> int:
         """Its seed."""
-        return self.ran.leg.seed
+        return self.ran.arm_run.seed
 
     @property
     def play(self) -> str:
         """Name of its play."""
-        return self.ran.leg.play
+        return self.ran.arm_run.play
 
     def to_json(self) -> dict[str, Any]:
         """Where its numbers come from, and what they are."""
@@ -78,12 +78,12 @@ class Scored:
             "scenes": self.scenes,
             "rollouts": self.rollouts,
             "official_scenes": self.official,
-            "settings": list(self.ran.leg.settings.words),
+            "settings": list(self.ran.arm_run.settings.words),
             "numbers": {name: one.to_json() for name, one in self.numbers.items()},
         }
 
 
-def read_scored(ran: Ran) -> Scored:
+def read_scored(ran: ExecutedRun) -> Scored:
     """Read the scores of a run that is whole.
 
     Raises:
@@ -109,7 +109,7 @@ def read_scored(ran: Ran) -> Scored:
     )
 
 
-def read_logs(ran: Ran, scenario_ids: Sequence[str]) -> Tally:
+def read_logs(ran: ExecutedRun, scenario_ids: Sequence[str]) -> Tally:
     """Score the logs of some scenes as if they were rollouts.
 
     The reference of a split knows all its logs; beside rollouts of some scenes stand the
@@ -136,9 +136,9 @@ def middle_s(measures: ReferenceSettings, count: int) -> np.ndarray:
     return np.arange(count) * measures.stride_s + measures.window_s / 2
 
 
-def _plan(ran: Ran) -> Plan:
+def _plan(ran: ExecutedRun) -> Plan:
     if ran.plan is None:
-        raise ValueError(f"{ran.leg.words} was never planned")
+        raise ValueError(f"{ran.arm_run.words} was never planned")
     return ran.plan
 
 

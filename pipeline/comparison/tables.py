@@ -7,7 +7,7 @@ from infgen.clock import CLOCK
 from infgen.views.published import ABLATIONS, CAVEAT, PAPER, Published
 from infgen.views.sheets import Measured, Sheet, SheetCell
 from pipeline.comparison.claims import PROTOCOLS, claims
-from pipeline.comparison.result import LONG, MOTION_ONLY, OFFICIAL_PLAY, Compared
+from pipeline.comparison.result import LONG, MOTION_ONLY, OFFICIAL_PLAY, ComparisonResult
 from pipeline.comparison.statistics import truth
 from pipeline.engine.layout import KEY_DIGITS
 from pipeline.settings.presets import Arm
@@ -30,7 +30,7 @@ _COUNT_ERRORS = {
 }
 
 
-def tables(found: Compared) -> list[Sheet]:
+def tables(found: ComparisonResult) -> list[Sheet]:
     """All tables that there are numbers for."""
     drawn = [
         claims(found),
@@ -44,20 +44,20 @@ def tables(found: Compared) -> list[Sheet]:
     return [sheet for sheet in drawn if sheet.rows]
 
 
-def caveats(found: Compared) -> list[str]:
+def caveats(found: ComparisonResult) -> list[str]:
     """What must be known of all the tables."""
     told = found.interval[0].upper() + found.interval[1:]
     return [f"{told} (half of it behind ±).", CAVEAT]
 
 
-def standing_alone(found: Compared, sheet: Sheet) -> Sheet:
+def standing_alone(found: ComparisonResult, sheet: Sheet) -> Sheet:
     """Let a table say itself what must be known of all."""
     if sheet.name == RUNS:
         return sheet
     return replace(sheet, note=" ".join([sheet.note, *caveats(found)]).strip())
 
 
-def short_term(found: Compared) -> Sheet:
+def short_term(found: ComparisonResult) -> Sheet:
     """Table 1: eight seconds by Waymo's metric."""
     names = list(_WOSAC)
     ours = [
@@ -79,7 +79,7 @@ def short_term(found: Compared) -> Sheet:
     )
 
 
-def long_term(found: Compared) -> Sheet:
+def long_term(found: ComparisonResult) -> Sheet:
     """Table 2: agents come and go for 30 s."""
     names = [COMPOSITE, *BUCKETS, *PLACEMENT]
     theirs: list[list[SheetCell]] = [
@@ -101,7 +101,7 @@ def long_term(found: Compared) -> Sheet:
     )
 
 
-def motion_only(found: Compared) -> Sheet:
+def motion_only(found: ComparisonResult) -> Sheet:
     """Table 3: the same length, nobody comes or goes."""
     theirs: list[list[SheetCell]] = [
         [f"{each.method}, published", *each.motion_only.values()]
@@ -117,7 +117,7 @@ def motion_only(found: Compared) -> Sheet:
     )
 
 
-def ablations(found: Compared) -> Sheet:
+def ablations(found: ComparisonResult) -> Sheet:
     """Table 5: the method with something left out."""
     left_out = [arm for arm in found.arms if arm.ablates is not None]
     whole = {arm.ablates for arm in left_out}
@@ -138,7 +138,7 @@ def ablations(found: Compared) -> Sheet:
     )
 
 
-def against_logs(found: Compared) -> Sheet:
+def against_logs(found: ComparisonResult) -> Sheet:
     """How many come, go and are there, beside the logs of the same scenes."""
     rates = {"corrected/entry_rate": "entries", "corrected/exit_rate": "exits"}
     shares = {
@@ -172,7 +172,7 @@ def against_logs(found: Compared) -> Sheet:
     )
 
 
-def runs(found: Compared) -> Sheet:
+def runs(found: ComparisonResult) -> Sheet:
     """Every run with the keys that its numbers can be traced by."""
     scored = {id(one.ran): one for one in found.scored}
     rows: list[list[SheetCell]] = []
@@ -182,7 +182,7 @@ def runs(found: Compared) -> Sheet:
         counts = (one.scenes, one.rollouts) if one else (None, None)
         score = ran.keys.get("score", "")[:KEY_DIGITS] or None
         why = "" if ran.is_whole else ran.why
-        rows.append([ran.leg.words, *counts, weights, score, why])
+        rows.append([ran.arm_run.words, *counts, weights, score, why])
     return Sheet(
         name=RUNS,
         title="Runs",
@@ -194,7 +194,7 @@ def runs(found: Compared) -> Sheet:
 
 
 def _by_protocol(
-    found: Compared,
+    found: ComparisonResult,
     arms: Sequence[Arm],
     mode: str,
     names: Sequence[str],
@@ -220,7 +220,7 @@ def _by_protocol(
 _WORDS = {**COMPOSITES, **BUCKETS, **PLACEMENT}
 
 
-def _published(found: Compared) -> list[Published]:
+def _published(found: ComparisonResult) -> list[Published]:
     """Rows of the paper that our methods stand beside; all, where none does."""
     names = {arm.published for arm in found.arms}
     return [each for each in PAPER if each.method in names] or list(PAPER)

@@ -12,10 +12,10 @@ from typing import Any
 
 from infgen.views.page import figures, heading, page, paragraph
 from infgen.views.sheets import Sheet
-from pipeline.comparison.execution import Ran
+from pipeline.comparison.execution import ExecutedRun
 from pipeline.comparison.figures import curve_sheet
 from pipeline.comparison.figures import figures as drawings
-from pipeline.comparison.result import Compared, compare
+from pipeline.comparison.result import ComparisonResult, compare
 from pipeline.comparison.runs import PAGE, PRESET, SHOWN, Comparison
 from pipeline.comparison.tables import caveats, standing_alone, tables
 from pipeline.engine.atomic import MANIFEST, publish, remove_folder, write_file, write_json
@@ -45,7 +45,9 @@ _MODULES = (
 """Whose code decides what is written: with other code it is written anew, in seconds."""
 
 
-def write_comparison(comparison: Comparison, ran: Sequence[Ran], *, again: bool) -> Path:
+def write_comparison(
+    comparison: Comparison, ran: Sequence[ExecutedRun], *, again: bool
+) -> Path:
     """Write what the runs of a preset have scored; return the folder to look into.
 
     Args:
@@ -73,7 +75,7 @@ def write_comparison(comparison: Comparison, ran: Sequence[Ran], *, again: bool)
     return shown
 
 
-def _about(preset: Preset, ran: Sequence[Ran]) -> dict[str, Any]:
+def _about(preset: Preset, ran: Sequence[ExecutedRun]) -> dict[str, Any]:
     """What the manifest says; the key follows from it."""
     arms = [
         [arm.name, arm.label, arm.published, arm.ablates] for arm in preset.arms.values()
@@ -96,7 +98,7 @@ def _about(preset: Preset, ran: Sequence[Ran]) -> dict[str, Any]:
     }
 
 
-def _write(folder: Path, found: Compared) -> None:
+def _write(folder: Path, found: ComparisonResult) -> None:
     sheets = tables(found)
     (folder / TABLES).mkdir()
     for sheet in [standing_alone(found, sheet) for sheet in sheets]:
@@ -118,7 +120,7 @@ def _write(folder: Path, found: Compared) -> None:
     write_file(folder / PAGE, page(title, _page(found, sheets)).encode())
 
 
-def _page(found: Compared, sheets: Sequence[Sheet]) -> list[str]:
+def _page(found: ComparisonResult, sheets: Sequence[Sheet]) -> list[str]:
     parts = [paragraph(_words(found)), *[paragraph(c, note=True) for c in caveats(found)]]
     if found.missing:
         parts += [heading("Missing"), *[paragraph(each) for each in found.missing]]
@@ -128,7 +130,7 @@ def _page(found: Compared, sheets: Sequence[Sheet]) -> list[str]:
     return parts
 
 
-def _words(found: Compared) -> str:
+def _words(found: ComparisonResult) -> str:
     """What the page is about, in a sentence."""
     arms = ", ".join(arm.label for arm in found.arms) or "Nothing yet"
     scenes = " or ".join(map(str, sorted({one.scenes for one in found.scored}))) or "no"

@@ -1,6 +1,6 @@
 """Stage ``calibrate``: weights to what rollouts add to their odds of coming and going.
 
-Odds that are right half second by half second thin a street out, or fill it, once the
+Odds that are right token step by token step thin a street out, or fill it, once the
 network plays on its own. So a unit plays some scenes with one pair of biases and counts who
 came, went and was there, beside their logs; ``finish`` finds the pair with which both are
 alike. Where the last validation of the training is to decide, there are no units.
@@ -17,11 +17,11 @@ from infgen.clock import CLOCK
 from infgen.config import CalibrateSettings, RolloutSettings, TokenSettings
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
 from pipeline.stages.calibration import Biases, read_biases, write_found
-from pipeline.stages.simulation import begin, load_player, play_all, read_some
+from pipeline.stages.simulation import begin, load_simulator, read_some, simulate_all
 from pipeline.storage.splits import files_of_split, spread_evenly
 
 if TYPE_CHECKING:
-    from infgen.metrics.flow import Turnover
+    from infgen.metrics.flow import FlowCounts
 
 Settings = Mapping[str, Any]
 
@@ -53,7 +53,7 @@ def normalize(settings: Settings) -> Settings:
 
 
 def plan(inputs: Inputs, settings: Settings) -> list[Unit]:
-    """One unit per pair of biases and some scenes; none if nothing is played."""
+    """One unit per pair of biases and some scenes; none if nothing is simulated."""
     how: CalibrateSettings = settings["calibrate"]
     if how.method != "simulate":
         return []
@@ -117,35 +117,35 @@ def _parts(
 
 def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Report:
     """Play some scenes with one pair of biases; count them, and their logs."""
-    from infgen.metrics.flow import add_up, count_turnover  # noqa: PLC0415
+    from infgen.metrics.flow import add_up, count_flow  # noqa: PLC0415
     from infgen.metrics.traffic import from_log, from_rollout, on_map  # noqa: PLC0415
-    from infgen.rollout.rules.off_road import lane_pieces  # noqa: PLC0415
+    from infgen.rollout.rules.off_road import lane_segments  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
     how: CalibrateSettings = settings["calibrate"]
     played = Biases(**unit.task["biases"]).over(settings["rollout"])
     folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
-    player, weights = load_player(folder, identity, played)
+    simulator, weights = load_simulator(folder, identity, played)
     starts, played_on, logs, refused = [], [], [], []
-    longest = CLOCK.tokens_in(player.settings.duration_s)
+    longest = CLOCK.tokens_in(simulator.settings.duration_s)
     for scene in _scenes(unit):
         try:
             logged = from_log(scene, settings["tokenize"])
-            starts += begin(player, scene)
+            starts += begin(simulator, scene)
         except ValueError as error:
             refused.append(f"{scene.scenario_id}: {error}")
             continue
         # The longer of a log and its rollouts is cut into windows as long as the shorter.
-        played_on.append((min(longest, logged.future_tokens), lane_pieces(scene)))
-        logs.append(count_turnover(logged, how.count_radius_m, longest))
+        played_on.append((min(longest, logged.future_tokens), lane_segments(scene)))
+        logs.append(count_flow(logged, how.count_radius_m, longest))
 
     def tell(done: float) -> None:
         progress(done, len(starts), "rollouts")
 
-    rollouts = chain.from_iterable(play_all(player, starts, weights, tell))
+    rollouts = chain.from_iterable(simulate_all(simulator, starts, weights, tell))
     # Beyond the end of a map nobody enters: biases are not to make up for that.
     plays = [
-        count_turnover(on_map(from_rollout(rollout), lanes), how.count_radius_m, length)
+        count_flow(on_map(from_rollout(rollout), lanes), how.count_radius_m, length)
         for rollout, (length, lanes) in zip(rollouts, played_on, strict=True)
     ]
     return {
@@ -212,15 +212,15 @@ def _find(
     }
 
 
-def _sum(units: Sequence[FinishedUnit], what: str, point: int) -> "Turnover":
-    from infgen.metrics.flow import Turnover, add_up  # noqa: PLC0415
+def _sum(units: Sequence[FinishedUnit], what: str, point: int) -> "FlowCounts":
+    from infgen.metrics.flow import FlowCounts, add_up  # noqa: PLC0415
 
     return add_up(
-        Turnover(**done.report[what]) for done in units if done.report["point"] == point
+        FlowCounts(**done.report[what]) for done in units if done.report["point"] == point
     )
 
 
-def _rates(counts: "Turnover") -> dict[str, float | None]:
+def _rates(counts: "FlowCounts") -> dict[str, float | None]:
     """Rates as they are written: None where nothing was looked at."""
     found = {
         "came_per_token": counts.came,

@@ -1,4 +1,4 @@
-"""What to add to log-odds so that decisions are right half second by half second.
+"""What to add to log-odds so that decisions are right token step by token step.
 
 The last validation of a training run has its decisions sorted by their probability. A
 network that was shown few scenes often is too sure of them; shifting its log-odds until the

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from infgen.metrics.flow import Turnover
+from infgen.metrics.flow import FlowCounts
 from pipeline.stages.calibration import Biases
 
 DESIGN = ((0.0, 0.0), (0.5, -1.0), (0.5, 0.0), (0.5, 1.0), (1.0, 0.0))
@@ -62,7 +62,7 @@ class Best:
     at_the_end: bool
 
 
-def find_best(plays: Sequence[Turnover], logs: Turnover, reach: Reach) -> Best | None:
+def find_best(plays: Sequence[FlowCounts], logs: FlowCounts, reach: Reach) -> Best | None:
     """Find the biases with which rollouts are as their logs: who comes, goes and is there.
 
     Args:
@@ -98,8 +98,8 @@ def find_best(plays: Sequence[Turnover], logs: Turnover, reach: Reach) -> Best |
 def _off(
     name: str,
     points: Float64[np.ndarray, "point 2"],
-    plays: Sequence[Turnover],
-    logs: Turnover,
+    plays: Sequence[FlowCounts],
+    logs: FlowCounts,
 ) -> Float64[np.ndarray, " point"]:
     """Logarithm of a count at points, as a multiple of the logs'."""
     rates = [counts.per_token(getattr(counts, name)) for counts in (logs, *plays)]

@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any
 from infgen.config import RolloutSettings
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
 from pipeline.stages.calibration import Biases, read_found
-from pipeline.stages.simulation import begin, load_player, play_all, read_some
+from pipeline.stages.simulation import begin, load_simulator, read_some, simulate_all
 from pipeline.storage.parquet import Fields, make_table, read_tables
 from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
 from pipeline.storage.splits import files_of_split, spread_evenly
 
 if TYPE_CHECKING:
-    from infgen.rollout.recording import Start
+    from infgen.rollout.recording import RolloutStart
     from infgen.rollout.rollout import Rollout
-    from infgen.rollout.simulator import Player
+    from infgen.rollout.simulator import Simulator
 
 INDEX: Fields = {
     "scenario_id": str,
@@ -75,7 +75,7 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
         leave=found.leave if settings.removes else 0.0,
     )
     every = inputs.units("ingest")
-    shards = files_of_split(every, settings.split, to="play", setting="rollout.split")
+    shards = files_of_split(every, settings.split, to="simulate", setting="rollout.split")
     units = []
     for done, rows in zip(shards, spread_evenly(shards, settings.max_scenes), strict=True):
         for first, after in pairwise(_edges(len(rows), settings.scenes_per_unit)):
@@ -100,7 +100,9 @@ def _edges(scenes: int, most: int) -> list[int]:
     return [math.ceil(scenes * at / parts) for at in range(parts)] + [scenes]
 
 
-def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress) -> Report:
+def simulate(
+    unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
+) -> Report:
     """Play all rollouts of some scenes, a batch at a time, and write them as groups."""
     from infgen.rollout.rollout import Rollout  # noqa: PLC0415
     from pipeline.storage.zarr_store import write_records  # noqa: PLC0415
@@ -108,22 +110,22 @@ def play(unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
     biases = Biases(**unit.task["biases"])
     settings = biases.over(settings)
     folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
-    player, weights = load_player(folder, identity, settings)
-    starts, refused = _starts(unit, player)
+    simulator, weights = load_simulator(folder, identity, settings)
+    starts, refused = _starts(unit, simulator)
     begun = time.monotonic()
 
     def tell(played: float) -> None:
         progress(played, len(starts), f"{_rate(played, begun):.3g} rollouts/s")
 
     rows: list[dict[str, Any]] = []
-    for group, rollouts in enumerate(play_all(player, starts, weights, tell)):
+    for group, rollouts in enumerate(simulate_all(simulator, starts, weights, tell)):
         path = target / f"rollouts-{group:03d}.zarr"
         write_records(path, rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True)
         rows += [_row(unit.name, group, at, done) for at, done in enumerate(rollouts)]
     make_table(rows, INDEX).write_parquet(target / "index.parquet")
     pace = {"rollouts_per_s": round(_rate(len(rows), begun), 4)}
     told = {"add_bias": settings.add_bias, "remove_bias": settings.remove_bias}
-    return {**_report(rows, refused), **told, "plays": player.plays, "run": pace}
+    return {**_report(rows, refused), **told, "simulates": simulator.simulates, "run": pace}
 
 
 def _rate(played: float | int, begun: float) -> float:
@@ -150,24 +152,24 @@ def finish(
         for name in ("inserted", "left", "agents")
     }
     refused = [line for done in units for line in done.report["refused"]]
-    plays = sorted({done.report["plays"] for done in units})
+    simulates = sorted({done.report["simulates"] for done in units})
     biases = {name: units[0].report[name] for name in ("add_bias", "remove_bias") if units}
     return {
         "rollouts": count,
-        "plays": "; ".join(plays),
+        "simulates": "; ".join(simulates),
         **means,
         **biases,
         "refused": refused,
     }
 
 
-def _starts(unit: Unit, player: "Player") -> "tuple[list[Start], list[str]]":
+def _starts(unit: Unit, simulator: "Simulator") -> "tuple[list[RolloutStart], list[str]]":
     """Begin all rollouts; scenes that cannot be played are named with the reason."""
     task = unit.task
     starts, refused = [], []
     for scene in read_some(Path(task["scenes"]), task["rows"]):
         try:
-            starts += begin(player, scene)
+            starts += begin(simulator, scene)
         except ValueError as error:
             refused.append(f"{scene.scenario_id}: {error}")
     return starts, refused
@@ -199,7 +201,7 @@ STAGE = Stage(
     version=7,
     settings={"rollout": RolloutSettings},
     plan=plan,
-    work=play,
+    work=simulate,
     finish=finish,
     normalize=normalize,
     modules=(

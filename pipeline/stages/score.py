@@ -124,7 +124,7 @@ class _Scorer:
     def take(self, scene: "Scene", rollouts: "Sequence[Rollout]") -> None:
         """Score the rollouts of one scene."""
         from infgen.metrics.long_term.binned import bin_traffic  # noqa: PLC0415
-        from infgen.metrics.long_term.radius import live_within  # noqa: PLC0415
+        from infgen.metrics.long_term.radius import present_within_radius  # noqa: PLC0415
         from infgen.metrics.long_term.reference import count_simulated  # noqa: PLC0415
         from infgen.metrics.long_term.table import make_row  # noqa: PLC0415
         from infgen.metrics.traffic import from_rollout  # noqa: PLC0415
@@ -134,7 +134,7 @@ class _Scorer:
         edges, radius_m = scene_road_edges(scene), self._settings.presence_radius_m
         self.official.append(_score_wosac(scene, rollouts, self._settings.wosac_version))
         for rollout in rollouts:
-            lived = live_within(rollout, radius_m) if radius_m else rollout
+            lived = present_within_radius(rollout, radius_m) if radius_m else rollout
             near_m = self._reference.count_radius_m
             binned = bin_traffic(from_rollout(lived), edges, near_m, as_logged=False)
             windows = self._against.windows(binned.bins.shape[-1])

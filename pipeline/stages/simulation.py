@@ -11,9 +11,9 @@ from infgen.clock import CLOCK
 from infgen.config import RolloutSettings
 
 if TYPE_CHECKING:
-    from infgen.rollout.recording import Start
+    from infgen.rollout.recording import RolloutStart
     from infgen.rollout.rollout import Rollout
-    from infgen.rollout.simulator import Player
+    from infgen.rollout.simulator import Simulator
     from infgen.scene import Scene
 
 TOGETHER_S = 1000.0
@@ -21,9 +21,9 @@ TOGETHER_S = 1000.0
 
 
 @lru_cache(maxsize=2)
-def load_player(
+def load_simulator(
     weights: Path, identity: str, settings: RolloutSettings
-) -> "tuple[Player, str]":
+) -> "tuple[Simulator, str]":
     """Load weights once per process: it may outlive what was at a path when it began.
 
     Returns:
@@ -32,12 +32,12 @@ def load_player(
     import torch  # noqa: PLC0415
 
     from infgen.model.stepping import Stepper  # noqa: PLC0415
-    from infgen.rollout.simulator import Player  # noqa: PLC0415
+    from infgen.rollout.simulator import Simulator  # noqa: PLC0415
     from pipeline.storage.weights import load_network, read_description  # noqa: PLC0415
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = load_network(weights).to(device).eval()
-    player = Player(
+    simulator = Simulator(
         stepper=Stepper(network),
         vocabulary=network.motion_vocabulary(),
         roads=network.map_vocabulary(),
@@ -45,7 +45,7 @@ def load_player(
         settings=settings,
         device=device,
     )
-    return player, str(read_description(weights)["weights"])
+    return simulator, str(read_description(weights)["weights"])
 
 
 def read_some(folder: Path, rows: Sequence[int]) -> "Iterator[Scene]":
@@ -57,49 +57,50 @@ def read_some(folder: Path, rows: Sequence[int]) -> "Iterator[Scene]":
     return (scene for row, scene in enumerate(scenes) if row in wanted)
 
 
-def begin(player: "Player", scene: "Scene") -> "list[Start]":
+def begin(simulator: "Simulator", scene: "Scene") -> "list[RolloutStart]":
     """Tokenize a scene's history, for all of its rollouts.
 
     Raises:
         ValueError: if it cannot be played, with the reason.
     """
-    from infgen.rollout.recording import Start  # noqa: PLC0415
+    from infgen.rollout.recording import RolloutStart  # noqa: PLC0415
     from infgen.tokens.tokenizer import read_logged_signals, tokenize_scene  # noqa: PLC0415
 
-    tokens, settings = player.tokens, player.settings
+    tokens, settings = simulator.tokens, simulator.settings
     if settings.simulates_all_agents:
         tokens = replace(tokens, max_ego_distance_m=1e9)  # All agents.
     history = tokenize_scene(
-        scene, player.vocabulary, player.roads, tokens, until=scene.now
+        scene, simulator.vocabulary, simulator.roads, tokens, until=scene.now
     )
     lights = read_logged_signals(scene) if settings.signals == "log" else None
     return [
-        Start(scene, history, at, settings.seed, lights) for at in range(settings.count)
+        RolloutStart(scene, history, at, settings.seed, lights)
+        for at in range(settings.count)
     ]
 
 
-def play_all(
-    player: "Player",
-    starts: "Sequence[Start]",
+def simulate_all(
+    simulator: "Simulator",
+    starts: "Sequence[RolloutStart]",
     weights: str,
     tell: Callable[[float], None],
 ) -> "Iterator[list[Rollout]]":
     """Play rollouts, a batch at a time, and make them whole a few at a time.
 
     Args:
-        player: What plays.
+        simulator: What plays.
         starts: Where they begin.
         weights: Fingerprint of the weights.
-        tell: Told how many rollouts are played, at every half second of a batch.
+        tell: Told how many rollouts are simulated, at every token step of a batch.
     """
     from infgen.rollout.recording import Frame, collect  # noqa: PLC0415
     from infgen.rollout.simulate import simulate  # noqa: PLC0415
 
-    duration_s, done = player.settings.duration_s, 0
+    duration_s, done = simulator.settings.duration_s, 0
     few = max(1, int(TOGETHER_S / duration_s))
-    for batch in _batches(starts, player.settings.batch_rollouts):
+    for batch in _batches(starts, simulator.settings.batch_rollouts):
         frames: list[Frame] = []
-        for frame in simulate(player, batch):
+        for frame in simulate(simulator, batch):
             frames.append(frame)
             tell(done + len(batch) * len(frames) * CLOCK.token_s / duration_s)
         done += len(batch)
@@ -108,7 +109,7 @@ def play_all(
             yield collect(batch, frames, weights, places)
 
 
-def _batches(starts: "Sequence[Start]", size: int) -> "Iterator[list[Start]]":
+def _batches(starts: "Sequence[RolloutStart]", size: int) -> "Iterator[list[RolloutStart]]":
     """Cut into batches whose histories are of one length."""
     for _, group in groupby(starts, key=lambda start: start.history.now):
         alike = list(group)

@@ -31,7 +31,7 @@ from infgen.tokens.clustering.sample_keys import name_key
 from infgen.tokens.clustering.vocabularies import Origin, cluster_map, cluster_motion
 from infgen.tokens.tracks import Paths, TokensError, read_paths
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
-from infgen.views.charts.vocabularies import codebook_page
+from infgen.views.charts.vocabularies import vocabulary_page
 from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import (
     FinishedUnit,
@@ -125,7 +125,7 @@ def reads(root: Path, settings: VocabSettings) -> list[Source]:
 def plan(inputs: Inputs, settings: VocabSettings) -> list[Unit]:
     """One unit per file of the two splits.
 
-    Codebooks that are taken, not made, need no file to learn from.
+    Vocabularies that are taken, not made, need no file to learn from.
 
     Raises:
         PlanError: if there is no file to learn from, or none at all.
@@ -202,7 +202,7 @@ def finish(
     from pipeline.storage.zarr_store import write_file, write_json  # noqa: PLC0415
 
     write_json(target / "report.json", report)
-    page = codebook_page(report, motion, move_origin, roads, road_origin)
+    page = vocabulary_page(report, motion, move_origin, roads, road_origin)
     write_file(target / "report.html", page.encode())
     return _headline(report)
 

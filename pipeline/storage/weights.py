@@ -125,13 +125,13 @@ def copy_weights(network: Network, folder: Path) -> None:
             the weights were made with other vocabularies, or are not what they were.
     """
     about = read_description(folder)
-    own_books = vocabulary_fingerprint(
+    own_vocabularies = vocabulary_fingerprint(
         network.motion_vocabulary(), network.map_vocabulary()
     )
-    if about["vocabulary"] != own_books:
+    if about["vocabulary"] != own_vocabularies:
         raise StoreError(
             f"{folder} was trained with vocabulary {about['vocabulary'][:12]}, expected "
-            f"{own_books[:12]}; build-vocab must have the same settings and records"
+            f"{own_vocabularies[:12]}; build-vocab must have the same settings and records"
             f"{_remedy(folder)}"
         )
     found = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()

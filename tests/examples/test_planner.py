@@ -28,11 +28,11 @@ def street(planner):
 
 
 def test_the_planner_drives_along_its_lane(planner, street):
-    player = planner.make_player(street.fresh_network(), ALONE)
+    simulator = planner.make_player(street.fresh_network(), ALONE)
 
     # All others are far ahead and beside: a free road.
-    start = planner.begin(street.street((8.0,)), player)
-    moments = list(planner.drive(player, start, 4.0))
+    start = planner.begin(street.street((8.0,)), simulator)
+    moments = list(planner.drive(simulator, start, 4.0))
 
     poses = np.array([moment.ego_pose for moment in moments])
     assert (np.diff(poses[:, 0]) > 3.5).all()

@@ -13,7 +13,7 @@ def test_the_mean_count_of_a_window_is_over_its_eighty_steps():
     windows = cut_windows(100, 8.0, 0.5)
     number = counts_of(4, 4, 4, 4, 4, 4, 4, 4, 12, 12)
 
-    # Each half second that the window moves swaps five 4s for five 12s.
+    # Each token step that the window moves swaps five 4s for five 12s.
     np.testing.assert_allclose(mean_counts(number, windows), [4.0, 4.5, 5.0, 5.5, 6.0])
 
 

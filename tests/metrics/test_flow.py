@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from infgen.config import TokenSettings
-from infgen.metrics.flow import Turnover, add_up, count_turnover
+from infgen.metrics.flow import FlowCounts, add_up, count_flow
 from infgen.metrics.traffic import from_log, from_rollout
 from tests.pipeline.stages.test_score import as_rollout
 
 TOKENS = 14
-"""Half seconds of 8 s that are looked at."""
+"""Token steps of 8 s that are looked at."""
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def played(parked):
 
 
 def count(rollout, radius_m=75.0):
-    return count_turnover(from_rollout(rollout), radius_m)
+    return count_flow(from_rollout(rollout), radius_m)
 
 
 def other(rollout):
@@ -39,11 +39,11 @@ def shown(rollout, *steps):
 
 
 def test_whoever_stays_is_there_in_every_half_second_but_the_last_two(played):
-    assert count(played) == Turnover(came=0, went=0, agents=2 * TOKENS, tokens=TOKENS)
+    assert count(played) == FlowCounts(came=0, went=0, agents=2 * TOKENS, tokens=TOKENS)
 
 
 def test_nobody_beyond_the_radius_counts(played):
-    assert count(played, radius_m=0.5) == Turnover(0, 0, 0, TOKENS)
+    assert count(played, radius_m=0.5) == FlowCounts(0, 0, 0, TOKENS)
 
 
 @pytest.mark.parametrize(
@@ -82,15 +82,15 @@ def test_who_drives_out_of_the_radius_has_gone_and_who_drives_in_has_come(played
 
 
 def test_a_log_is_counted_as_its_rollout_would_be(parked, played):
-    logged = count_turnover(from_log(parked(count=2), TokenSettings()), 75.0)
+    logged = count_flow(from_log(parked(count=2), TokenSettings()), 75.0)
 
     assert logged == count(played)
 
 
 def test_counts_add_up_to_rates():
-    found = add_up([Turnover(3, 1, 20, 10), Turnover(1, 1, 0, 10)])
+    found = add_up([FlowCounts(3, 1, 20, 10), FlowCounts(1, 1, 0, 10)])
 
-    assert found == Turnover(4, 2, 20, 20)
+    assert found == FlowCounts(4, 2, 20, 20)
     assert found.per_token(found.came) == 0.2
 
 
@@ -106,23 +106,21 @@ def test_a_long_rollout_is_counted_in_windows_as_long_as_its_log(played):
     back = shown(played, (-10, 5), (71, 80))
 
     def windows(rollout):
-        return count_turnover(from_rollout(rollout), 75.0, temporal_window_tokens=8)
+        return count_flow(from_rollout(rollout), 75.0, temporal_window_tokens=8)
 
-    assert windows(played) == Turnover(0, 0, agents=2 * 12, tokens=12)
-    assert windows(late) == Turnover(1, 0, agents=12 + 5, tokens=12)
-    assert windows(early) == Turnover(0, 1, agents=12 + 3, tokens=12)
-    assert windows(back) == Turnover(0, 1, agents=12 + 1, tokens=12)
-    assert count(back) == Turnover(0, 0, agents=14 + 1, tokens=14)
+    assert windows(played) == FlowCounts(0, 0, agents=2 * 12, tokens=12)
+    assert windows(late) == FlowCounts(1, 0, agents=12 + 5, tokens=12)
+    assert windows(early) == FlowCounts(0, 1, agents=12 + 3, tokens=12)
+    assert windows(back) == FlowCounts(0, 1, agents=12 + 1, tokens=12)
+    assert count(back) == FlowCounts(0, 0, agents=14 + 1, tokens=14)
 
 
 def test_windows_reach_from_the_first_half_second_to_the_last(played):
-    """Three of 5 of 16 half seconds: 0 to 5, 5.5 to 10.5 and 11 to 16."""
+    """Three of 5 of 16 token steps: 0 to 5, 5.5 to 10.5 and 11 to 16."""
     late = shown(played, (66, 80))
 
-    found = count_turnover(from_rollout(late), 75.0, temporal_window_tokens=5)
+    found = count_flow(from_rollout(late), 75.0, temporal_window_tokens=5)
 
     assert found.tokens == 3 * 3
-    assert found == Turnover(1, 0, agents=9 + 1, tokens=9)
-    assert count_turnover(from_rollout(late), 75.0, temporal_window_tokens=99) == count(
-        late
-    )
+    assert found == FlowCounts(1, 0, agents=9 + 1, tokens=9)
+    assert count_flow(from_rollout(late), 75.0, temporal_window_tokens=99) == count(late)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from infgen.config import TokenSettings
-from infgen.metrics.long_term.radius import live_within
+from infgen.metrics.long_term.radius import present_within_radius
 from infgen.metrics.placement import (
     count_per_token,
     logged_events,
@@ -148,7 +148,7 @@ def test_by_radius_agents_enter_and_leave_where_they_cross_the_circle():
     # from 30 m (beyond 50 after step 30, read at step 35).
     steps = np.arange(61)
     paths = np.stack([0 * steps, 70.0 - steps, 20.0 + steps])
-    lived = live_within(rollout(paths, np.ones((3, 61), bool)), 50.0)
+    lived = present_within_radius(rollout(paths, np.ones((3, 61), bool)), 50.0)
     found = simulated_events(lived)
 
     assert lived.entry_step.tolist() == [0, 20, 0]
@@ -164,7 +164,9 @@ def test_by_radius_agents_enter_and_leave_where_they_cross_the_circle():
 def test_by_radius_nobody_enters_twice():
     steps = np.arange(61)
     wave = 50.0 - 20.0 * np.sin(steps / 4.0)
-    lived = live_within(rollout(np.stack([0 * steps, wave]), np.ones((2, 61), bool)), 50.0)
+    lived = present_within_radius(
+        rollout(np.stack([0 * steps, wave]), np.ones((2, 61), bool)), 50.0
+    )
 
     assert len(simulated_events(lived).entry_token) <= 1
 
@@ -172,7 +174,7 @@ def test_by_radius_nobody_enters_twice():
 def test_with_a_wide_radius_nothing_changes():
     steps = np.arange(61)
     played = rollout(np.stack([0 * steps, 30.0 + 0 * steps]), np.ones((2, 61), bool))
-    lived = live_within(played, 1000.0)
+    lived = present_within_radius(played, 1000.0)
 
     np.testing.assert_array_equal(lived.valid, played.valid)
     np.testing.assert_array_equal(lived.xyz_m, played.xyz_m)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from infgen.config import TokenSettings
-from infgen.metrics.flow import count_turnover
+from infgen.metrics.flow import count_flow
 from infgen.metrics.traffic import OFF_MAP_M, from_log, on_map
-from infgen.rollout.rules.off_road import lane_pieces
+from infgen.rollout.rules.off_road import lane_segments
 from tests.conftest import straight_road
 
 LANE_M = 40.0
@@ -19,7 +19,7 @@ def traffic(drive):
 
     def build(speed_mps):
         scene = drive(speed_mps, road_map=straight_road(2 * LANE_M))
-        return from_log(scene, TokenSettings()), lane_pieces(scene)
+        return from_log(scene, TokenSettings()), lane_segments(scene)
 
     return build
 
@@ -35,7 +35,7 @@ def test_a_log_is_cut_where_the_ego_is_too_far_from_every_lane(traffic, speed_mp
     if not len(left):
         assert cut is whole
     else:
-        assert left[0] <= end < left[0] + 5  # It is looked at every half second.
+        assert left[0] <= end < left[0] + 5  # It is looked at every token step.
         assert cut.motion.valid.shape == (1, 1, end)
 
 
@@ -51,6 +51,6 @@ def test_who_stays_on_the_map_and_who_has_none_are_left_alone(traffic):
 def test_less_of_what_is_cut_is_counted(traffic):
     whole, lanes = traffic(20.0)
 
-    before, after = (count_turnover(one, 75.0) for one in (whole, on_map(whole, lanes)))
+    before, after = (count_flow(one, 75.0) for one in (whole, on_map(whole, lanes)))
 
     assert 0 < after.tokens < before.tokens

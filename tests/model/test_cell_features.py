@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from infgen.model.cell_features import Bearings, Ground, Lying
+from infgen.model.cell_features import CellFeatures, CellSources, HeadingFeatures
 from infgen.model.neighbours import cell_pose
 from infgen.tokens.grid import make_grid
 
@@ -18,11 +18,11 @@ def grid(grid_settings):
 
 
 @pytest.fixture
-def ground(grid):
+def cell_features(grid):
     torch.manual_seed(0)
-    ground = Ground(WIDTH, FEATURES, grid)
-    torch.nn.init.normal_(ground.place[-1].weight)
-    return ground.eval()
+    cell_features = CellFeatures(WIDTH, FEATURES, grid)
+    torch.nn.init.normal_(cell_features.place[-1].weight)
+    return cell_features.eval()
 
 
 def lying(*poses, seed=0):
@@ -30,7 +30,7 @@ def lying(*poses, seed=0):
     features = torch.randn(len(poses), WIDTH, generator=torch.Generator().manual_seed(seed))
     pose = torch.tensor([list(poses)], dtype=torch.float32).view(1, -1, 3)
     row = torch.arange(len(poses))[None]
-    return Lying(features, row, pose, torch.ones_like(row, dtype=torch.bool))
+    return CellSources(features, row, pose, torch.ones_like(row, dtype=torch.bool))
 
 
 NOTHING = lying()
@@ -39,14 +39,14 @@ EGO = torch.tensor([[3.0, -2.0, 0.4]])
 
 def at(grid, cell, turned_rad=0.0, off_m=(0.0, 0.0)):
     """The world's pose of a place in a cell, as the ego of these tests sees it."""
-    place_m = torch.from_numpy(grid.centre_m[cell]) + torch.tensor(off_m)
-    x, y, heading = cell_pose(EGO[0], place_m).tolist()
+    position_m = torch.from_numpy(grid.centre_m[cell]) + torch.tensor(off_m)
+    x, y, heading = cell_pose(EGO[0], position_m).tolist()
     return x, y, heading + turned_rad
 
 
-def changed(ground, things, other):
+def changed(cell_features, things, other):
     """Cells whose features differ between two streets."""
-    gap = ground(EGO, things, NOTHING) - ground(EGO, other, NOTHING)
+    gap = cell_features(EGO, things, NOTHING) - cell_features(EGO, other, NOTHING)
     return set((gap[0].abs().amax(dim=-1) > 1e-6).nonzero()[:, 0].tolist())
 
 
@@ -55,58 +55,60 @@ def neighbours(grid, cell):
     return set((gap_m < 1.5 * grid.step_m).nonzero()[0].tolist())
 
 
-def test_a_thing_speaks_for_its_cell_and_those_beside_it(ground, grid):
+def test_a_thing_speaks_for_its_cell_and_those_beside_it(cell_features, grid):
     cell = grid.ego_cell + 5
-    assert changed(ground, lying(at(grid, cell)), NOTHING) == neighbours(grid, cell)
+    assert changed(cell_features, lying(at(grid, cell)), NOTHING) == neighbours(grid, cell)
 
 
-def test_a_thing_between_four_cells_is_shared_out_between_them(ground, grid):
+def test_a_thing_between_four_cells_is_shared_out_between_them(cell_features, grid):
     cell, half_m = grid.ego_cell, grid.step_m / 2
-    laid = ground._lay(EGO, lying(at(grid, cell, off_m=(half_m, half_m))), ground.road)
-    whole = ground._lay(EGO, lying(at(grid, cell)), ground.road)
+    laid = cell_features._cell_sources(
+        EGO, lying(at(grid, cell, off_m=(half_m, half_m))), cell_features.road
+    )
+    whole = cell_features._cell_sources(EGO, lying(at(grid, cell)), cell_features.road)
     some = laid.abs().sum(dim=-1) > 1e-4 * whole.abs().max()
     assert some.sum() == 4
     torch.testing.assert_close(laid[some], whole.amax(dim=0).expand(4, -1) / 4)
 
 
-def test_things_outside_the_grid_say_nothing(ground, grid):
+def test_things_outside_the_grid_say_nothing(cell_features, grid):
     far = lying(at(grid, grid.ego_cell, off_m=(0.0, 1.5 * grid.radius_m)))
-    assert not changed(ground, far, NOTHING)
+    assert not changed(cell_features, far, NOTHING)
 
 
-def test_features_follow_a_thing_without_a_jump(ground, grid):
+def test_features_follow_a_thing_without_a_jump(cell_features, grid):
     edge_m = grid.step_m / 2
     before, after = (
-        ground(EGO, lying(at(grid, grid.ego_cell, off_m=(edge_m + e, 0.0))), NOTHING)
+        cell_features(EGO, lying(at(grid, grid.ego_cell, off_m=(edge_m + e, 0.0))), NOTHING)
         for e in (-1e-3, 1e-3)
     )
     assert (before - after).abs().max() < 5e-3
 
 
-def test_which_way_a_thing_faces_is_told(ground, grid):
+def test_which_way_a_thing_faces_is_told(cell_features, grid):
     cell = grid.ego_cell + 3
     turned = lying(at(grid, cell, turned_rad=math.pi))
-    assert changed(ground, lying(at(grid, cell)), turned) <= neighbours(grid, cell)
-    assert cell in changed(ground, lying(at(grid, cell)), turned)
+    assert changed(cell_features, lying(at(grid, cell)), turned) <= neighbours(grid, cell)
+    assert cell in changed(cell_features, lying(at(grid, cell)), turned)
 
 
-def test_roads_and_agents_are_told_apart(ground, grid):
+def test_roads_and_agents_are_told_apart(cell_features, grid):
     thing = lying(at(grid, grid.ego_cell))
-    gap = ground(EGO, thing, NOTHING) - ground(EGO, NOTHING, thing)
+    gap = cell_features(EGO, thing, NOTHING) - cell_features(EGO, NOTHING, thing)
     assert gap.abs().max() > 1e-3
 
 
-def test_a_query_chooses_by_the_products_of_features(ground):
+def test_a_query_chooses_by_the_products_of_features(cell_features):
     x, cells = torch.randn(2, 3, WIDTH), torch.randn(2, 7, FEATURES)
-    logits = ground.choose(x, cells)
-    asked = ground.ask(x[1, 2]) / math.sqrt(FEATURES)
+    logits = cell_features.choose(x, cells)
+    asked = cell_features.ask(x[1, 2]) / math.sqrt(FEATURES)
     torch.testing.assert_close(logits[1, 2, 4], asked @ cells[1, 4])
 
 
 @pytest.fixture
 def bearings(grid):
     torch.manual_seed(1)
-    return Bearings(WIDTH, FEATURES, grid.num_headings).eval()
+    return HeadingFeatures(WIDTH, FEATURES, grid.num_headings).eval()
 
 
 @pytest.mark.parametrize("bins", [1, 7, -3])
@@ -121,7 +123,9 @@ def test_turning_a_road_by_some_bins_turns_what_it_says(bearings, grid, bins):
 
 def test_roads_that_are_not_there_say_nothing(bearings):
     x, pose, roads = torch.randn(1, WIDTH), torch.zeros(1, 3), lying((1.0, 2.0, 0.3))
-    gone = Lying(roads.features, roads.row, roads.pose, torch.zeros_like(roads.present))
+    gone = CellSources(
+        roads.features, roads.row, roads.pose, torch.zeros_like(roads.present)
+    )
     torch.testing.assert_close(bearings(x, pose, gone), bearings(x, pose, NOTHING))
 
 
@@ -132,11 +136,15 @@ def test_several_questions_at_one_place_are_each_of_them(bearings):
         torch.testing.assert_close(together, alone)
 
 
-def test_no_query_is_no_answer(ground, bearings):
-    nobody = Lying(
+def test_no_query_is_no_answer(cell_features, bearings):
+    nobody = CellSources(
         torch.randn(0, WIDTH),
         *(x[:0] for x in (lying().row, EGO[:, None])),
         EGO[:0, :0] > 0,
     )
-    assert ground(EGO[:0], nobody, nobody).shape == (0, len(ground.centre_m), FEATURES)
+    assert cell_features(EGO[:0], nobody, nobody).shape == (
+        0,
+        len(cell_features.centre_m),
+        FEATURES,
+    )
     assert bearings(torch.randn(0, WIDTH), EGO[:0], nobody).shape[0] == 0

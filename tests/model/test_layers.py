@@ -10,8 +10,8 @@ from torch.nn import functional
 from infgen.model import neighbour_attention
 from infgen.model.layers import (
     Attention,
+    AttentionSources,
     FourierEmbedding,
-    Seen,
     dropout_factors,
     gather,
     initialise,
@@ -67,7 +67,7 @@ def make_seen(targets, slots, neighbours):
     relation = normed(torch.randn(targets, neighbours, WIDTH)).requires_grad_()
     present = torch.rand(targets, slots, neighbours) < 0.6
     present[0] = False  # One target sees nobody.
-    return Seen(features, index, Shared.of(relation), present), relation
+    return AttentionSources(features, index, Shared.of(relation), present), relation
 
 
 @pytest.mark.parametrize("bipartite", [False, True])
@@ -134,7 +134,7 @@ def test_a_target_without_neighbours_still_passes_gate_and_feed_forward():
     nobody = torch.zeros(3, 0, WIDTH)
     none = torch.zeros(3, 0, dtype=torch.bool)
 
-    updated = layer(target, Seen.own(nobody, Shared.of(nobody), none))
+    updated = layer(target, AttentionSources.own(nobody, Shared.of(nobody), none))
 
     assert torch.isfinite(updated).all()
     assert (updated - target).abs().max() > 0.1
@@ -146,7 +146,7 @@ def test_what_is_not_present_does_not_matter_whatever_it_holds():
     hidden = ~seen.present[:, 0, :, None]
     features = seen.features[seen.index].masked_fill(hidden, 3.0)
     other = relation.masked_fill(hidden, -5.0)
-    other = Seen.own(features, Shared.of(other), seen.present)
+    other = AttentionSources.own(features, Shared.of(other), seen.present)
 
     assert torch.equal(layer(target, seen), layer(target, other))
 

@@ -1,4 +1,4 @@
-"""The nearest road tokens by squares: the same as by looking at all of them."""
+"""The nearest map tokens by squares: the same as by looking at all of them."""
 
 import pytest
 import torch

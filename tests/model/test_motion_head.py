@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from infgen.model.motion_head import MoveHead
+from infgen.model.motion_head import MotionHead
 from infgen.tokens.vocabulary import BOX_LW_M, MotionVocabulary
 
 WIDTH, FEATURES = 16, 12
@@ -21,7 +21,7 @@ def row_of_moves(kinds=3, spacing_m=0.1, count=40):
 @pytest.fixture
 def head():
     torch.manual_seed(0)
-    return MoveHead(WIDTH, FEATURES, row_of_moves())
+    return MotionHead(WIDTH, FEATURES, row_of_moves())
 
 
 def features(rows, seed=0):
@@ -46,7 +46,7 @@ def test_moves_that_end_in_one_place_are_told_alike():
     book = row_of_moves()
     book.path[:, 7] = book.path[:, 3]
 
-    head = MoveHead(WIDTH, FEATURES, book)
+    head = MotionHead(WIDTH, FEATURES, book)
 
     logits = head(features(5), torch.zeros(5, dtype=torch.int64), head.table())
 
@@ -54,7 +54,7 @@ def test_moves_that_end_in_one_place_are_told_alike():
 
 
 def test_no_two_moves_a_centimetre_apart_look_the_same(head):
-    waves = MoveHead(WIDTH, FEATURES, row_of_moves(spacing_m=0.01)).waves[0]
+    waves = MotionHead(WIDTH, FEATURES, row_of_moves(spacing_m=0.01)).waves[0]
 
     gap = (waves[:, None] - waves).abs().amax(dim=-1)
     gap.fill_diagonal_(1.0)

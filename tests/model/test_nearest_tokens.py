@@ -7,7 +7,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from infgen import geometry
-from infgen.model.nearest_tokens import MoveEnds, nearest, nearest_of, to_local, to_world
+from infgen.model.nearest_tokens import (
+    MotionTokenEnds,
+    nearest,
+    nearest_of,
+    to_local,
+    to_world,
+)
 from infgen.tokens.motion_tokens import advance, make_match_table, nearest_motion_tokens
 from infgen.tokens.vocabulary import BOX_LW_M, MotionVocabulary
 
@@ -43,7 +49,7 @@ def test_the_nearest_move_is_the_same_on_tensors(seed, stray, rows):
     target = ahead + (rng.normal(size=(rows, 3)) * stray).astype(np.float32)
 
     wanted = torch.from_numpy(geometry.to_local(target, pose))
-    ends = MoveEnds.of(vocabulary, CPU)
+    ends = MotionTokenEnds.of(vocabulary, CPU)
     found = nearest(wanted, torch.from_numpy(kind).long(), ends)
 
     expected = nearest_motion_tokens(target, pose, kind, make_match_table(vocabulary))
@@ -54,7 +60,7 @@ def test_the_nearest_move_is_the_same_on_tensors(seed, stray, rows):
 @settings(max_examples=20)
 def test_the_nearest_of_all_moves_is_the_nearest(seed):
     rng = np.random.default_rng(seed)
-    ends = MoveEnds.of(random_codebook(rng), CPU)
+    ends = MotionTokenEnds.of(random_codebook(rng), CPU)
     wanted = torch.from_numpy(poses(rng, 60, far_m=4.0))
     kind = torch.from_numpy(rng.integers(0, 3, 60))
     everything = torch.arange(200).expand(60, 200)
@@ -67,7 +73,7 @@ def test_the_nearest_of_all_moves_is_the_nearest(seed):
 def test_the_nearest_of_some_is_among_them_and_the_first_of_twins():
     rng = np.random.default_rng(0)
     vocabulary = random_codebook(rng)
-    ends = MoveEnds.of(vocabulary, CPU)
+    ends = MotionTokenEnds.of(vocabulary, CPU)
     wanted = torch.from_numpy(vocabulary.end_pose[0, [1, 1, 7]])
     kind = torch.zeros(3, dtype=torch.int64)
     choice = torch.tensor([[1, 7, 100], [7, 100, 1], [7, 9, 3]])
@@ -79,7 +85,7 @@ def test_the_nearest_of_some_is_among_them_and_the_first_of_twins():
 def test_the_search_is_exact_under_autocast(dtype):
     rng = np.random.default_rng(1)
     vocabulary = random_codebook(rng)
-    ends = MoveEnds.of(vocabulary, CPU)
+    ends = MotionTokenEnds.of(vocabulary, CPU)
     wanted = torch.from_numpy(vocabulary.end_pose[1])
     kind = torch.ones(200, dtype=torch.int64)
 

@@ -12,8 +12,8 @@ from infgen.model.network import Network
 from infgen.tokens.scene_tokens import Presence
 
 CLOSE = {"atol": 1e-4, "rtol": 1e-4}
-MODELS = {"motion": "move_logits leave_logit", "entries": "add_logit cell_logits"}
-DETAILS = "kind_logits size_log_m heading_logits offset_m"
+MODELS = {"motion": "motion_logits remove_logit", "entries": "add_logit position_logits"}
+DETAILS = "agent_type_logits size_log_m heading_logits offset_m"
 
 
 @torch.no_grad()
@@ -65,7 +65,7 @@ def test_scenes_side_by_side_are_scenes_one_by_one(network, record, limits):
                 one = getattr(getattr(alone, part), name)
                 all_of_them = getattr(getattr(together, part), name)
                 mine = all_of_them[start : start + len(one)]
-                if part == "entries":  # Padded to the longest list of newcomers.
+                if part == "entries":  # Padded to the longest list of inserted agents.
                     mine = mine[:, : one.shape[1]]
                 torch.testing.assert_close(mine, one, **CLOSE, msg=f"{part}.{name}")
             rows[part] += len(one)
@@ -77,9 +77,9 @@ def test_padding_changes_nothing(network, record, limits):
     _, alone = run(network, [scene], limits)
     _, padded = run(network, [scene, long], limits)
 
-    count = len(alone.motion.move_logits)
+    count = len(alone.motion.motion_logits)
     torch.testing.assert_close(
-        padded.motion.move_logits[:count], alone.motion.move_logits, **CLOSE
+        padded.motion.motion_logits[:count], alone.motion.motion_logits, **CLOSE
     )
 
 
@@ -115,8 +115,8 @@ def test_what_comes_later_changes_no_logit(network, record, limits):
     whole, whole_out = run(network, [scene], limits)
     short, short_out = run(network, [early], limits)
 
-    moves = whole_out.motion.rows.spread(whole_out.motion.move_logits)[0, :6]
-    cut_moves = short_out.motion.rows.spread(short_out.motion.move_logits)[0]
+    moves = whole_out.motion.rows.spread(whole_out.motion.motion_logits)[0, :6]
+    cut_moves = short_out.motion.rows.spread(short_out.motion.motion_logits)[0]
     order = {tuple(p[0].tolist()): i for i, p in enumerate(_last_poses(whole))}
     for row, key in enumerate(_last_poses(short)):
         same = order[tuple(key[0].tolist())]
@@ -136,7 +136,7 @@ def _last_poses(batch):
 
 @pytest.fixture(scope="module")
 def crowded(record):
-    """Three newcomers at token 3, after three agents that are always there."""
+    """Three inserted agents at token 3, after three agents that are always there."""
     return record(8, tokens=6, lives=[(0, 5)] * 3 + [(3, 5)] * 3, spread_m=20.0)
 
 
@@ -153,8 +153,12 @@ def test_a_slot_sees_the_newcomers_before_it_and_not_those_after(network, crowde
         after = network(changed, hidden_roads=True)
 
     here = int(before.entries.rows.number[0, 3])
-    gap = (after.entries.cell_logits - before.entries.cell_logits)[here].abs().amax(-1)
-    assert gap[:2].max() == 0  # Slot 1 is asked for the second newcomer itself.
+    gap = (
+        (after.entries.position_logits - before.entries.position_logits)[here]
+        .abs()
+        .amax(-1)
+    )
+    assert gap[:2].max() == 0  # Slot 1 is asked for the second inserted agent itself.
     assert gap[2:].min() > 1e-4
 
 
@@ -162,7 +166,7 @@ def test_the_details_of_a_newcomer_do_not_show_the_newcomer(network, crowded, li
     batch, before = run(network, [crowded], limits)
     details, agents = batch.details, batch.agents
     newcomers = details.newcomer[0].nonzero()[:, 0]
-    row = int(newcomers[1])  # The second newcomer: one before it, one after.
+    row = int(newcomers[1])  # The second inserted agent: one before it, one after.
     moved = agents.pose.clone()
     for other in newcomers[1:]:
         moved[0, 3, details.agent[0, other], 2] += 1.0
@@ -171,7 +175,9 @@ def test_the_details_of_a_newcomer_do_not_show_the_newcomer(network, crowded, li
         after = network(replace(batch, agents=replace(agents, pose=moved)))
 
     at = int(before.details.rows.number[0, row])
-    assert torch.equal(after.details.kind_logits[at], before.details.kind_logits[at])
+    assert torch.equal(
+        after.details.agent_type_logits[at], before.details.agent_type_logits[at]
+    )
     assert torch.equal(after.details.heading_logits[at], before.details.heading_logits[at])
 
 
@@ -188,7 +194,7 @@ def test_pseudo_newcomers_do_not_see_themselves(network, record, limits):
 
     heading = before.details.heading_logits
     assert torch.equal(after.details.heading_logits[row], heading[row])
-    assert not torch.equal(after.motion.move_logits, before.motion.move_logits)
+    assert not torch.equal(after.motion.motion_logits, before.motion.motion_logits)
 
 
 def test_hidden_road_tokens_are_not_seen(network, record, limits):
@@ -214,7 +220,7 @@ def test_signals_as_they_were_last_are_seen(new_network, tiny, record, limits):
     with torch.no_grad():
         after = network(replace(batch, roads=replace(batch.roads, signal=signal)))
 
-    assert (after.motion.move_logits - before.motion.move_logits).abs().max() > 1e-4
+    assert (after.motion.motion_logits - before.motion.motion_logits).abs().max() > 1e-4
 
 
 def test_a_light_that_changes_is_seen_from_then_on_and_not_before(network, record, limits):
@@ -226,7 +232,9 @@ def test_a_light_that_changes_is_seen_from_then_on_and_not_before(network, recor
     with torch.no_grad():
         after = network(replace(batch, roads=replace(batch.roads, shown=shown)))
 
-    gap = before.motion.rows.spread(after.motion.move_logits - before.motion.move_logits)
+    gap = before.motion.rows.spread(
+        after.motion.motion_logits - before.motion.motion_logits
+    )
     assert gap[0, :4].abs().max() == 0
     assert gap[0, 4].abs().max() > 1e-3
 
@@ -238,7 +246,7 @@ def test_agents_are_told_of_the_lines_ahead(network, record, limits):
     with torch.no_grad():
         untold = network(replace(batch, roads=replace(batch.roads, follows=nowhere)))
 
-    gap = told.motion.move_logits - untold.motion.move_logits
+    gap = told.motion.motion_logits - untold.motion.motion_logits
     assert gap.abs().max() > 1e-3
 
 
@@ -248,9 +256,9 @@ def test_the_ego_alone_is_told_that_it_is(new_network, record, limits):
     batch.agents.pose[:, :, 1] += 500  # Neither sees the other.
 
     with torch.no_grad():
-        told = network(batch).motion.move_logits
+        told = network(batch).motion.motion_logits
         network.embed.ego.zero_()
-        untold = network(batch).motion.move_logits
+        untold = network(batch).motion.motion_logits
     ego, other = (told - untold).abs().amax(dim=-1).view(-1, 2).T
 
     assert ego.min() > 1e-3
@@ -272,9 +280,9 @@ def test_an_agent_that_is_not_observed_is_neither_row_nor_neighbour(
     with torch.no_grad():
         after = network(replace(batch, agents=replace(batch.agents, pose=pose)))
 
-    same = before.motion.rows.spread(before.motion.move_logits)[0, :4]
-    assert torch.equal(after.motion.rows.spread(after.motion.move_logits)[0, :4], same)
-    assert len(before.motion.move_logits) == int(batch.agents.visible.sum())
+    same = before.motion.rows.spread(before.motion.motion_logits)[0, :4]
+    assert torch.equal(after.motion.rows.spread(after.motion.motion_logits)[0, :4], same)
+    assert len(before.motion.motion_logits) == int(batch.agents.visible.sum())
 
 
 @pytest.mark.parametrize(
@@ -300,8 +308,8 @@ def test_odd_scenes_work(network, record, limits, shape):
 def test_sizes_follow_the_vocabularies(network, record, limits):
     _, outputs = run(network, [record(1)], limits)
 
-    assert outputs.motion.move_logits.shape[-1] == 24
-    assert outputs.entries.cell_logits.shape[-1] == network.grid.num_cells
+    assert outputs.motion.motion_logits.shape[-1] == 24
+    assert outputs.entries.position_logits.shape[-1] == network.grid.num_cells
     assert outputs.details.heading_logits.shape[-1] == 36
     assert outputs.roads.logits.shape[-1] == 12
 

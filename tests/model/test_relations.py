@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from infgen.model.neighbours import Reach, cell_pose, look_around
+from infgen.model.neighbours import NeighbourSpec, cell_pose, find_neighbours
 from infgen.model.relations import (
     Rows,
     across,
@@ -136,7 +136,7 @@ def test_across_is_how_far_off_a_lane_one_drives_wherever_the_lane_began():
 @pytest.mark.parametrize(("ahead_m", "seen"), [(0.0, {1, 2}), (6.0, {2, 3})])
 def test_who_looks_ahead_sees_what_lies_there_rather_than_behind(ahead_m, seen):
     relation = relation_embedding(20.0, 2, 8)
-    reach = Reach.of(20.0, 2, relation, ahead_m=ahead_m)
+    reach = NeighbourSpec.of(20.0, 2, relation, ahead_m=ahead_m)
     facing = 2.0
     way = torch.tensor([math.cos(facing), math.sin(facing)])
     along_m = torch.tensor([-4.0, -1.0, 2.0, 7.0])
@@ -144,7 +144,7 @@ def test_who_looks_ahead_sees_what_lies_there_rather_than_behind(ahead_m, seen):
     target = torch.tensor([[[0.0, 0.0, facing]]])
     one = Rows.where(torch.ones(1, 1, dtype=torch.bool))
 
-    found = look_around(
+    found = find_neighbours(
         reach, one, target, source, torch.arange(4)[None], torch.ones(1, 1, 4).bool()
     )
 

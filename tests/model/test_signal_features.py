@@ -17,7 +17,7 @@ REACH_M = 20.0
 
 
 def roads(pose, light, shown, follows=None):
-    """Maps of one scene: road tokens with their lights, all of them real."""
+    """Maps of one scene: map tokens with their lights, all of them real."""
     count = len(pose)
     nothing = torch.zeros((1, count), dtype=torch.int64)
     return Roads(
@@ -35,7 +35,7 @@ def roads(pose, light, shown, follows=None):
 
 
 def told(lines, pose=(0.0, 0.0, 0.0), token=0):
-    """Read what one agent is told: {class: (nearness, half seconds)}."""
+    """Read what one agent is told: {class: (nearness, token steps)}."""
     said = lines.ahead(
         torch.tensor([pose]), torch.tensor([0]), torch.tensor([token]), REACH_M
     )

@@ -9,17 +9,17 @@ from infgen.model.batching.batch import collate, collate_roads
 from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.neighbours import grid_place
 from infgen.model.stepping import Stepper
-from infgen.model.token_step import Column
+from infgen.model.token_step import TokenStep
 from infgen.tokens.scene_tokens import NO_CELL, NO_MOTION_TOKEN, Presence
 
 CLOSE = {"atol": 1e-4, "rtol": 1e-4}
 
 
 def column_at(agents, token, turns=OUTSIDE + 1):
-    """Column of a batch with newcomers up to a turn; the others are not there yet."""
+    """Token step of a batch with the agents inserted up to a turn."""
     hidden = agents.turn[:, token] >= turns
     presence = agents.presence[:, token].masked_fill(hidden, int(Presence.ABSENT))
-    return Column(
+    return TokenStep(
         kind=agents.kind,
         size_lwh_m=agents.size_lwh_m,
         pose=agents.pose[:, token],
@@ -31,7 +31,7 @@ def column_at(agents, token, turns=OUTSIDE + 1):
 
 
 def places(batch, token, slot):
-    """Where the newcomer of a slot is in the ego's grid frame; anything for nobody."""
+    """Position of the inserted agent of a slot in the ego's grid frame."""
     pose = batch.agents.pose[:, token]
     agent = batch.entries.agent[:, token, slot].clamp(min=0)
     return grid_place(pose[torch.arange(len(agent)), agent], pose[:, 0])
@@ -63,10 +63,10 @@ def play(network, batch, records):
             for slot in range(slots):
                 queries[token, slot] = stepper.entry_query(entries)
                 cell = batch.entries.cell[:, token, slot]
-                place_m = None if by_cell else places(batch, token, slot)
-                details[token, slot] = stepper.entry_details(entries, cell, place_m)
-                column = column_at(batch.agents, token, turns=slot + 1)
-                entries = stepper.entry_add(entries, column)
+                position_m = None if by_cell else places(batch, token, slot)
+                details[token, slot] = stepper.entry_details(entries, cell, position_m)
+                token_step = column_at(batch.agents, token, turns=slot + 1)
+                entries = stepper.entry_add(entries, token_step)
         motion.append(stepper.motion_step(memory, column_at(batch.agents, token)))
     return motion, queries, details
 
@@ -88,7 +88,7 @@ def both(variant, new_network, records, limits):
 
 def test_motion_is_the_same_step_by_step(both):
     batch, outputs, (motion, _, _) = both
-    for name in ("move_logits", "leave_logit", "pattern_logits"):
+    for name in ("motion_logits", "remove_logit", "pattern_logits"):
         said = getattr(outputs.motion, name)
         spread = None if said is None else outputs.motion.rows.spread(said)
         for token, step in enumerate(motion):
@@ -104,7 +104,7 @@ def test_queries_for_newcomers_are_the_same_step_by_step(both):
     assert (batch.entries.agent >= 0).sum() >= 3
     for (token, slot), query in queries.items():
         seen = batch.entries.asked[:, token]
-        for name in ("add_logit", "cell_logits", "place_m"):
+        for name in ("add_logit", "position_logits", "position_m"):
             wanted = getattr(said, name)
             wanted = None if wanted is None else said.rows.spread(wanted)
             same(of(getattr(query, name), seen), of(wanted, seen, token, slot))
@@ -122,7 +122,7 @@ def test_details_of_newcomers_are_the_same_step_by_step(both):
         token, turn = int(pack(wanted.token)[row]), int(pack(wanted.turn)[row])
         step, kind = details[token, turn], int(pack(wanted.kind)[row])
         at = scene[row]
-        same(step.kind_logits[at], found.kind_logits[row])
+        same(step.agent_type_logits[at], found.agent_type_logits[row])
         same(step.size_lwh_m[at, kind].log(), found.size_log_m[row])
         for name in ("heading_logits", "turned_rad", "offset_m"):
             same(of(getattr(step, name), at, kind), of(getattr(found, name), row))
@@ -134,7 +134,7 @@ def test_weights_that_know_motion_only_let_nobody_in(tiny, new_network, records)
     stepper = Stepper(new_network(replace(tiny, insertion_and_removal=False)))
     roads = collate_roads(records, 10_000)
     memory = stepper.begin(roads, torch.arange(2), rows=4)
-    nobody = Column(
+    nobody = TokenStep(
         kind=torch.zeros((2, 4), dtype=torch.int64),
         size_lwh_m=torch.ones((2, 4, 3)),
         pose=torch.zeros((2, 4, 3)),

@@ -131,16 +131,16 @@ def test_who_enters_where_changes_nothing_where_only_motion_is_modelled(
         one, two = network(batch), network(replace(batch, agents=other))
 
     assert leaving.any()
-    assert torch.equal(one.motion.move_logits, two.motion.move_logits)
+    assert torch.equal(one.motion.motion_logits, two.motion.motion_logits)
 
 
 def test_places_are_the_inverse_of_cells(batch):
     ego_pose = torch.tensor([[3.0, -2.0, 0.7], [0.0, 5.0, -2.0]])
-    place_m = torch.tensor([[10.0, -20.0], [0.5, 40.0]])
+    position_m = torch.tensor([[10.0, -20.0], [0.5, 40.0]])
 
-    there = cell_pose(ego_pose, place_m)
+    there = cell_pose(ego_pose, position_m)
 
-    torch.testing.assert_close(grid_place(there, ego_pose), place_m, atol=1e-4, rtol=0)
+    torch.testing.assert_close(grid_place(there, ego_pose), position_m, atol=1e-4, rtol=0)
 
 
 def test_regression_of_places_and_headings_is_right_at_the_logs_own(
@@ -150,12 +150,12 @@ def test_regression_of_places_and_headings_is_right_at_the_logs_own(
     outputs = network(batch, hidden_roads=True)
     entries, details, pose = batch.entries, batch.details, batch.agents.pose
 
-    place_m = torch.zeros_like(outputs.entries.place_m)
+    position_m = torch.zeros_like(outputs.entries.position_m)
     for row, at in enumerate(outputs.entries.rows.at.tolist()):
         scene, token = divmod(at, entries.agent.shape[1])
         for slot, agent in enumerate(entries.agent[scene, token].tolist()):
             ego_pose = pose[scene, token, 0]
-            place_m[row, slot] = grid_place(pose[scene, token, agent], ego_pose)
+            position_m[row, slot] = grid_place(pose[scene, token, agent], ego_pose)
     turned_rad = torch.zeros_like(outputs.details.turned_rad)
     for row, at in enumerate(outputs.details.rows.at.tolist()):
         scene, one = divmod(at, details.agent.shape[1])
@@ -164,7 +164,7 @@ def test_regression_of_places_and_headings_is_right_at_the_logs_own(
         turned_rad[row] = away_rad + 2 * math.pi  # A whole turn more is no error.
     right = replace(
         outputs,
-        entries=replace(outputs.entries, place_m=place_m + 6.0),
+        entries=replace(outputs.entries, position_m=position_m + 6.0),
         details=replace(outputs.details, turned_rad=turned_rad + 0.3),
     )
     terms = losses(right, batch, TRAIN)
@@ -179,9 +179,9 @@ def test_regression_of_places_and_headings_is_right_at_the_logs_own(
 def test_regressed_places_stay_within_the_grids_square(tiny, new_network, batch):
     outputs = new_network(replace(tiny, position_token=False))(batch)
 
-    assert outputs.entries.cell_logits is None
+    assert outputs.entries.position_logits is None
     assert outputs.details.offset_m is None
-    assert outputs.entries.place_m.abs().max() <= 60.0
+    assert outputs.entries.position_m.abs().max() <= 60.0
 
 
 def test_patterns_are_learned_as_long_as_an_agent_lives_on(batch, tiny, new_network):

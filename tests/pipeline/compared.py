@@ -4,9 +4,9 @@ import numpy as np
 
 from infgen.config import ReferenceSettings, ScoreSettings
 from infgen.views.sheets import Measured
-from pipeline.comparison.execution import Ran
-from pipeline.comparison.result import Compared
-from pipeline.comparison.runs import Leg
+from pipeline.comparison.execution import ExecutedRun
+from pipeline.comparison.result import ComparisonResult
+from pipeline.comparison.runs import ArmRun
 from pipeline.comparison.scores import Scored
 from pipeline.settings.overlay import Overlay
 from pipeline.settings.presets import Arm, Preset
@@ -38,7 +38,7 @@ def scored(method, seed, means, *, mode="long", numbers=None, curves=None) -> Sc
         for name, values in (curves or {}).items()
     }
     return Scored(
-        ran=Ran(Leg("mini", method, seed, mode), "made"),
+        ran=ExecutedRun(ArmRun("mini", method, seed, mode), "made"),
         mode=mode,
         weights=f"weights of {method.name} {seed}",
         scenes=len(means),
@@ -54,13 +54,13 @@ def scored(method, seed, means, *, mode="long", numbers=None, curves=None) -> Sc
     )
 
 
-def compared(runs, logs=None, *, missing=(), count_error="truth") -> Compared:
+def compared(runs, logs=None, *, missing=(), count_error="truth") -> ComparisonResult:
     """A comparison of scored runs; ``missing`` are runs that failed."""
     arms = {one.ran.leg.arm.name: one.ran.leg.arm for one in runs}
     arms |= {each.leg.arm.name: each.leg.arm for each in missing}
     preset = Preset("mini", (), 1, count_error, {}, arms)
     ran = [*[one.ran for one in runs], *missing]
-    return Compared(preset, ran, list(runs), logs or Tally())
+    return ComparisonResult(preset, ran, list(runs), logs or Tally())
 
 
 def _spread(value):

@@ -23,7 +23,7 @@ from pipeline.engine.stage import Unit
 from pipeline.settings.request import Request
 from pipeline.stages.tokenize import SCHEMA
 from pipeline.stages.train.loader import TokenScenes
-from pipeline.stages.train.setup import Course
+from pipeline.stages.train.setup import TrainingSetup
 from pipeline.storage.weights import save_network, state_dict_of
 from pipeline.storage.zarr_store import write_records
 from tests.pipeline.finished import TINY
@@ -183,9 +183,9 @@ def train_unit(shards):
 
 
 @pytest.fixture
-def course(shards, tmp_path):
+def setup(shards, tmp_path):
     """The same as what a training loop is given."""
-    return Course(
+    return TrainingSetup(
         TRAINING["model"],
         TRAINING["train"],
         TRAINING["tokenize"],

@@ -7,8 +7,8 @@ import torch
 from infgen.config import ModelSettings, RolloutSettings, TokenSettings
 from infgen.model.network import Network
 from infgen.model.stepping import Stepper
-from infgen.rollout.recording import Start
-from infgen.rollout.simulator import Player
+from infgen.rollout.recording import RolloutStart
+from infgen.rollout.simulator import Simulator
 from infgen.tokens.grid import make_grid
 from infgen.tokens.tokenizer import tokenize_scene
 
@@ -18,14 +18,14 @@ SMALL = ModelSettings(
 
 
 @pytest.fixture
-def player(metre_moves, bent_roads):
+def simulator(metre_moves, bent_roads):
     """``player(model={}, **settings)``: an untrained network, ready to be played."""
 
     def build(model=None, **settings):
         torch.manual_seed(0)
         sizes = replace(SMALL, **(model or {}))
         network = Network(sizes, metre_moves, bent_roads, TokenSettings())
-        return Player(
+        return Simulator(
             stepper=Stepper(network),
             vocabulary=metre_moves,
             roads=bent_roads,
@@ -41,8 +41,8 @@ def player(metre_moves, bent_roads):
 def force():
     """``force(player, add=None, leave=None)``: fix log-odds of entering and leaving."""
 
-    def fix(player, *, add=None, leave=None):
-        network = player.stepper.network
+    def fix(simulator, *, add=None, leave=None):
+        network = simulator.stepper.network
         if add is not None:
             say(network.cells.add, add)
         if leave is not None:
@@ -68,7 +68,7 @@ def start(metre_moves, bent_roads):
         history = tokenize_scene(
             scene, metre_moves, bent_roads, TokenSettings(), until=scene.now
         )
-        return Start(scene=scene, history=history, index=index, seed=7)
+        return RolloutStart(scene=scene, history=history, index=index, seed=7)
 
     return build
 

@@ -12,34 +12,40 @@ import torch
 from torch import Tensor
 
 from infgen.model.agents import KINDS
-from infgen.model.batching.batch import Agents, Batch, Details, Entries, collate_roads
+from infgen.model.batching.batch import Agents, Batch, Details, Insertions, collate_roads
 from infgen.model.batching.insertion_targets import OUTSIDE
-from infgen.model.logits import DetailOutputs, EntryOutputs, MotionOutputs
+from infgen.model.logits import DetailOutputs, InsertionOutputs, MotionOutputs
 from infgen.model.stepping import Stepper
-from infgen.model.token_step import Column, EntryDetails, EntryQuery, MotionStep
-from infgen.rollout.population import settle
+from infgen.model.token_step import InsertionDetails, MotionStep, PositionOutputs, TokenStep
+from infgen.rollout.population import place_logged_agents
 from infgen.rollout.recording import NOBODY
 from infgen.rollout.session import Session
 from infgen.tokens.scene_tokens import NO_CELL, NO_MOTION_TOKEN, Presence
 
-QUERY_LOGITS = ("add_logit", "cell_logits", "place_m")
-DETAIL_LOGITS = ("kind_logits", "size_lwh_m", "heading_logits", "turned_rad", "offset_m")
-MOTION_LOGITS = ("move_logits", "leave_logit", "pattern_logits")
+QUERY_LOGITS = ("add_logit", "position_logits", "position_m")
+DETAIL_LOGITS = (
+    "agent_type_logits",
+    "size_lwh_m",
+    "heading_logits",
+    "turned_rad",
+    "offset_m",
+)
+MOTION_LOGITS = ("motion_logits", "remove_logit", "pattern_logits")
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Which rollouts asked for a newcomer at a half second, and which turn it was for each.
+class RequestOptions:
+    """Rollouts that queried an insertion at a token step, and the turn of each.
 
-    ``cell`` and ``place_m`` are where in them, if it was asked who enters.
+    ``cell`` and ``position_m`` are where in them, if it was asked who enters.
     """
 
     token: int
     rollout: Tensor
     turn: Tensor
-    said: EntryQuery | EntryDetails
+    said: PositionOutputs | InsertionDetails
     cell: Tensor | None = None
-    place_m: Tensor | None = None
+    position_m: Tensor | None = None
 
 
 class Listening(Stepper):
@@ -47,14 +53,14 @@ class Listening(Stepper):
 
     def __init__(self, network):
         super().__init__(network)
-        self.columns: list[Column] = []
+        self.columns: list[TokenStep] = []
         self.motion: list[MotionStep] = []
-        self.queries: list[Asked] = []
-        self.details: list[Asked] = []
+        self.queries: list[RequestOptions] = []
+        self.details: list[RequestOptions] = []
 
-    def motion_step(self, memory, column):
-        said = super().motion_step(memory, column)
-        self.columns.append(column)
+    def motion_step(self, memory, token_step):
+        said = super().motion_step(memory, token_step)
+        self.columns.append(token_step)
         self.motion.append(said)
         return said
 
@@ -63,16 +69,16 @@ class Listening(Stepper):
         self.queries.append(asked(entries, said))
         return said
 
-    def entry_details(self, entries, cell, place_m=None):
-        said = super().entry_details(entries, cell, place_m)
-        self.details.append(asked(entries, said, cell, place_m))
+    def entry_details(self, entries, cell, position_m=None):
+        said = super().entry_details(entries, cell, position_m)
+        self.details.append(asked(entries, said, cell, position_m))
         return said
 
 
 def asked(entries, said, *where):
-    """Note who asked; newcomers so far tell the turn."""
-    turn = (entries.column.presence == Presence.INSERTED).sum(dim=1)
-    return Asked(entries.token, entries.rollout, turn, said, *where)
+    """Note who asked; inserted agents so far tell the turn."""
+    turn = (entries.token_step.presence == Presence.INSERTED).sum(dim=1)
+    return RequestOptions(entries.token, entries.rollout, turn, said, *where)
 
 
 @dataclass(frozen=True)
@@ -91,7 +97,7 @@ class Played:
 
     @property
     def tokens(self):
-        """Half seconds whose column was played to the end."""
+        """Token steps whose column was played to the end."""
         return len(self.heard.columns)
 
     @property
@@ -101,7 +107,9 @@ class Played:
     @property
     def presence(self):
         """``Presence`` [token, rollout, row]."""
-        return torch.stack([column.presence for column in self.heard.columns]).numpy()
+        return torch.stack(
+            [token_step.presence for token_step in self.heard.columns]
+        ).numpy()
 
     @property
     def queries(self):
@@ -112,20 +120,20 @@ class Played:
         return [one for one in self.heard.details if one.token < self.tokens]
 
 
-def play(player, starts, half_seconds):
-    """Play so many half seconds, each with its newcomers."""
-    session = Session(player, starts)
-    lives = [session.population.life] * (session.token + 1)
+def play(simulator, starts, half_seconds):
+    """Play so many token steps, each with its inserted agents."""
+    session = Session(simulator, starts)
+    lives = [session.population.agent_number] * (session.token + 1)
     for _ in range(half_seconds):
         session.step()
-        lives.append(session.population.life)
-    session.step()  # Only now is the network shown the newcomers of the last half second.
-    return Played(starts, player.stepper, _agents_of(starts, np.stack(lives)))
+        lives.append(session.population.agent_number)
+    session.step()  # Only now does the network see the agents inserted last.
+    return Played(starts, simulator.stepper, _agents_of(starts, np.stack(lives)))
 
 
 def _agents_of(starts, lives):
     """Number agents: those of the history by their rows, the others by their lives."""
-    settled = settle(starts, lives.shape[2])[-1].life
+    settled = place_logged_agents(starts, lives.shape[2])[-1].agent_number
     agent = lives.copy()
     for at, start in enumerate(starts):
         logged = np.flatnonzero(settled[at] != NOBODY)
@@ -157,7 +165,7 @@ def _agents(played):
     number = agent[token, rollout, row]
 
     def told(name, fill):
-        values = torch.stack([getattr(column, name) for column in columns])
+        values = torch.stack([getattr(token_step, name) for token_step in columns])
         shape = (rollouts, tokens, count, *values.shape[3:])
         filled = torch.full(shape, fill, dtype=values.dtype)
         filled[rollout, token, number] = values[token, rollout, row]
@@ -189,11 +197,11 @@ def _turns(presence, now):
 
 
 def _entries(played):
-    """Ask for as many newcomers at every half second as the engine ever did."""
+    """Ask for as many inserted agents at every token step as the engine ever did."""
     shape = (len(played.starts), played.tokens)
     slots = 1 + max((int(one.turn.max()) for one in played.queries), default=0)
     nobody = torch.full((*shape, slots), NOBODY)
-    return Entries(
+    return Insertions(
         asked=(torch.arange(played.tokens) > played.now).expand(shape),
         count=torch.zeros(shape, dtype=torch.int64),
         agent=nobody,
@@ -215,9 +223,9 @@ def _details(network, played):
 
     token, cell = spread("token", torch.int64), spread("cell", torch.int64)
     offset_m = torch.zeros((*token.shape, 2))
-    if told and told[0].place_m is not None:
-        place_m = spread("place_m", torch.float32, (2,))
-        offset_m = place_m - network.details.centre_m[cell]
+    if told and told[0].position_m is not None:
+        position_m = spread("position_m", torch.float32, (2,))
+        offset_m = position_m - network.details.centre_m[cell]
     present = spread("rollout", torch.bool)
     return Details(
         present=present,
@@ -240,7 +248,7 @@ class Gaps:
         self.largest: dict[str, float] = {}
         self.compared: dict[str, int] = {}
         self._motion(played, outputs.motion)
-        visible = sum(int(column.visible.sum()) for column in played.heard.columns)
+        visible = sum(int(token_step.visible.sum()) for token_step in played.heard.columns)
         assert batch.agents.visible.sum() == visible
         if outputs.entries is not None:
             self._queries(played, outputs.entries)
@@ -256,7 +264,7 @@ class Gaps:
                 heard = None if heard is None else heard[rollout, row]
                 self._take(name, heard, getattr(said, name), number)
 
-    def _queries(self, played, said: EntryOutputs):
+    def _queries(self, played, said: InsertionOutputs):
         for one in played.queries:
             number = said.rows.number[one.rollout, one.token]
             for name in QUERY_LOGITS:
@@ -272,7 +280,7 @@ class Gaps:
                 told = said.size_log_m.exp() if name == "size_lwh_m" else None
                 told = getattr(said, name) if told is None else told
                 heard = getattr(one.said, name)
-                if name == "kind_logits":  # The same whatever kind is given.
+                if name == "agent_type_logits":  # The same whatever kind is given.
                     heard = heard[:, None].expand(-1, len(KINDS), -1)
                 self._take(name, heard, told, number)
 

@@ -22,7 +22,7 @@ BUSY = {
     "add_bias": -0.7,
     "remove_bias": -2.2,
 }
-"""Agents come and go at every half second, rows run out and are used again at once."""
+"""Agents come and go at every token step, rows run out and are used again at once."""
 
 
 @pytest.fixture
@@ -34,11 +34,11 @@ def starts(crossing, start):
 
 
 @pytest.fixture
-def listening(player):
+def listening(simulator):
     """``listening(model={}, stepper=Listening)``: a player that keeps what is said."""
 
     def build(model=None, stepper=Listening, **settings):
-        playing = player(
+        playing = simulator(
             {"temporal_window_tokens": 6, **(model or {})}, **{**BUSY, **settings}
         )
         network = playing.stepper.network
@@ -50,10 +50,10 @@ def listening(player):
     return build
 
 
-def compare(player, starts, half_seconds):
+def compare(simulator, starts, half_seconds):
     """Play and recompute: what was played, and how far the logits are apart."""
-    played = play(player, starts, half_seconds)
-    return played, Gaps(played, *recompute(player.stepper.network, played))
+    played = play(simulator, starts, half_seconds)
+    return played, Gaps(played, *recompute(simulator.stepper.network, played))
 
 
 def test_every_logit_of_thirty_seconds_is_that_of_a_plain_pass(starts, listening):
@@ -69,9 +69,9 @@ def test_every_logit_of_thirty_seconds_is_that_of_a_plain_pass(starts, listening
     tries = sum(len(one.rollout) for one in played.details)
     assert tries > 1.2 * entering.sum(), "places are refused"
     assert set(gaps.compared) == {
-        *("move_logits", "leave_logit"),
-        *("add_logit", "cell_logits"),
-        *("kind_logits", "size_lwh_m", "heading_logits", "offset_m"),
+        *("motion_logits", "remove_logit"),
+        *("add_logit", "position_logits"),
+        *("agent_type_logits", "size_lwh_m", "heading_logits", "offset_m"),
     }
     assert min(gaps.compared.values()) > 200
     assert max(gaps.largest.values()) < CLOSE, gaps.largest
@@ -97,8 +97,8 @@ def test_the_same_holds_for_variants(starts, listening, model, settings):
 class Forgetful(Listening):
     """Loses the oldest column that it should remember."""
 
-    def motion_step(self, memory, column):
-        said = super().motion_step(memory, column)
+    def motion_step(self, memory, token_step):
+        said = super().motion_step(memory, token_step)
         memory.visible[:, :, memory.columns % memory.window] = False
         return said
 
@@ -106,24 +106,24 @@ class Forgetful(Listening):
 class Mixed(Listening):
     """Takes what one agent was for what its neighbour was."""
 
-    def motion_step(self, memory, column):
-        said = super().motion_step(memory, column)
+    def motion_step(self, memory, token_step):
+        said = super().motion_step(memory, token_step)
         memory.features = memory.features.roll(1, dims=2)
         return said
 
 
 class Blind(Listening):
-    """Asks for newcomers without seeing those before."""
+    """Asks for inserted agents without seeing those before."""
 
-    def entry_add(self, entries, column):
-        seen = super().entry_add(entries, column)
-        newcomers = (column.presence == Presence.INSERTED).any()
-        return replace(seen, within=entries.within) if newcomers else seen
+    def entry_add(self, entries, token_step):
+        seen = super().entry_add(entries, token_step)
+        inserted = (token_step.presence == Presence.INSERTED).any()
+        return replace(seen, within=entries.within) if inserted else seen
 
 
 @pytest.mark.parametrize(
     ("broken", "wrong"),
-    [(Forgetful, "move_logits"), (Mixed, "move_logits"), (Blind, "cell_logits")],
+    [(Forgetful, "motion_logits"), (Mixed, "motion_logits"), (Blind, "position_logits")],
 )
 def test_a_broken_memory_is_found(starts, listening, broken, wrong):
     playing = listening(stepper=broken)
@@ -143,8 +143,10 @@ def test_alone_or_among_thirty_two_the_network_says_the_same(start, crossing, li
         np.testing.assert_array_equal(one.move[0], beside.move[chosen])
         np.testing.assert_array_equal(one.presence[0], beside.presence[chosen])
     for one, beside in zip(alone.motion, together.motion, strict=True):
-        torch.testing.assert_close(one.move_logits[0], beside.move_logits[chosen], **NEAR)
-        torch.testing.assert_close(one.leave_logit[0], beside.leave_logit[chosen], **NEAR)
+        torch.testing.assert_close(
+            one.motion_logits[0], beside.motion_logits[chosen], **NEAR
+        )
+        torch.testing.assert_close(one.remove_logit[0], beside.remove_logit[chosen], **NEAR)
     assert len(alone.queries) > half_seconds
     for one in alone.queries:
         beside = next(
@@ -154,4 +156,4 @@ def test_alone_or_among_thirty_two_the_network_says_the_same(start, crossing, li
             and (other.turn[other.rollout == chosen] == one.turn).any()
         )
         torch.testing.assert_close(one.said.add_logit, beside.add_logit, **NEAR)
-        torch.testing.assert_close(one.said.cell_logits, beside.cell_logits, **NEAR)
+        torch.testing.assert_close(one.said.position_logits, beside.position_logits, **NEAR)

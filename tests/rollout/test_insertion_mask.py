@@ -1,11 +1,11 @@
-"""Where newcomers may stand: the ego at the origin of a straight road, cars beside it."""
+"""The insertion mask around an ego at the origin of a straight road, cars beside it."""
 
 import numpy as np
 import pytest
 
 from infgen.geometry import boxes_overlap
-from infgen.rollout.insertion_mask import make_room
-from infgen.rollout.population import Newcomers, settle
+from infgen.rollout.insertion_mask import make_insertion_mask
+from infgen.rollout.population import InsertedAgents, place_logged_agents
 from infgen.scene import AgentType
 from infgen.tokens.map import PolylineType
 from infgen.tokens.scene_tokens import FIRST_MOTION_TOKEN
@@ -18,14 +18,14 @@ SIZE = {CAR: (4.0, 2.0, 1.5), WALKER: (1.0, 1.0, 1.7)}
 def begun(parked, start):
     """The ego at the origin facing +x, another car at (8, -2); the lane is y = 0."""
     begin = start(parked(1))
-    return begin, settle([begin], min_rows=4)[-1]
+    return begin, place_logged_agents([begin], min_rows=4)[-1]
 
 
 def newcomer(x_m, y_m, kind=CAR, turned_rad=0.0):
     # The grid's +y is the ego's +x, its +x the ego's right.
-    return Newcomers(
+    return InsertedAgents(
         who=np.array([True]),
-        place_m=np.array([[-y_m, x_m]], dtype=np.float32),
+        position_m=np.array([[-y_m, x_m]], dtype=np.float32),
         turned_rad=np.array([turned_rad], dtype=np.float32),
         kind=np.array([kind], dtype=np.int8),
         size_lwh_m=np.array([SIZE[kind]], dtype=np.float32),
@@ -38,7 +38,7 @@ def books(metre_moves, bent_roads):
 
 
 def room_of(begin, books, lane_m):
-    return make_room([begin.history], books, np.zeros(1, dtype=np.int64), lane_m)
+    return make_insertion_mask([begin.history], books, np.zeros(1, dtype=np.int64), lane_m)
 
 
 @pytest.mark.parametrize(
@@ -60,33 +60,33 @@ def test_newcomers_stand_on_nobody_and_vehicles_by_a_lane(
     begun, books, newcomer_at, allowed
 ):
     begin, population = begun
-    room = room_of(begin, books, lane_m=5.0)
+    insertion_mask = room_of(begin, books, lane_m=5.0)
 
-    assert room.allows(population, newcomer(*newcomer_at)).tolist() == [allowed]
+    assert insertion_mask.allows(population, newcomer(*newcomer_at)).tolist() == [allowed]
 
 
 def test_pedestrians_may_walk_close_together(begun, books):
     begin, population = begun
-    room = room_of(begin, books, lane_m=5.0)
+    insertion_mask = room_of(begin, books, lane_m=5.0)
     population.kind[0, 1] = WALKER
     population.size_lwh_m[0, 1] = SIZE[WALKER]
 
-    assert room.allows(population, newcomer(8.3, -2, WALKER)).all()
-    assert not room.allows(population, newcomer(8.3, -2, CAR)).any()
+    assert insertion_mask.allows(population, newcomer(8.3, -2, WALKER)).all()
+    assert not insertion_mask.allows(population, newcomer(8.3, -2, CAR)).any()
 
 
 def test_nobody_enters_where_another_will_be_in_half_a_second(begun, books):
-    """The car at (8, -2), 4.8 m long, drives on by 5 m: newcomers are 4 m long."""
+    """The car at (8, -2), 4.8 m long, drives on by 5 m: inserted agents are 4 m long."""
     begin, population = begun
-    room = room_of(begin, books, lane_m=1e6)
+    insertion_mask = room_of(begin, books, lane_m=1e6)
     ahead = [newcomer(x_m, -2) for x_m in (12.5, 17.3, 17.5)]
 
     population.move[0, 1] = 0
-    stands = [room.allows(population, one).item() for one in ahead]
+    stands = [insertion_mask.allows(population, one).item() for one in ahead]
     population.move[0, 1] = 5
-    drives = [room.allows(population, one).item() for one in ahead]
+    drives = [insertion_mask.allows(population, one).item() for one in ahead]
     population.move[0, 1] = FIRST_MOTION_TOKEN
-    enters = [room.allows(population, one).item() for one in ahead]
+    enters = [insertion_mask.allows(population, one).item() for one in ahead]
 
     assert stands == enters == [True, True, True]
     assert drives == [False, False, True]
@@ -94,42 +94,42 @@ def test_nobody_enters_where_another_will_be_in_half_a_second(begun, books):
 
 def test_places_that_nobody_holds_are_free(begun, books):
     begin, population = begun
-    room = room_of(begin, books, lane_m=1e6)
+    insertion_mask = room_of(begin, books, lane_m=1e6)
     population.presence[0, 1] = 0
 
-    assert room.allows(population, newcomer(8, -2)).all()
+    assert insertion_mask.allows(population, newcomer(8, -2)).all()
 
 
 def test_lanes_are_measured_along_their_whole_length(begun, books):
     begin, _ = begun
-    room = room_of(begin, books, lane_m=5.0)
+    insertion_mask = room_of(begin, books, lane_m=5.0)
 
-    # Road tokens start every five metres: halfway between two the lane is as near.
+    # Map tokens start every five metres: halfway between two the lane is as near.
     for x_m in (10.0, 11.0, 12.5):
-        gap_m = room.lane_distance_m(np.array([[x_m, 3.0]], dtype=np.float32))
+        gap_m = insertion_mask.lane_distance_m(np.array([[x_m, 3.0]], dtype=np.float32))
         np.testing.assert_allclose(gap_m, 3.0, atol=0.05)
 
 
 def test_each_rollout_is_asked_on_its_own_map(parked, drive, start, books, build_map):
     here = start(parked(1))
     elsewhere = start(drive(road_map=build_map([])))
-    room = make_room(
+    insertion_mask = make_insertion_mask(
         [here.history, elsewhere.history], books, np.array([1, 0, 0]), lane_m=5.0
     )
-    population = settle([elsewhere, here, here], min_rows=4)[-1]
+    population = place_logged_agents([elsewhere, here, here], min_rows=4)[-1]
     far = newcomer(30, 20)
-    three = Newcomers(
+    three = InsertedAgents(
         **{name: np.repeat(getattr(far, name), 3, axis=0) for name in far.__slots__}
     )
 
     # A map without lanes asks for none.
     assert not (elsewhere.history.map_polyline_type == PolylineType.LANE).any()
-    assert room.allows(population, three).tolist() == [True, False, False]
+    assert insertion_mask.allows(population, three).tolist() == [True, False, False]
 
 
 def test_overlap_is_that_of_the_boxes_in_the_scene(begun, books):
     begin, population = begun
-    room = room_of(begin, books, lane_m=1e6)
+    insertion_mask = room_of(begin, books, lane_m=1e6)
     random = np.random.default_rng(0)
     for x_m, y_m, turned_rad in random.uniform([-8, -6, -3], [16, 6, 3], size=(200, 3)):
         pose = np.array([[x_m, y_m, turned_rad]], dtype=np.float32)
@@ -140,6 +140,6 @@ def test_overlap_is_that_of_the_boxes_in_the_scene(begun, books):
             population.size_lwh_m[0, :2, :2],
         ).any()
 
-        allowed = room.allows(population, newcomer(x_m, y_m, CAR, turned_rad))
+        allowed = insertion_mask.allows(population, newcomer(x_m, y_m, CAR, turned_rad))
 
         assert allowed.tolist() == [not on_somebody]

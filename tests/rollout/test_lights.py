@@ -31,25 +31,25 @@ def lit(crossing, build_signals):
 
 
 @pytest.fixture
-def play(player, start):
-    """``play(scene, lights, model=...)``: logits of moves, half second by half second."""
+def play(simulator, start):
+    """``play(scene, lights, model=...)``: logits of moves, token step by token step."""
 
     def build(scene, lights, model=SEES):
-        playing = player(model, insert=False, remove=False, motion_top_k=1)
+        playing = simulator(model, insert=False, remove=False, motion_top_k=1)
         network = playing.stepper.network
         with torch.no_grad():
             network.roads.signal.weight.normal_(std=3.0)
         session = Session(playing, replace(start(scene), lights=lights))
         step, said = playing.stepper.motion_step, []
 
-        def heard(memory, column):
-            said.append(step(memory, column))
+        def heard(memory, token_step):
+            said.append(step(memory, token_step))
             return said[-1]
 
         playing.stepper.motion_step = heard
         for _ in range(6):
             session.step()
-        return [one.packed.move_logits for one in said]
+        return [one.packed.motion_logits for one in said]
 
     return build
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from infgen.rollout.random_streams import Purpose, Stream, uniforms
+from infgen.rollout.random_streams import Purpose, Stream, draw_uniforms
 
 
 def test_the_same_arguments_always_give_the_same_numbers():
@@ -42,7 +42,7 @@ def test_a_longer_draw_starts_with_the_shorter_one():
 def test_draws_of_a_batch_are_those_of_its_members():
     streams = [Stream.of(0, "abc", index) for index in range(3)]
 
-    batch = uniforms(streams, 4, Purpose.ADD, 2)
+    batch = draw_uniforms(streams, 4, Purpose.ADD, 2)
 
     np.testing.assert_array_equal(batch[1], streams[1].uniform(4, Purpose.ADD, 2))
 

@@ -1,7 +1,12 @@
 import numpy as np
 
 from infgen.clock import CLOCK
-from infgen.rollout.population import Newcomers, enter, move_on, settle
+from infgen.rollout.population import (
+    InsertedAgents,
+    add_inserted,
+    advance_agents,
+    place_logged_agents,
+)
 from infgen.rollout.recording import NOBODY, Frame, collect
 from infgen.rollout.rollout import NEVER
 from infgen.scene import AgentType
@@ -10,23 +15,27 @@ from infgen.tokens.scene_tokens import Presence
 
 def play(begin, vocabulary, grid, seconds, speed=5, leave_at=None, add_at=None):
     """Everyone drives at one speed; row 1 may leave, someone may enter 30 m ahead."""
-    population = settle([begin], min_rows=4)[-1]
+    population = place_logged_agents([begin], min_rows=4)[-1]
     now = begin.history.now
     for token in range(now + 1, now + 1 + CLOCK.tokens_in(seconds)):
-        shape = population.life.shape
+        shape = population.agent_number.shape
         leave = np.zeros(shape, bool)
         leave[0, 1] = token == leave_at
-        moved, path = move_on(population, np.full(shape, speed), leave, vocabulary)
+        moved, path = advance_agents(population, np.full(shape, speed), leave, vocabulary)
         population = moved
         if token == add_at:
-            population, _ = enter(moved, car_ahead(grid))
+            population, _ = add_inserted(moved, car_ahead(grid))
         yield Frame(
             token=token,
-            life=moved.life,
+            agent_number=moved.agent_number,
             path=path,
             shown=np.ones(path.shape[:3], bool),
-            leaving=moved.presence == Presence.REMOVED,
-            born=np.where(population.life != moved.life, population.life, np.int32(NOBODY)),
+            removed=moved.presence == Presence.REMOVED,
+            inserted_number=np.where(
+                population.agent_number != moved.agent_number,
+                population.agent_number,
+                np.int32(NOBODY),
+            ),
             kind=population.kind,
             size_lwh_m=population.size_lwh_m,
         )
@@ -34,9 +43,9 @@ def play(begin, vocabulary, grid, seconds, speed=5, leave_at=None, add_at=None):
 
 def car_ahead(grid):
     ahead = (grid.centre_m == [0, 30]).all(axis=1)
-    return Newcomers(
+    return InsertedAgents(
         who=np.array([True]),
-        place_m=grid.centre_m[ahead],
+        position_m=grid.centre_m[ahead],
         turned_rad=grid.heading_centre_rad[60:61],
         kind=np.array([AgentType.VEHICLE], dtype=np.int8),
         size_lwh_m=np.array([[4.0, 2.0, 1.5]], dtype=np.float32),
@@ -84,7 +93,8 @@ def test_a_newcomer_is_valid_from_the_step_after_its_entry(
     assert rollout.entry_step[2] == 20
     np.testing.assert_array_equal(np.flatnonzero(rollout.valid[2]), np.arange(21, 31))
     assert rollout.id[2] == begin.scene.tracks.id.max() + 1
-    # The ego is at 10 m at step 20, the newcomer 30 m ahead; a metre later, both moved on.
+    # The ego is at 10 m at step 20, the inserted agent 30 m ahead; a metre later, both
+    # moved on.
     np.testing.assert_allclose(rollout.xyz_m[2, 21, 0], 41.0, atol=0.1)
     assert rollout.kind[2] == AgentType.VEHICLE
     np.testing.assert_allclose(rollout.size_lwh_m[2], [4.0, 2.0, 1.5])
@@ -109,11 +119,11 @@ def test_a_batch_gives_each_start_its_own_rollout(parked, start, metre_moves, gr
             **{
                 name: np.concatenate([getattr(frame, name)] * 2)
                 for name in (
-                    "life",
+                    "agent_number",
                     "path",
                     "shown",
-                    "leaving",
-                    "born",
+                    "removed",
+                    "inserted_number",
                     "kind",
                     "size_lwh_m",
                 )

@@ -3,7 +3,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infgen.rollout.sampling import choose, happens
+from infgen.rollout.sampling import choose, sample_event
 
 
 def test_a_uniform_number_picks_the_choice_whose_share_it_falls_in():
@@ -54,7 +54,7 @@ def test_frequencies_follow_the_probabilities():
 def test_events_happen_with_their_probability(logit, uniform):
     expected = uniform < 1 / (1 + torch.exp(torch.tensor(-logit, dtype=torch.float64)))
 
-    result = happens(
+    result = sample_event(
         torch.tensor(logit, dtype=torch.float64), torch.tensor(uniform, dtype=torch.float64)
     )
 
@@ -106,7 +106,7 @@ def test_the_largest_number_never_picks_what_cannot_be():
 def test_a_bias_moves_the_log_odds(bias, expected):
     uniform = (torch.arange(10_000, dtype=torch.float64) + 0.5) / 10_000
 
-    share = happens(torch.zeros(10_000), uniform, bias).float().mean()
+    share = sample_event(torch.zeros(10_000), uniform, bias).float().mean()
 
     assert float(share) == pytest.approx(expected, abs=1e-3)
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from infgen.rollout.recording import collect
-from infgen.rollout.rules.collision import find_hits
-from infgen.rollout.rules.off_road import Kerbs, find_departures
+from infgen.rollout.rules.collision import find_collisions
+from infgen.rollout.rules.off_road import RoadEdgeTiles, find_off_road
 from infgen.rollout.session import Session
 from infgen.rollout.simulate import simulate
 from infgen.tokens.scene_tokens import Presence
@@ -15,13 +15,13 @@ ALONE = {"insert": False, "remove": False, "max_agents": 6}
 
 
 @pytest.fixture
-def session(crossing, start, player):
+def session(crossing, start, simulator):
     """``session(count=1, **settings)``: rollouts of a crossing, the ego at (-30, 0)."""
 
     def build(count=1, **settings):
         scene = crossing()
         starts = [start(scene, at) for at in range(count)]
-        return Session(player(**{**ALONE, **settings}), starts)
+        return Session(simulator(**{**ALONE, **settings}), starts)
 
     return build
 
@@ -30,8 +30,8 @@ def pose(x_m, y_m=0.0, heading_rad=0.0):
     return np.array([x_m, y_m, heading_rad], dtype=np.float32)
 
 
-def test_without_a_driver_a_session_is_a_simulation(crossing, start, player):
-    begin, playing = [start(crossing())], player(seconds=1.5, max_insertions=2)
+def test_without_a_driver_a_session_is_a_simulation(crossing, start, simulator):
+    begin, playing = [start(crossing())], simulator(seconds=1.5, max_insertions=2)
     session = Session(playing, begin[0])
 
     frames = [session.step() for _ in range(3)]
@@ -127,8 +127,8 @@ def test_other_numbers_of_poses_are_refused(session, count, shape):
         driven.step(np.zeros(shape, dtype=np.float32))
 
 
-def test_newcomers_enter_around_the_driven_ego(crossing, start, player, force):
-    playing = player(max_insertions=2, remove=False)
+def test_newcomers_enter_around_the_driven_ego(crossing, start, simulator, force):
+    playing = simulator(max_insertions=2, remove=False)
     force(playing, add=20.0)
     driven = Session(playing, start(crossing()))
     for step in range(1, 4):
@@ -143,12 +143,12 @@ def test_newcomers_enter_around_the_driven_ego(crossing, start, player, force):
 
 @pytest.mark.parametrize(("add", "leave"), [(0.0, -20.0), (-2.0, 1.0)])
 def test_the_number_of_agents_is_held_to_what_it_was_at_now(
-    parked, start, player, force, add, leave
+    parked, start, simulator, force, add, leave
 ):
     begin = [start(parked(6), at) for at in range(6)]
     counts = {}
     for firmly in (0.0, 40.0):
-        playing = player(insertion_mask=False, density_control=firmly, max_agents=40)
+        playing = simulator(insertion_mask=False, density_control=firmly, max_agents=40)
         force(playing, add=add, leave=leave)
         session = Session(playing, begin)
         for _ in range(6):
@@ -166,28 +166,28 @@ def new_hits(playing, begin, tokens=8):
         before = session.population
         way = session.step().path[:, :, [2, 4]]
         there = before.presence != Presence.ABSENT
-        count += int(find_hits(before, there, way).sum())
+        count += int(find_collisions(before, there, way).sum())
     return count
 
 
-def test_who_would_run_into_somebody_draws_again(parked, start, player):
+def test_who_would_run_into_somebody_draws_again(parked, start, simulator):
     """Moves of an untrained network are as good as drawn by lot; many cars are near."""
     begin = [start(parked(5), at) for at in range(12)]
     still = {"insert": False, "remove": False, "motion_top_k": 0}
 
-    careless = new_hits(player(**still), begin)
-    careful = new_hits(player(**still, max_motion_samples=20), begin)
+    careless = new_hits(simulator(**still), begin)
+    careful = new_hits(simulator(**still, max_motion_samples=20), begin)
 
     assert careless > 20
     assert careful < careless / 5
 
 
-def test_where_nobody_would_run_into_anybody_nothing_changes(drive, start, player):
+def test_where_nobody_would_run_into_anybody_nothing_changes(drive, start, simulator):
     begin = [start(drive(), at) for at in range(4)]
     alone = {"insert": False, "remove": False}
 
     careless, careful = (
-        Session(player(**alone, max_motion_samples=tries), begin).step()
+        Session(simulator(**alone, max_motion_samples=tries), begin).step()
         for tries in (1, 20)
     )
 
@@ -196,36 +196,40 @@ def test_where_nobody_would_run_into_anybody_nothing_changes(drive, start, playe
 
 def off_the_road(playing, begin, tokens=8):
     """How often a vehicle leaves the road, all rollouts together."""
-    kerbs, session, count = [Kerbs(begin[0].scene)], Session(playing, begin), 0
+    road_edge_tiles, session, count = (
+        [RoadEdgeTiles(begin[0].scene)],
+        Session(playing, begin),
+        0,
+    )
     for _ in range(tokens):
         before = session.population
         way = session.step().path[:, :, [2, 4]]
         there = before.presence != Presence.ABSENT
         one_map = np.zeros(len(begin), dtype=np.int64)
         moments = np.full(there.shape, way.shape[2])
-        found = find_departures(before, there, way, moments, kerbs, one_map)
+        found = find_off_road(before, there, way, moments, road_edge_tiles, one_map)
         count += int(found.sum())
     return count
 
 
-def test_who_would_leave_the_road_draws_again_if_asked(drive, start, player):
+def test_who_would_leave_the_road_draws_again_if_asked(drive, start, simulator):
     begin = [start(drive(), at) for at in range(24)]
     still = {"insert": False, "remove": False, "motion_top_k": 0, "max_motion_samples": 20}
 
-    careless = off_the_road(player(**still), begin)
-    careful = off_the_road(player(**still, reject_off_road=True), begin)
+    careless = off_the_road(simulator(**still), begin)
+    careful = off_the_road(simulator(**still, reject_off_road=True), begin)
 
     assert careless > 20
     assert careful < careless / 5
 
 
-def test_who_has_to_steer_does_not_stop_for_it(drive, start, player):
+def test_who_has_to_steer_does_not_stop_for_it(drive, start, simulator):
     """Nobody else stands than would have anyway, though many draw again."""
     begin = [start(drive(), at) for at in range(200)]
     still = {"insert": False, "remove": False, "motion_top_k": 0, "max_motion_samples": 20}
 
     plain, kept = (
-        Session(player(**still, reject_off_road=stays), begin).step().path
+        Session(simulator(**still, reject_off_road=stays), begin).step().path
         for stays in (False, True)
     )
 
@@ -236,28 +240,30 @@ def test_who_has_to_steer_does_not_stop_for_it(drive, start, player):
 
 
 def test_who_can_stay_on_the_road_only_by_running_into_others_leaves_it(
-    parked, start, player
+    parked, start, simulator
 ):
     begin = [start(parked(5), at) for at in range(12)]
     still = {"insert": False, "remove": False, "motion_top_k": 0}
 
-    careless = new_hits(player(**still), begin)
-    careful = new_hits(player(**still, max_motion_samples=40, reject_off_road=True), begin)
+    careless = new_hits(simulator(**still), begin)
+    careful = new_hits(
+        simulator(**still, max_motion_samples=40, reject_off_road=True), begin
+    )
 
     assert careful < careless / 5
 
 
-def test_who_is_driven_is_never_drawn_for(parked, start, player):
+def test_who_is_driven_is_never_drawn_for(parked, start, simulator):
     careful = {"max_motion_samples": 5, "reject_off_road": True}
-    driven = Session(player(**careful, insert=False, remove=False), start(parked(1)))
+    driven = Session(simulator(**careful, insert=False, remove=False), start(parked(1)))
 
     frame = driven.step(pose(8.0, -2.0))
 
     np.testing.assert_allclose(frame.path[0, 0, -1], [8.0, -2.0, 0.0], atol=1e-5)
 
 
-def test_drawing_again_does_not_depend_on_other_rollouts(parked, start, player):
-    playing = player(
+def test_drawing_again_does_not_depend_on_other_rollouts(parked, start, simulator):
+    playing = simulator(
         **{"max_motion_samples": 5, "reject_off_road": True, "max_stall_s": 1.0},
         **{"insert": False, "remove": False, "motion_top_k": 0},
     )
@@ -271,7 +277,7 @@ def test_drawing_again_does_not_depend_on_other_rollouts(parked, start, player):
     np.testing.assert_allclose(many.path[2], one.path[0], atol=1e-4)
 
 
-def test_who_is_too_fast_for_every_way_takes_the_slowest(drive, start, player):
+def test_who_is_too_fast_for_every_way_takes_the_slowest(drive, start, simulator):
     """The network knows 10 to 19 m to the right only, and all lead off the road soon."""
     begin = [start(drive(), at) for at in range(24)]
     still = {"insert": False, "remove": False, "motion_top_k": 0, "max_motion_samples": 40}
@@ -280,9 +286,9 @@ def test_who_is_too_fast_for_every_way_takes_the_slowest(drive, start, player):
         step, move = playing.stepper.motion_step, torch.arange(61)
         fast = (move > 40) & (move % 20 >= 10)
 
-        def heard(memory, column):
-            said = step(memory, column)
-            said.packed.move_logits.masked_fill_(~fast, -torch.inf)
+        def heard(memory, token_step):
+            said = step(memory, token_step)
+            said.packed.motion_logits.masked_fill_(~fast, -torch.inf)
             return said
 
         playing.stepper.motion_step = heard
@@ -290,8 +296,8 @@ def test_who_is_too_fast_for_every_way_takes_the_slowest(drive, start, player):
         before = session.population.pose[:, 0, :2]
         return np.linalg.norm(session.step().path[:, 0, -1, :2] - before, axis=-1)
 
-    careless = ways_m(player(**still))
-    careful = ways_m(player(**still, reject_off_road=True))
+    careless = ways_m(simulator(**still))
+    careful = ways_m(simulator(**still, reject_off_road=True))
 
     assert careless.mean() > 13
     assert np.median(careful) < 12

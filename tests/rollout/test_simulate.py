@@ -10,7 +10,7 @@ from infgen.model.stepping import Stepper
 from infgen.rollout.recording import collect
 from infgen.rollout.rollout import NEVER
 from infgen.rollout.simulate import simulate
-from infgen.rollout.simulator import Player
+from infgen.rollout.simulator import Simulator
 
 SMALL = ModelSettings(
     width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4
@@ -28,7 +28,7 @@ def play(network):
     """``play(starts, **settings)``: rollouts of an untrained network."""
 
     def run(starts, **settings):
-        player = Player(
+        simulator = Simulator(
             stepper=Stepper(network),
             vocabulary=network.motion_vocabulary(),
             roads=network.map_vocabulary(),
@@ -36,7 +36,7 @@ def play(network):
             settings=RolloutSettings(**{"seconds": 4.0, "max_agents": 24, **settings}),
             device=torch.device("cpu"),
         )
-        return collect(starts, list(simulate(player, starts)), "weights")
+        return collect(starts, list(simulate(simulator, starts)), "weights")
 
     return run
 

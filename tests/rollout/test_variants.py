@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from infgen.geometry import boxes_overlap
-from infgen.metrics.long_term.radius import live_within
+from infgen.metrics.long_term.radius import present_within_radius
 from infgen.rollout.population import EGO_ROW
 from infgen.rollout.recording import NOBODY, collect
 from infgen.rollout.rollout import NEVER
@@ -29,8 +29,8 @@ FASTEST_M = 20.0
 """The longest move of the vocabulary of these tests."""
 
 
-def play(player, starts):
-    return collect(starts, list(simulate(player, starts)), "weights")
+def play(simulator, starts):
+    return collect(starts, list(simulate(simulator, starts)), "weights")
 
 
 def check_session(session, frames, grid):
@@ -40,18 +40,23 @@ def check_session(session, frames, grid):
         before = session.population
         frame = session.step()
         after = session.population
-        lives = {(r, n) for r, row in enumerate(frame.life) for n in row if n != NOBODY}
-        rows = (frame.life != NOBODY).sum()
+        lives = {
+            (r, n) for r, row in enumerate(frame.agent_number) for n in row if n != NOBODY
+        }
+        rows = (frame.agent_number != NOBODY).sum()
         assert len(lives) == rows, "an agent has one row"
         assert not lives & gone, "who has left never returns"
-        same = (before.life == frame.life) & (frame.life != NOBODY)
+        same = (before.agent_number == frame.agent_number) & (frame.agent_number != NOBODY)
         assert same.sum() == rows, "who is there was there, in the same row"
         gap_m = np.linalg.norm(frame.path[:, :, -1, :2] - before.pose[..., :2], axis=-1)
         assert gap_m[same].max() <= FASTEST_M + 1e-3
-        gone |= {(r, frame.life[r, row]) for r, row in np.argwhere(frame.leaving)}
-        born = {(r, frame.born[r, row]) for r, row in np.argwhere(frame.born != NOBODY)}
-        assert not born & (ids | lives), "every newcomer is a new agent"
-        ids |= lives | born
+        gone |= {(r, frame.agent_number[r, row]) for r, row in np.argwhere(frame.removed)}
+        inserted_number = {
+            (r, frame.inserted_number[r, row])
+            for r, row in np.argwhere(frame.inserted_number != NOBODY)
+        }
+        assert not inserted_number & (ids | lives), "every newcomer is a new agent"
+        ids |= lives | inserted_number
         entering = after.presence == Presence.INSERTED
         assert (after.cells(grid)[entering] >= 0).all(), "newcomers are in the grid"
         assert (after.presence[:, EGO_ROW] == Presence.PRESENT).all()
@@ -60,9 +65,9 @@ def check_session(session, frames, grid):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_variant_plays_and_keeps_the_rules(
-    variant, crossing, parked, start, player, force
+    variant, crossing, parked, start, simulator, force
 ):
-    playing = player(
+    playing = simulator(
         VARIANTS[variant],
         max_agents=9,
         max_insertions=2,
@@ -75,8 +80,8 @@ def test_every_variant_plays_and_keeps_the_rules(
 
     ids = check_session(session, 5, playing.grid)
 
-    newcomers = len(ids) - (3 + 5)
-    assert newcomers > 3 if playing.stepper.insertion_and_removal else newcomers == 0
+    inserted = len(ids) - (3 + 5)
+    assert inserted > 3 if playing.stepper.insertion_and_removal else inserted == 0
 
 
 @settings(
@@ -92,9 +97,9 @@ def test_every_variant_plays_and_keeps_the_rules(
     mask=st.booleans(),
 )
 def test_the_rules_hold_whatever_comes_and_goes(
-    crossing, start, player, force, add, leave, rows, index, mask
+    crossing, start, simulator, force, add, leave, rows, index, mask
 ):
-    playing = player(
+    playing = simulator(
         max_agents=rows,
         insertion_mask=mask,
         max_insertions=3,
@@ -106,11 +111,11 @@ def test_the_rules_hold_whatever_comes_and_goes(
 
     check_session(session, 5, playing.grid)
 
-    assert session.population.life.shape == (1, rows)
+    assert session.population.agent_number.shape == (1, rows)
 
 
-def test_rows_that_are_freed_are_used_again(crossing, start, player, force):
-    playing = player(max_agents=5, max_insertions=2)
+def test_rows_that_are_freed_are_used_again(crossing, start, simulator, force):
+    playing = simulator(max_agents=5, max_insertions=2)
     force(playing, add=20.0, leave=2.0)
     session = Session(playing, start(crossing()))
 
@@ -120,18 +125,18 @@ def test_rows_that_are_freed_are_used_again(crossing, start, player, force):
 
 
 def test_motion_only_weights_say_what_they_play_and_ignore_the_rest(
-    crossing, start, player
+    crossing, start, simulator
 ):
-    playing = player({"insertion_and_removal": False}, insert=True, remove=True)
+    playing = simulator({"insertion_and_removal": False}, insert=True, remove=True)
 
     (rollout,) = play(playing, [start(crossing())])
 
-    assert playing.plays == "motion only"
+    assert playing.simulates == "motion only"
     assert rollout.logged.all()
     assert (rollout.exit_step == NEVER).all()
-    assert player().plays == "motion, entries, exits"
-    assert player({"remove_token": False}).plays == "motion, entries"
-    assert player(mode="wosac", seconds=None).plays == "motion only"
+    assert simulator().simulates == "motion, entries, exits"
+    assert simulator({"remove_token": False}).simulates == "motion, entries"
+    assert simulator(mode="wosac", seconds=None).simulates == "motion only"
 
 
 @pytest.fixture
@@ -145,15 +150,15 @@ def passing(build_scene, start):
 
 
 def test_smart_with_the_radius_heuristic_enters_and_leaves_as_the_paper_says(
-    passing, player
+    passing, simulator
 ):
-    playing = player(VARIANTS["smart"], seconds=8.0)
+    playing = simulator(VARIANTS["smart"], seconds=8.0)
     keep_speed(playing)
     (rollout,) = play(playing, [passing])
 
-    found = live_within(rollout, radius_m=80.0)
+    found = present_within_radius(rollout, radius_m=80.0)
 
-    # At ends of half seconds 20 + 65 m is the first beyond, 140 - 60 m the first within.
+    # At ends of token steps 20 + 65 m is the first beyond, 140 - 60 m the first within.
     np.testing.assert_array_equal(found.exit_step, [NEVER, 60, NEVER, NEVER])
     np.testing.assert_array_equal(found.entry_step, [0, 0, 60, 0])
     assert not found.valid[2, :61].any()
@@ -162,15 +167,15 @@ def test_smart_with_the_radius_heuristic_enters_and_leaves_as_the_paper_says(
 
 
 @pytest.mark.parametrize("variant", ["smart", "no leave token"])
-def test_without_leave_tokens_agents_leave_by_distance_alone(variant, passing, player):
-    playing = player(VARIANTS[variant], seconds=4.0, insert=False, removal_radius_m=60.0)
+def test_without_leave_tokens_agents_leave_by_distance_alone(variant, passing, simulator):
+    playing = simulator(VARIANTS[variant], seconds=4.0, insert=False, removal_radius_m=60.0)
     keep_speed(playing)
 
     (rollout,) = play(playing, [passing])
 
     # Beyond 60 m for the first time at the end of a half second at step 45 (65 m).
     np.testing.assert_array_equal(rollout.exit_step, [NEVER, 45, NEVER, NEVER])
-    (stays,) = play(player(VARIANTS[variant], seconds=1.0, insert=False), [passing])
+    (stays,) = play(simulator(VARIANTS[variant], seconds=1.0, insert=False), [passing])
     assert (stays.exit_step == NEVER).all()
 
 
@@ -178,17 +183,17 @@ def keep_speed(playing):
     """Let everyone repeat the move that led to where it is."""
     step = playing.stepper.motion_step
 
-    def again(memory, column):
-        said = step(memory, column)
-        wanted = torch.nn.functional.one_hot(column.move.clamp(min=0), 61).float()
-        said.packed.move_logits.copy_(100 * said.packed.rows.pack(wanted))
+    def again(memory, token_step):
+        said = step(memory, token_step)
+        wanted = torch.nn.functional.one_hot(token_step.move.clamp(min=0), 61).float()
+        said.packed.motion_logits.copy_(100 * said.packed.rows.pack(wanted))
         return said
 
     playing.stepper.motion_step = again
 
 
-def test_newcomers_are_kept_off_others_and_near_lanes(parked, start, player, force):
-    playing = player(
+def test_newcomers_are_kept_off_others_and_near_lanes(parked, start, simulator, force):
+    playing = simulator(
         insertion_lane_distance_m=6.0,
         max_insertion_attempts=5,
         position_top_k=0,
@@ -212,7 +217,7 @@ def test_newcomers_are_kept_off_others_and_near_lanes(parked, start, player, for
 
 def assert_has_room(now, rollout, row):
     others = (now.presence[rollout] != Presence.ABSENT) & (
-        np.arange(now.life.shape[1]) != row
+        np.arange(now.agent_number.shape[1]) != row
     )
     if now.kind[rollout, row] == AgentType.PEDESTRIAN:
         others &= now.kind[rollout] != AgentType.PEDESTRIAN
@@ -227,15 +232,17 @@ def assert_has_room(now, rollout, row):
     assert not overlap.any()
 
 
-def test_with_a_mask_that_refuses_nobody_rollouts_are_as_without(crossing, start, player):
+def test_with_a_mask_that_refuses_nobody_rollouts_are_as_without(
+    crossing, start, simulator
+):
     scene = crossing()
 
     few = {"seconds": 2.0, "max_insertions": 2}
     (masked,) = play(
-        player(insertion_lane_distance_m=1e6, max_insertion_attempts=1, **few),
+        simulator(insertion_lane_distance_m=1e6, max_insertion_attempts=1, **few),
         [start(scene)],
     )
-    (free,) = play(player(insertion_mask=False, **few), [start(scene)])
+    (free,) = play(simulator(insertion_mask=False, **few), [start(scene)])
 
     same = min(len(masked.id), len(free.id))
     first = int(np.argmax(masked.entry_step[:same] != free.entry_step[:same]) or same)
@@ -243,10 +250,10 @@ def test_with_a_mask_that_refuses_nobody_rollouts_are_as_without(crossing, start
     np.testing.assert_array_equal(masked.xyz_m[:3, :steps], free.xyz_m[:3, :steps])
 
 
-def test_patterns_make_agents_flicker_and_nothing_else(crossing, start, player, force):
+def test_patterns_make_agents_flicker_and_nothing_else(crossing, start, simulator, force):
     model = {"validity_pattern_tokens": True}
     seen, flickering = (
-        player(model, validity_patterns=patterns, max_insertions=2, seconds=3.0)
+        simulator(model, validity_patterns=patterns, max_insertions=2, seconds=3.0)
         for patterns in (False, True)
     )
     for playing in (seen, flickering):
@@ -279,20 +286,22 @@ def test_patterns_make_agents_flicker_and_nothing_else(crossing, start, player, 
         ("remove_bias", -30.0),
     ],
 )
-def test_biases_decide_where_the_network_is_undecided(crossing, start, player, name, value):
+def test_biases_decide_where_the_network_is_undecided(
+    crossing, start, simulator, name, value
+):
     kept = {"add_bias": -30.0, "remove_bias": -30.0, name: value}
 
-    (rollout,) = play(player(seconds=1.0, max_insertions=2, **kept), [start(crossing())])
+    (rollout,) = play(simulator(seconds=1.0, max_insertions=2, **kept), [start(crossing())])
 
     assert (~rollout.logged).any() == (kept["add_bias"] > 0)
     assert (rollout.exit_step != NEVER).any() == (kept["remove_bias"] > 0)
 
 
-def test_the_likeliest_alone_is_what_every_seed_plays(crossing, start, player):
+def test_the_likeliest_alone_is_what_every_seed_plays(crossing, start, simulator):
     scene = crossing()
     few = {"insert": False, "remove": False, "seconds": 1.0}
-    certain = player(motion_top_k=1, **few)
-    cold = player(motion_top_k=0, motion_temperature=1e-6, **few)
+    certain = simulator(motion_top_k=1, **few)
+    cold = simulator(motion_top_k=0, motion_temperature=1e-6, **few)
 
     one, other = play(certain, [start(scene, 0), start(scene, 1)])
 
@@ -302,10 +311,10 @@ def test_the_likeliest_alone_is_what_every_seed_plays(crossing, start, player):
 
 
 def test_a_narrow_nucleus_leaves_the_likeliest_way_to_go_and_to_stand(
-    crossing, start, player
+    crossing, start, simulator
 ):
     few = {"insert": False, "remove": False, "seconds": 0.5, "motion_top_k": 0}
-    playing = player(motion_top_p=1e-6, **few)
+    playing = simulator(motion_top_p=1e-6, **few)
 
     ends_m = [
         play(playing, [start(crossing(), seed)])[0].xyz_m[:, -1] for seed in range(12)

@@ -81,7 +81,7 @@ def assert_same(decoded, matrix):
 
 
 def said(tokens, token):
-    """The words of one half second as (word, agent)."""
+    """The words of one token step as (word, agent)."""
     rows = tokens.sequence_step == token
     return [
         (TokenType(word).name, int(agent))
@@ -200,7 +200,7 @@ def test_the_stream_brings_the_matrix_back_bit_for_bit(
 @given(drawn=paths_and_gaps())
 @settings(deadline=None)
 def test_the_stream_is_in_order(tokens_of, build_scene, drawn):
-    """Every half second: moves, controls, newcomers, and one word that ends it."""
+    """Every token step: moves, controls, inserted agents, and one word that ends it."""
     tokens = tokens_of(build_scene(*drawn))
 
     assert (np.diff(tokens.sequence_step.astype(int)) >= 0).all()

@@ -32,7 +32,7 @@ def test_newcomers_are_counted_per_half_second_after_the_history(counted, crossi
 
 
 def test_errors_are_distances_from_the_log_at_the_end_of_moves(counted, drive):
-    # 4.5 m each half second in moves of whole metres: ends are 0 or 0.5 m off.
+    # 4.5 m each token step in moves of whole metres: ends are 0 or 0.5 m off.
     figures = counted(drive(speed_mps=9.0))
 
     assert figures.error[0].sum() == 17

@@ -1,4 +1,4 @@
-"""Half seconds as five times yes or no."""
+"""Token steps as five times yes or no."""
 
 import numpy as np
 import pytest

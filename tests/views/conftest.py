@@ -6,7 +6,7 @@ import pytest
 from benchmarks.player import busy_film as made_busy_film
 from infgen.sources.towns import builtin_records
 from infgen.sources.womd import iter_scenes
-from infgen.views.scene.view_model import Film, make_film
+from infgen.views.scene.view_model import ViewModel, make_view_model
 from tests.exports.replays import replay, with_newcomer
 
 
@@ -18,25 +18,27 @@ def town():
 
 
 @pytest.fixture(scope="session")
-def film(town) -> Film:
+def view_model(town) -> ViewModel:
     """The log, and two rollouts that replay it with someone new."""
     played = tuple(with_newcomer(replay(town, at, 0.5 * at), 30 + at) for at in range(2))
-    return make_film(town, played)
+    return make_view_model(town, played)
 
 
 @pytest.fixture
 def same():
     """``same(film, other)``: equal to a centimetre and a milliradian."""
 
-    def check(film: Film, other: Film) -> None:
-        assert (film.scenario_id, film.now) == (other.scenario_id, other.now)
-        np.testing.assert_array_equal(film.drawn_map.look, other.drawn_map.look)
-        np.testing.assert_array_equal(film.drawn_map.bridge, other.drawn_map.bridge)
-        np.testing.assert_array_equal(film.drawn_map.offsets, other.drawn_map.offsets)
-        np.testing.assert_allclose(film.drawn_map.xy_m, other.drawn_map.xy_m, atol=0.006)
-        np.testing.assert_array_equal(film.lights.state, other.lights.state)
-        np.testing.assert_allclose(film.lights.xy_m, other.lights.xy_m, atol=0.006)
-        for mine, read in zip(film.showings, other.showings, strict=True):
+    def check(view_model: ViewModel, other: ViewModel) -> None:
+        assert (view_model.scenario_id, view_model.now) == (other.scenario_id, other.now)
+        np.testing.assert_array_equal(view_model.drawn_map.look, other.drawn_map.look)
+        np.testing.assert_array_equal(view_model.drawn_map.bridge, other.drawn_map.bridge)
+        np.testing.assert_array_equal(view_model.drawn_map.offsets, other.drawn_map.offsets)
+        np.testing.assert_allclose(
+            view_model.drawn_map.xy_m, other.drawn_map.xy_m, atol=0.006
+        )
+        np.testing.assert_array_equal(view_model.lights.state, other.lights.state)
+        np.testing.assert_allclose(view_model.lights.xy_m, other.lights.xy_m, atol=0.006)
+        for mine, read in zip(view_model.showings, other.showings, strict=True):
             assert (mine.name, mine.ego) == (read.name, read.ego)
             for field in ("id", "kind", "role", "valid", "last_step"):
                 np.testing.assert_array_equal(getattr(mine, field), getattr(read, field))
@@ -51,5 +53,5 @@ def same():
 
 @pytest.fixture(scope="session")
 def busy_film():
-    """Log and three rollouts of 128 agents each, 2,000 road tokens, 30 s."""
+    """Log and three rollouts of 128 agents each, 2,000 map tokens, 30 s."""
     return made_busy_film()

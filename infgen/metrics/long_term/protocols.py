@@ -128,7 +128,7 @@ class Protocol:
             counts, so that many short lives look safer than few long ones.
         event_radius_m: Entries and exits farther from the ego are not counted, logged or
             simulated; infinite for all.
-        unseen_tokens: Last half seconds of a log left out of the logged counts, because
+        unseen_tokens: Last token steps of a log left out of the logged counts, because
             whoever enters or leaves in them cannot be told.
     """
 

@@ -8,10 +8,10 @@ from infgen.clock import CLOCK
 from infgen.rollout.rollout import NEVER, Rollout
 
 
-def live_within(rollout: Rollout, radius_m: float) -> Rollout:
+def present_within_radius(rollout: Rollout, radius_m: float) -> Rollout:
     """Let agents enter and leave a rollout by crossing a circle around the ego.
 
-    Distances are read at the ends of half seconds. An agent enters where it is within the
+    Distances are read at the ends of token steps. An agent enters where it is within the
     radius for the first time and never was before; it leaves where it is beyond it for the
     first time and always was within before. Who is beyond it is not there.
 

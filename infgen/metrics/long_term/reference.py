@@ -140,7 +140,7 @@ def event_bins(
 def token_bins(
     binned: Binned, feature: str, protocol: Protocol, num_tokens: int
 ) -> Int64[np.ndarray, " token"]:
-    """Bin of the number of entries or exits in each half second."""
+    """Bin of the number of entries or exits in each token step."""
     number = events_per_token(binned, feature, protocol, num_tokens)
     bins = bin_of(number.astype(np.float32), FEATURES[ROW[feature]].histogram)
     return bins.astype(np.int64)
@@ -149,7 +149,7 @@ def token_bins(
 def events_per_token(
     binned: Binned, feature: str, protocol: Protocol, num_tokens: int
 ) -> Int64[np.ndarray, " token"]:
-    """Count the entries or exits in each half second, as far away as a protocol does."""
+    """Count the entries or exits in each token step, as far away as a protocol does."""
     token, distance_m = (
         (binned.entry_token, binned.entry_distance_m)
         if feature == "num_entries"
@@ -173,7 +173,7 @@ def _count_steps(
 def _count_events(
     into: np.ndarray, binned: Binned, num_tokens: int, protocol: Protocol
 ) -> None:
-    """Add entries and exits of the first half seconds."""
+    """Add entries and exits of the first token steps."""
     for name in ("num_entries", "num_exits"):
         bins = token_bins(binned, name, protocol, num_tokens)
         into[ROW[name]] += np.bincount(bins, minlength=MAX_BINS)

@@ -1,4 +1,4 @@
-"""The radius of ``live_within`` that makes placement most like the logs' (SPEC 7.1).
+"""The presence radius with which placement is most like that of the logs (SPEC 7.1).
 
 Placement needs no boxes and no map, so a radius is tried at the cost of one pass over the
 paths. To be tuned on validation, and then set as ``score.presence_radius_m``.
@@ -18,7 +18,7 @@ from infgen.metrics.long_term.protocols import (
     STEP_FEATURES,
     Protocol,
 )
-from infgen.metrics.long_term.radius import live_within
+from infgen.metrics.long_term.radius import present_within_radius
 from infgen.metrics.long_term.table import Against
 from infgen.metrics.placement import simulated_events
 from infgen.rollout.rollout import NEVER, Rollout
@@ -51,7 +51,9 @@ def placement_by_radius(
     by_scene: dict[str, list[np.ndarray]] = {}  # [radius, feature] of each rollout
     for rollout in rollouts:
         _check(rollout)
-        scores = [_placement(live_within(rollout, r), against)[at] for r in radii_m]
+        scores = [
+            _placement(present_within_radius(rollout, r), against)[at] for r in radii_m
+        ]
         by_scene.setdefault(rollout.scenario_id, []).append(np.array(scores))
     if not by_scene:
         raise RadiusError("there are no rollouts to tune a radius on")

@@ -1,9 +1,10 @@
 """Tokenized scenes as padded tensors: what the network is trained on.
 
-Dims: scene, agent, token, road, slot (turn of a newcomer within its half second), detail
-(an agent whose entry is described: a newcomer, or one that only plays the part). Agents are
-ordered from near to far by their least distance to the ego; agent 0 is the ego. Tokens come
-before agents, unlike in ``SceneTokens``: what is seen together lies together.
+Dims: scene, agent, token, road, slot (turn of an inserted agent within its half second),
+detail (an agent whose entry is described: an inserted agent, or one that only plays the
+part). Agents are ordered from near to far by their least distance to the ego; agent 0 is
+the ego. Tokens come before agents, unlike in ``SceneTokens``: what is seen together lies
+together.
 
 A batch is a function of its records, their draws and the limits: nothing is random here.
 """
@@ -18,12 +19,22 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from infgen.model.batching.crop import SceneWindow, cut_window, disturb, hide_far, look_away
-from infgen.model.batching.insertion_targets import detail_arrays, entry_arrays, turns_of
+from infgen.model.batching.crop import (
+    SceneWindow,
+    cut_window,
+    hide_signals,
+    hide_until_near,
+    perturb,
+)
+from infgen.model.batching.insertion_targets import (
+    detail_arrays,
+    insertion_arrays,
+    insertion_turns,
+)
 from infgen.model.batching.padding import Arrays, pad
 from infgen.model.batching.perturbation import Perturbation, perturb_map
+from infgen.model.batching.tensors import map_tensors
 from infgen.model.settings import ModelSettings
-from infgen.model.tensors import map_tensors
 from infgen.model.training_settings import TrainSettings
 from infgen.tokens.grid import make_grid
 from infgen.tokens.scene_tokens import Presence, SceneTokens
@@ -33,7 +44,7 @@ from infgen.tokens.signals import LoggedSignals, hold_last_signals
 T = TypeVar("T")
 
 PICKED_SHARE = 0.15
-"""Share of road tokens that are hidden to be predicted: few, as everyone else does without
+"""Share of map tokens that are hidden to be predicted: few, as everyone else does without
 them in the same pass."""
 FORGOTTEN_SHARE = 0.5
 """Share of scenes in which nobody looks at traffic lights after the history."""
@@ -41,7 +52,7 @@ BARE_RIM_SHARE = 0.5
 """Share of scenes in which nobody from beyond the rim is there from the beginning, as in a
 rollout after its first seconds."""
 LEFT_TOKENS = 2
-"""Who is not seen for so many half seconds has left: at a log's end one cannot tell."""
+"""Who is not seen for so many token steps has left: at a log's end one cannot tell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +108,10 @@ class Roads:
         polyline_type: ``PolylineType``.
         signal: ``SignalClass`` at the end of the history.
         light: The traffic light of its lane, counted from 1; 0 for none.
-        shown: ``SignalClass`` of those lights at the end of each half second, or
+        shown: ``SignalClass`` of those lights at the end of each token step, or
             ``REMEMBERED`` ones.
-        follows: Whether the road token before it is its predecessor on the same line.
-        picked: Whether it is hidden where road tokens are predicted.
+        follows: Whether the map token before it is its predecessor on the same line.
+        picked: Whether it is hidden where map tokens are predicted.
     """
 
     real: Bool[Tensor, "scene road"]
@@ -116,14 +127,15 @@ class Roads:
 
 
 @dataclass(frozen=True, slots=True)
-class Entries:
+class Insertions:
     """Who enters when.
 
     Attributes:
-        asked: Whether newcomers are asked for at this token (never at the first, nor at
-            the last of a log).
-        count: Newcomers within the grid at this token, also those beyond the last slot.
-        agent: The newcomer of each turn, or ``NOBODY``.
+        asked: Whether inserted agents are asked for at this token (never at the first, nor
+            at the last of a log).
+        count: Inserted agents within the grid at this token, also those beyond the last
+            slot.
+        agent: The inserted agent of each turn, or ``NOBODY``.
         cell: Its cell; 0 where there is nobody.
     """
 
@@ -139,10 +151,11 @@ class Details:
 
     Attributes:
         present: False for padding.
-        newcomer: Whether the agent does enter; else it is there already and plays the part.
+        inserted agent: Whether the agent does enter; else it is there already and plays the
+            part.
         agent: Row of the agent, hidden from its own query.
         token: When.
-        turn: Newcomers of this turn and later are hidden as well.
+        turn: Inserted agents of this turn and later are hidden as well.
         cell: Where.
         kind: ``AgentType``.
         size_lwh_m: Its box.
@@ -169,7 +182,7 @@ class Batch:
     scenario_ids: tuple[str, ...]
     agents: Agents
     roads: Roads
-    entries: Entries
+    entries: Insertions
     details: Details
 
 
@@ -179,9 +192,9 @@ class Limits:
 
     Attributes:
         agents: Agents, nearest to the ego first.
-        roads: Road tokens, nearest to the ego's path first.
-        entries: Newcomers per half second.
-        tokens: Half seconds; of a longer log a part is taken.
+        roads: Map tokens, nearest to the ego's path first.
+        entries: Inserted agents per half second.
+        tokens: Token steps; of a longer log a part is taken.
         grid: Settings the scenes were tokenized with.
     """
 
@@ -217,8 +230,8 @@ def collate(
         records: The scenes.
         limits: How much of each is taken.
         draw: Which of the many views of a scene to take: it decides the part of a long log,
-            the hidden road tokens, who plays newcomer, and what noise does. Equal draws,
-            equal batches.
+            the hidden map tokens, who plays inserted agent, and what noise does. Equal
+            draws, equal batches.
         noise: How tokens are disturbed, to learn from; None for scenes as they are.
     """
     scenes = [_scene(record, limits, draw, noise) for record in records]
@@ -226,7 +239,7 @@ def collate(
         scenario_ids=tuple(record.scenario_id for record in records),
         agents=pad([scene[0] for scene in scenes], Agents),
         roads=pad([scene[1] for scene in scenes], Roads),
-        entries=pad([scene[2] for scene in scenes], Entries),
+        entries=pad([scene[2] for scene in scenes], Insertions),
         details=pad([scene[3] for scene in scenes], Details),
     )
 
@@ -240,7 +253,7 @@ def collate_roads(
 
     Args:
         records: The scenes.
-        max_map_tokens: Road tokens of each.
+        max_map_tokens: Map tokens of each.
         lights: What the lights of each show, if that is known for longer than the record;
             afterwards they are remembered as they were last.
     """
@@ -277,13 +290,13 @@ def _scene(
     start = int(random.integers(spare + 1))
     window = cut_window(record, start, limits.tokens, limits.agents, limits.roads)
     if _keyed(f"rim/{draw}/{record.scenario_id}").random() < BARE_RIM_SHARE:
-        window = hide_far(window, limits.grid, record.now + 1 - start)
+        window = hide_until_near(window, limits.grid, record.now + 1 - start)
     if noise and noise.moves:
-        window = disturb(window, noise, grid, chance)
+        window = perturb(window, noise, grid, chance)
     if _keyed(f"lights/{draw}/{record.scenario_id}").random() < FORGOTTEN_SHARE:
-        window = look_away(window, record.now + 1)
-    turn = turns_of(window)
-    entries = entry_arrays(window, turn, limits.entries)
+        window = hide_signals(window, record.now + 1)
+    turn = insertion_turns(window)
+    entries = insertion_arrays(window, turn, limits.entries)
     details = detail_arrays(window, entries, grid, random)
     picked = random.random(len(window.roads)) < PICKED_SHARE
     token = record.map_token[window.roads]
@@ -344,7 +357,7 @@ def _last_shown(roads: Roads, maps: Sequence[Arrays]) -> Roads:
 
 
 def _lights(line: np.ndarray, signal_polyline: np.ndarray) -> np.ndarray:
-    """Number of the light of each road token's line, from 1; 0 where it has none."""
+    """Number of the light of each map token's line, from 1; 0 where it has none."""
     if not len(signal_polyline):
         return np.zeros(len(line), dtype=np.int64)
     at = np.minimum(np.searchsorted(signal_polyline, line), len(signal_polyline) - 1)

@@ -1,4 +1,4 @@
-"""A part of one tokenized scene: some half seconds, the nearest agents and roads."""
+"""A part of one tokenized scene: some token steps, the nearest agents and roads."""
 
 from dataclasses import dataclass, replace
 
@@ -22,14 +22,14 @@ class SceneWindow:
 
     Attributes:
         record: The whole scene.
-        after: Half seconds that the log goes on for afterwards.
+        after: Token steps that the log goes on for afterwards.
         label: The move to learn for each token: ``move`` until agents are led astray.
-        roads: Rows of the record's road tokens that are kept, ascending.
+        roads: Rows of the record's map tokens that are kept, ascending.
         shown: ``SignalClass`` of each of the record's lights at each token's end, or what
             it showed when it was last looked at, ``REMEMBERED``.
         kind, size_lwh_m, near, pose, move, presence, observed, pattern, cell: As in the
             record.
-        entry_row: Row of each newcomer whose agent is kept ...
+        entry_row: Row of each inserted agent whose agent is kept ...
         insertion_token: ... its token, ascending from 0 ...
         insertion_cell: ... and its cell.
     """
@@ -56,7 +56,7 @@ class SceneWindow:
 def cut_window(
     record: SceneTokens, start: int, tokens: int, max_agents: int, max_map_tokens: int
 ) -> SceneWindow:
-    """Take ``tokens`` half seconds from ``start`` on, and what is nearest to the ego."""
+    """Take ``tokens`` token steps from ``start`` on, and what is nearest to the ego."""
     stop = min(start + tokens, record.num_tokens)
     presence, observed, move = _begin_at(record, start, stop)
     visible = observed | (presence == Presence.INSERTED)
@@ -90,13 +90,13 @@ def cut_window(
     )
 
 
-def disturb(
+def perturb(
     window: SceneWindow, noise: Perturbation, grid: Grid, random: np.random.Generator
 ) -> SceneWindow:
     """Lead agents astray, the ego like all others.
 
     Who is absent, entering or not observed is where it was. Cells follow the poses, the
-    ego's too; but a newcomer is lost to none for it, and none is won.
+    ego's too; but an inserted agent is lost to none for it, and none is won.
     """
     strays = perturb_motion(
         window.kind, window.pose, window.move, window.observed, noise, random
@@ -116,15 +116,17 @@ def disturb(
     )
 
 
-def hide_far(window: SceneWindow, settings: TokenSettings, known: int) -> SceneWindow:
+def hide_until_near(
+    window: SceneWindow, settings: TokenSettings, known: int
+) -> SceneWindow:
     """Hide agents that begin beyond ``insertion_distance_m`` until they come within.
 
     It then enters, as who comes later does already; who never comes never is.
 
     Args:
         window: What is known.
-        settings: The distance (0: nobody is hidden), and the order of newcomers.
-        known: Half seconds of the history.
+        settings: The distance (0: nobody is hidden), and the order of inserted agents.
+        known: Token steps of the history.
     """
     if not settings.insertion_distance_m or known < 1:
         return window
@@ -133,7 +135,7 @@ def hide_far(window: SceneWindow, settings: TokenSettings, known: int) -> SceneW
     inside = np.hypot(away_m[..., 0], away_m[..., 1]) < settings.insertion_distance_m
     inside &= visible
     born = visible.argmax(axis=1)
-    # Who is there as the history ends is seen from the half second after it on at latest.
+    # Who is there as the history ends is seen from the token step after it on at latest.
     far = (born <= known) & ~inside[np.arange(len(inside)), born]
     far[0] = False
 
@@ -153,8 +155,8 @@ def hide_far(window: SceneWindow, settings: TokenSettings, known: int) -> SceneW
     return _with_entries(changed, far, settings.insertion_order)
 
 
-def look_away(window: SceneWindow, known: int) -> SceneWindow:
-    """Let nobody look at traffic lights after the first ``known`` half seconds."""
+def hide_signals(window: SceneWindow, known: int) -> SceneWindow:
+    """Let nobody look at traffic lights after the first ``known`` token steps."""
     tokens = window.shown.shape[1]
     return replace(
         window, shown=hold_last_signals(window.shown, min(known, tokens), tokens)
@@ -229,7 +231,7 @@ def _nearest_agents(pose: np.ndarray, visible: np.ndarray, ego: int) -> np.ndarr
 
 
 def _nearest_roads(map_pose: np.ndarray, path: np.ndarray, limit: int) -> np.ndarray:
-    """Rows, ascending, of the road tokens nearest to the ego's path."""
+    """Rows, ascending, of the map tokens nearest to the ego's path."""
     if len(map_pose) <= limit:
         return np.arange(len(map_pose))
     away_m = map_pose[:, None, :2] - path[:, :2]  # [road, token, 2]

@@ -1,4 +1,4 @@
-"""Newcomers of a part of a scene as arrays: whose turn it is, where they enter and how."""
+"""Insertion targets of a cropped scene: the order of insertions, positions and details."""
 
 import numpy as np
 from jaxtyping import Float32, Int16, Integer
@@ -9,9 +9,9 @@ from infgen.tokens.grid import Grid, encode_heading, to_grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence
 
 OUTSIDE = 1 << 15
-"""Turn of a newcomer that is in no cell: no query may see it yet."""
+"""Turn of an inserted agent that is in no cell: no query may see it yet."""
 PSEUDO_PER_TOKEN = 2
-"""Agents per half second that play newcomers, to learn headings and offsets from."""
+"""Agents per half second that play inserted agents, to learn headings and offsets from."""
 
 
 def describe(
@@ -25,23 +25,23 @@ def describe(
     return heading, to_grid(pose[..., :2], ego_pose) - grid.centre_m[cell]
 
 
-def turns_of(window: SceneWindow) -> np.ndarray:
-    """Turn of every agent among the newcomers of its token [agent, token]."""
+def insertion_turns(window: SceneWindow) -> np.ndarray:
+    """Turn of every agent among the inserted agents of its token [agent, token]."""
     turn = np.full(window.presence.shape, -1, dtype=np.int64)
     turn[window.presence == Presence.INSERTED] = OUTSIDE
     turn[0] = -1  # The ego is always there to be seen.
     inside = (window.insertion_cell != NO_CELL) & (window.entry_row > 0)
     row, token = window.entry_row[inside], window.insertion_token[inside]
-    first = np.searchsorted(token, token)  # Tokens ascend: first newcomer of each.
+    first = np.searchsorted(token, token)  # Tokens ascend: first inserted agent of each.
     turn[row, token] = np.arange(len(token)) - first
     return turn
 
 
-def entry_arrays(window: SceneWindow, turn: np.ndarray, limit: int) -> Arrays:
+def insertion_arrays(window: SceneWindow, turn: np.ndarray, limit: int) -> Arrays:
     """Who enters when, for each token that is asked.
 
     Not the first: who is there then has not come. Not the last of a log: to have come, one
-    must be seen in the half second after it.
+    must be seen in the token step after it.
     """
     tokens = turn.shape[1]
     inside = (turn >= 0) & (turn < OUTSIDE)
@@ -59,7 +59,7 @@ def entry_arrays(window: SceneWindow, turn: np.ndarray, limit: int) -> Arrays:
 def detail_arrays(
     window: SceneWindow, entries: Arrays, grid: Grid, random: np.random.Generator
 ) -> Arrays:
-    """Newcomers in order, then agents that are there already and play the part."""
+    """Inserted agents in order, then agents that are there already and play the part."""
     token, turn = np.nonzero(entries["agent"] >= 0)
     row = entries["agent"][token, turn]
     there = (window.presence == Presence.PRESENT) & window.observed

@@ -1,7 +1,7 @@
 """Perturbation on tokens to learn from, and the moves that lead back (SPEC 2.3, 1.3).
 
 Who only ever sees logs never sees what its own small errors lead to. So agents are led off
-their ways a little: at each half second an agent takes not the move that ends nearest to
+their ways a little: at each token step an agent takes not the move that ends nearest to
 where it should be, but one of the few nearest, and goes on from where that leads. What is
 to be learned is always the nearest, from where the agent has come to. As every draw is near
 to the true pose, errors never add up: agents stray as far as a few neighbouring moves are
@@ -37,12 +37,12 @@ FARTHEST_M = 1.0
 """No draw leads farther from where an agent should be: where moves are rare, the second
 nearest may end metres away ..."""
 FARTHEST_SHARE = 1 / 8
-"""... nor farther than this share of the agent's way in the half second."""
+"""... nor farther than this share of the agent's way in the token step."""
 
 DRIFT_KEPT = 0.8
-"""Share of how far aside a drifting agent is that is left half a second later."""
+"""Share of how far aside a drifting agent is that is left one token step later."""
 DRIFT_M, DRIFT_SHARE = 0.9, 0.15
-"""Typically it is so far aside, or less: this share of its way in half a second ..."""
+"""Typically it is so far aside, or less: this share of its way in one token step ..."""
 DRIFT_MOST = 2.0
 """... and never more than so many times as far."""
 DRIFT_LEAST_WAY_M = 0.75
@@ -137,7 +137,7 @@ def perturb_motion(
         way_m = np.hypot(*(wanted - pose[rows, token - 1])[:, :2].T)
         was_m, aside_m = aside_m, np.zeros(len(kind))
         aside_m[rows] = _drifted(was_m[rows], way_m, pushes[rows, token])
-        led = _led_aside(wanted, way_m, was_m[rows], aside_m[rows])
+        led = _drift_target(wanted, way_m, was_m[rows], aside_m[rows])
 
         few = nearest_k_motion_tokens(led, before, kind[rows], noise.table, noise.moves)
         nearest, taken = few[:, 0].copy(), few[np.arange(len(rows)), turn[rows, token]]
@@ -183,7 +183,7 @@ def _drifted(
     return np.clip(DRIFT_KEPT * aside_m + fresh_m, -most_m, most_m)
 
 
-def _led_aside(
+def _drift_target(
     wanted: Float32[np.ndarray, "row 3"],
     way_m: Float[np.ndarray, " row"],
     was_m: Float64[np.ndarray, " row"],
@@ -203,7 +203,7 @@ def perturb_map(
     noise: Perturbation,
     random: np.random.Generator,
 ) -> Int16[np.ndarray, " road"]:
-    """Draw each road token's shape from those near to it, but for the ``fixed``."""
+    """Draw each map token's shape from those near to it, but for the ``fixed``."""
     turn = random.integers(noise.near_roads.shape[1], size=token.shape)
     return np.where(fixed, token, noise.near_roads[token, turn])
 

@@ -1,6 +1,6 @@
 """Scenes as the network itself plays them, to learn from: closed-loop fine-tuning.
 
-CatK (SPEC 7.1): at every half second each agent takes, of the moves that the network finds
+CatK (SPEC 7.1): at every token step each agent takes, of the moves that the network finds
 most likely, the one that ends nearest to where the log says the agent is. So the scene
 stays near the log, and all that is seen of it is the network's own doing. What is to be
 learned is the move of all that leads nearest to the log from where the agent has come to.
@@ -13,12 +13,18 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from infgen.model.batching.batch import Agents, Batch, Details, Entries
+from infgen.model.batching.batch import Agents, Batch, Details, Insertions
 from infgen.model.batching.insertion_targets import describe
-from infgen.model.nearest_tokens import MoveEnds, nearest, nearest_of, to_local, to_world
+from infgen.model.nearest_tokens import (
+    MotionTokenEnds,
+    nearest,
+    nearest_of,
+    to_local,
+    to_world,
+)
 from infgen.model.network import EGO, Network
 from infgen.model.stepping import Stepper
-from infgen.model.token_step import Column
+from infgen.model.token_step import TokenStep
 from infgen.tokens.grid import Grid, encode_cell, to_grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence
 
@@ -27,9 +33,10 @@ from infgen.tokens.scene_tokens import NO_CELL, Presence
 def close_loop(network: Network, batch: Batch, top: int) -> Batch:
     """Play a batch from its first half second on, close to the log.
 
-    Who enters, leaves or is unseen when and where is the log's: newcomers enter at their
-    true poses, and who was unseen goes on from its true pose. Cells, headings and offsets
-    that are told relative to the ego are told anew, as it is played like all others.
+    Who enters, leaves or is unseen when and where is the log's: inserted agents enter at
+    their true poses, and who was unseen goes on from its true pose. Cells, headings and
+    offsets that are told relative to the ego are told anew, as it is simulated like all
+    others.
 
     Args:
         network: What plays; its mode (training or not) is kept.
@@ -64,7 +71,10 @@ def _play(network: Network, batch: Batch, top: int) -> tuple[Agents, Tensor]:
     logged, stepper, grid = batch.agents, Stepper(network), network.grid
     device = logged.pose.device
     vocabulary = network.motion_vocabulary()
-    ends, top = MoveEnds.of(vocabulary, device), min(top, vocabulary.num_motion_tokens)
+    ends, top = (
+        MotionTokenEnds.of(vocabulary, device),
+        min(top, vocabulary.num_motion_tokens),
+    )
     scenes, tokens, rows = logged.move.shape
     memory = stepper.begin(batch.roads, torch.arange(scenes, device=device), rows)
     off = torch.zeros_like(logged.observed)
@@ -77,7 +87,7 @@ def _play(network: Network, batch: Batch, top: int) -> tuple[Agents, Tensor]:
     )
     for token in range(1, tokens):
         said = stepper.motion_step(memory, _column(played, token - 1))
-        _move(played, logged, off, token, said.move_logits, top, ends)
+        _move(played, logged, off, token, said.motion_logits, top, ends)
         played.cell[:, token] = _cells(played, logged, off, token, grid)
     return played, off
 
@@ -89,7 +99,7 @@ def _move(
     token: int,
     logits: Tensor,
     top: int,
-    ends: MoveEnds,
+    ends: MotionTokenEnds,
 ) -> None:
     """Write the next move of all who are seen now and then, and where it leads."""
     who = logged.observed[:, token] & logged.visible[:, token - 1]  # [scene, agent]
@@ -108,8 +118,8 @@ def _move(
     played.pose[:, token][who] = torch.where(strays[:, None], led, true)
 
 
-def _column(agents: Agents, token: int) -> Column:
-    return Column(
+def _column(agents: Agents, token: int) -> TokenStep:
+    return TokenStep(
         kind=agents.kind,
         size_lwh_m=agents.size_lwh_m,
         pose=agents.pose[:, token],
@@ -121,7 +131,7 @@ def _column(agents: Agents, token: int) -> Column:
 
 
 def _cells(played: Agents, logged: Agents, off: Tensor, token: int, grid: Grid) -> Tensor:
-    """Cells [scene, agent] of the played ego's grid; a newcomer's is never lost."""
+    """Cells [scene, agent] of the played ego's grid; a inserted agent's is never lost."""
     pose, old = played.pose[:, token].numpy(force=True), logged.cell[:, token]
     found = encode_cell(to_grid(pose[..., :2], pose[:, EGO, None]), grid)
     new = torch.from_numpy(found).to(old)
@@ -131,7 +141,7 @@ def _cells(played: Agents, logged: Agents, off: Tensor, token: int, grid: Grid) 
     return torch.where(told & ~lost, new, old)
 
 
-def _tell_entries(entries: Entries, agents: Agents) -> Entries:
+def _tell_entries(entries: Insertions, agents: Agents) -> Insertions:
     cell = agents.cell.gather(2, entries.agent.clamp(min=0))
     return replace(entries, cell=torch.where(entries.agent >= 0, cell, entries.cell))
 

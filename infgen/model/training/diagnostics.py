@@ -15,7 +15,7 @@ BIN_EDGES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
 @torch.no_grad()
-def move_surprise(outputs: Outputs, batch: Batch) -> Float32[Tensor, "2"]:
+def motion_surprise(outputs: Outputs, batch: Batch) -> Float32[Tensor, "2"]:
     """Sum the negative log-likelihoods of the next moves, and count them.
 
     Without label smoothing and weights: the exponential of their mean is the perplexity.
@@ -24,7 +24,7 @@ def move_surprise(outputs: Outputs, batch: Batch) -> Float32[Tensor, "2"]:
     mask = rows.pack(motion_mask(agents))
     target = rows.pack(agents.label.roll(-1, dims=1))[mask]
     each = functional.cross_entropy(
-        outputs.motion.move_logits[mask], target, reduction="none"
+        outputs.motion.motion_logits[mask], target, reduction="none"
     )
     return torch.stack([each.sum(), mask.sum().to(each.dtype)])
 
@@ -37,11 +37,11 @@ def decisions(outputs: Outputs, batch: Batch) -> dict[str, tuple[Tensor, Tensor]
         Both [decision] by the name of the loss term, of those the network has a head for.
     """
     found = {}
-    rows, leave_logit = outputs.motion.rows, outputs.motion.leave_logit
-    if leave_logit is not None:
+    rows, remove_logit = outputs.motion.rows, outputs.motion.remove_logit
+    if remove_logit is not None:
         mask = rows.pack(stay_mask(batch.agents))
         leaves = rows.pack(batch.agents.presence.roll(-1, dims=1) == Presence.REMOVED)
-        found["keep"] = (leave_logit[mask].sigmoid(), leaves[mask])
+        found["keep"] = (remove_logit[mask].sigmoid(), leaves[mask])
     if outputs.entries is not None:
         asked, add_logit = outputs.entries.rows, outputs.entries.add_logit
         agent = asked.pack(batch.entries.agent)

@@ -44,7 +44,7 @@ def supervised(batch: Batch, settings: TrainSettings) -> Tensor:
 
 
 def _motion(batch: Batch, settings: TrainSettings) -> Tensor:
-    """Moves, a newcomer's first one counting more; at token 0 nobody comes in."""
+    """Moves, a inserted agent's first one counting more; at token 0 nobody comes in."""
     mask = motion_mask(batch.agents)
     first = batch.agents.presence == Presence.INSERTED
     first[:, 0] = False
@@ -52,14 +52,14 @@ def _motion(batch: Batch, settings: TrainSettings) -> Tensor:
 
 
 def _decided(batch: Batch) -> Tensor:
-    """Decisions between ADD and BEGIN MOTION: one per newcomer, and one after the last."""
+    """Count decisions of ADD: one per inserted agent, and BEGIN MOTION at the end."""
     entries = batch.entries
     slots = entries.agent.shape[2]
     return torch.where(entries.asked, (entries.count + 1).clamp(max=slots), 0).sum()
 
 
 def _hidden(roads: Roads) -> Tensor:
-    """Which road tokens are predicted [scene, road]: hidden ones after one that is not."""
+    """Which map tokens are predicted [scene, road]: hidden ones after one that is not."""
     wanted = roads.real & roads.picked & roads.follows
     wanted[:, 1:] &= ~roads.picked[:, :-1]
     return wanted

@@ -15,7 +15,7 @@ from torch.nn import functional
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.logits import (
     DetailOutputs,
-    EntryOutputs,
+    InsertionOutputs,
     MotionOutputs,
     Outputs,
     RoadOutputs,
@@ -78,8 +78,8 @@ def losses(outputs: Outputs, batch: Batch, settings: TrainSettings) -> Terms:
     """Compute every term, by name; none of what the network has no head for."""
     smoothing, motion = settings.label_smoothing, outputs.motion
     terms = {"motion": _motion(motion, batch.agents, settings)}
-    if motion.leave_logit is not None:
-        terms["keep"] = _stay(motion.rows, motion.leave_logit, batch.agents)
+    if motion.remove_logit is not None:
+        terms["keep"] = _stay(motion.rows, motion.remove_logit, batch.agents)
     if motion.pattern_logits is not None:
         terms["validity_pattern"] = _pattern(
             motion.rows, motion.pattern_logits, batch.agents
@@ -117,9 +117,10 @@ def figures(terms: Mapping[str, Term]) -> dict[str, float]:
 def motion_mask(agents: Agents) -> Tensor:
     """Tell which tokens [scene, token, agent] have a supervised next move (SPEC 3.5).
 
-    The next move must be known. A newcomer's first one is always supervised. Later ones ask
-    for the token before and the one itself to be observed, so that nothing is learned at
-    the edges of a gap; entering counts as observed for the token that follows it.
+    The next move must be known. A inserted agent's first one is always supervised. Later
+    ones ask for the token before and the one itself to be observed, so that nothing is
+    learned at the edges of a gap; entering counts as observed for the token that follows
+    it.
     """
     entering = agents.presence == Presence.INSERTED
     there = agents.observed
@@ -157,7 +158,7 @@ def _before(values: Tensor) -> Tensor:
 
 
 def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> Term:
-    """Next move of every agent; a newcomer's first one counts more."""
+    """Next move of every agent; a inserted agent's first one counts more."""
     rows = outputs.rows
     mask = rows.pack(motion_mask(agents))
     weight = torch.ones(agents.move.shape, device=mask.device)
@@ -165,17 +166,17 @@ def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> 
     weight[:, 1:][entering] = settings.first_motion_weight  # At token 0 nobody comes in.
     target = rows.pack(_next(agents.label, -1))
     return _choice(
-        outputs.move_logits[mask],
+        outputs.motion_logits[mask],
         target[mask],
         settings.label_smoothing,
         rows.pack(weight)[mask],
     )
 
 
-def _stay(rows: Rows, leave_logit: Tensor, agents: Agents) -> Term:
+def _stay(rows: Rows, remove_logit: Tensor, agents: Agents) -> Term:
     mask = rows.pack(stay_mask(agents))
     following = rows.pack(_next(agents.presence, int(Presence.ABSENT)))
-    return _event(leave_logit[mask], following[mask] == Presence.REMOVED)
+    return _event(remove_logit[mask], following[mask] == Presence.REMOVED)
 
 
 def _pattern(rows: Rows, pattern_logits: Tensor, agents: Agents) -> Term:
@@ -184,38 +185,40 @@ def _pattern(rows: Rows, pattern_logits: Tensor, agents: Agents) -> Term:
     return _choice(pattern_logits[mask], target[mask], 0.0)
 
 
-def _entries(outputs: EntryOutputs, batch: Batch, smoothing: float) -> Terms:
-    """ADD for every newcomer and BEGIN MOTION once after them; cells of newcomers."""
+def _entries(outputs: InsertionOutputs, batch: Batch, smoothing: float) -> Terms:
+    """Terms of ADD (BEGIN MOTION once after the last) and of the position tokens."""
     entries = batch.entries
     count = outputs.rows.pack(entries.count)[:, None]
     slot = torch.arange(entries.agent.shape[2], device=count.device)
     decided = slot <= count
     comes = outputs.rows.pack(entries.agent) >= 0
     terms = {"add": _event(outputs.add_logit[decided], comes[decided])}
-    if outputs.cell_logits is not None:
+    if outputs.position_logits is not None:
         cell = outputs.rows.pack(entries.cell)
-        terms["position"] = _choice(outputs.cell_logits[comes], cell[comes], smoothing)
-    if outputs.place_m is not None:
-        gap_m = outputs.place_m - _places(outputs.rows, batch)
+        terms["position"] = _choice(outputs.position_logits[comes], cell[comes], smoothing)
+    if outputs.position_m is not None:
+        gap_m = outputs.position_m - _places(outputs.rows, batch)
         terms["position_regression"] = _distance(gap_m[comes] / outputs.radius_m)
     return terms
 
 
 def _places(rows: Rows, batch: Batch) -> Tensor:
-    """Where newcomers are in the ego's grid frame [row, slot, 2]; anything for nobody."""
+    """Positions of inserted agents in the ego's grid frame [row, slot, 2]."""
     pose = rows.pack(batch.agents.pose)  # [row, agent, 3]
     agent = rows.pack(batch.entries.agent).clamp(min=0)
-    entry_pose = pose.gather(1, agent[..., None].expand(-1, -1, 3))
-    return grid_place(entry_pose, pose[:, EGO, None])
+    insertion_pose = pose.gather(1, agent[..., None].expand(-1, -1, 3))
+    return grid_place(insertion_pose, pose[:, EGO, None])
 
 
 def _details(outputs: DetailOutputs, batch: Batch) -> Terms:
-    """Kind and size of newcomers; heading and offset also of those who play the part."""
+    """Terms of agent type and size; heading and offset also of pseudo-insertions."""
     details, pack = batch.details, outputs.rows.pack
     real = pack(details.newcomer)
     size_log_m = pack(details.size_lwh_m).clamp(min=0.05).log()
     terms = {
-        "agent_type": _choice(outputs.kind_logits[real], pack(details.kind)[real], 0.0),
+        "agent_type": _choice(
+            outputs.agent_type_logits[real], pack(details.kind)[real], 0.0
+        ),
         "size": _distance((outputs.size_log_m - size_log_m)[real]),
     }
     if outputs.heading_logits is not None:

@@ -1,4 +1,4 @@
-"""Who would run into somebody soon, if everybody goes on as in this half second."""
+"""Who would run into somebody soon, if everybody goes on as in this token step."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
@@ -29,7 +29,7 @@ def repeat(
     return np.concatenate(found, axis=2).astype(np.float32)
 
 
-def find_hits(
+def find_collisions(
     before: Population,
     there: Bool[np.ndarray, "rollout row"],
     ways: Float32[np.ndarray, "rollout row looked 3"],
@@ -39,7 +39,7 @@ def find_hits(
     Pedestrians may walk through each other: groups are closer together than their boxes.
 
     Args:
-        before: Everyone at the beginning of the half second.
+        before: Everyone at the beginning of the token step.
         there: Who is still there in it.
         ways: Where everyone is to be, one moment after the other.
     """
@@ -69,7 +69,7 @@ def _near(
     """Pairs whose boxes may meet: rollout and both rows."""
     reach_m = np.linalg.norm(before.size_lwh_m[..., :2], axis=-1) / 2  # [rollout, row]
     near = np.zeros((*there.shape, there.shape[1]), dtype=bool)
-    for xy_m in np.moveaxis(ways[..., 1::2, :2], 2, 0):  # at the ends of half seconds
+    for xy_m in np.moveaxis(ways[..., 1::2, :2], 2, 0):  # at the ends of token steps
         gap_m = np.linalg.norm(xy_m[:, :, None] - xy_m[:, None], axis=-1)
         near |= gap_m < reach_m[:, :, None] + reach_m[:, None] + ON_THE_WAY_M
     near &= there[:, :, None] & there[:, None]

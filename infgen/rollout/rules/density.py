@@ -11,19 +11,19 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from infgen.rollout.population import EGO_ROW, Population
-from infgen.rollout.recording import Start, number_maps
-from infgen.rollout.rules.off_road import lane_pieces
+from infgen.rollout.recording import RolloutStart, number_maps
+from infgen.rollout.rules.off_road import lane_segments
 from infgen.scene import Scene
 
 Pieces = tuple[Float32[np.ndarray, "_ 2"], Float64[np.ndarray, " _"]]
 
-ENOUGH = 0.5
+FEWEST_LANES_SHARE = 0.5
 """With this share of the lanes that were around at now, a street is as full as then: counts
 in towns' logs hardly depend on how much road there is, as long as there is some."""
 
 
 @dataclass(frozen=True, slots=True)
-class Fullness:
+class DensityControl:
     """How many others there were around each ego of a batch of rollouts.
 
     Attributes:
@@ -42,8 +42,8 @@ class Fullness:
 
     @classmethod
     def of(
-        cls, starts: Sequence[Start], population: Population, radius_m: float
-    ) -> "Fullness":
+        cls, starts: Sequence[RolloutStart], population: Population, radius_m: float
+    ) -> "DensityControl":
         """Look around the egos at now."""
         maps, scene = number_maps(starts)
         pieces = [pieces_of(start.scene) for start in maps]
@@ -57,7 +57,7 @@ class Fullness:
     ) -> Float64[np.ndarray, " rollout"]:
         """How many others are to be around the egos where they are."""
         lanes_m = _around_m(self.pieces, self.scene, ego_m, self.radius_m)
-        enough_m = ENOUGH * self.lanes_m
+        enough_m = FEWEST_LANES_SHARE * self.lanes_m
         # A map without lanes is everywhere as it was.
         share = np.divide(lanes_m, enough_m, np.ones_like(enough_m), where=enough_m > 0)
         return self.at_now * np.minimum(share, 1)
@@ -65,7 +65,7 @@ class Fullness:
 
 def pieces_of(scene: Scene) -> Pieces:
     """Take the pieces of a map's lanes."""
-    start_m, along_m = lane_pieces(scene)
+    start_m, along_m = lane_segments(scene)
     return start_m[:, :2], np.linalg.norm(along_m, axis=1).astype(np.float64)
 
 

@@ -1,4 +1,4 @@
-"""Who would drive off the road soon, if everybody goes on as in this half second."""
+"""Who would drive off the road soon, if everybody goes on as in this token step."""
 
 from collections.abc import Sequence
 
@@ -32,13 +32,13 @@ Lanes = tuple[Float32[np.ndarray, "piece 3"], Float32[np.ndarray, "piece 3"]]
 """Pieces of lanes, flat: first points, and the ways to their last points."""
 
 
-class Kerbs:
+class RoadEdgeTiles:
     """How far off the road the places of one map are, all of it flat."""
 
     def __init__(self, scene: Scene) -> None:
         """Look at nothing yet."""
         self._edges = scene_road_edges(scene, flat=True)
-        self._lanes = lane_pieces(scene)
+        self._lanes = lane_segments(scene)
         self._row: dict[int, int] = {}
         self._off_m = np.zeros((0, TILE + 1, TILE + 1), dtype=np.float32)
 
@@ -92,7 +92,7 @@ class Kerbs:
         return off_m.reshape(at.shape[:-1])
 
 
-def lane_pieces(scene: Scene) -> Lanes:
+def lane_segments(scene: Scene) -> Lanes:
     """Take all pieces of lanes of a map."""
     road_map = scene.road_map
     flat_m = road_map.xyz_m * np.array([1, 1, 0], dtype=np.float32)
@@ -116,28 +116,28 @@ def lanes_distance_m(
     return np.linalg.norm(away_m - share[:, None] * along_m, axis=1).astype(np.float32)
 
 
-def find_departures(
+def find_off_road(
     before: Population,
     which: Bool[np.ndarray, "rollout row"],
     ways: Float32[np.ndarray, "rollout row looked 3"],
     moments: Int64[np.ndarray, "rollout row"],
-    kerbs: Sequence[Kerbs],
+    road_edge_tiles: Sequence[RoadEdgeTiles],
     scene: Int64[np.ndarray, " rollout"],
 ) -> Bool[np.ndarray, "rollout row"]:
     """Tell which vehicles leave the road, or go farther off it.
 
     Args:
-        before: Everyone at the beginning of the half second.
+        before: Everyone at the beginning of the token step.
         which: Who is asked about.
         ways: Where everyone is to be, one moment after the other.
         moments: How many of these count for each.
-        kerbs: Of each map.
+        road_edge_tiles: Of each map.
         scene: Map of each rollout.
     """
     departs = np.zeros(which.shape, dtype=bool)
     vehicle = which & (before.kind == AgentType.VEHICLE)
     poses = np.concatenate([before.pose[:, :, None], ways], axis=2)
-    for at, edge in enumerate(kerbs):
+    for at, edge in enumerate(road_edge_tiles):
         rollout, row = np.nonzero(vehicle & (scene == at)[:, None])
         counts = np.arange(poses.shape[2]) <= moments[rollout, row, None]  # now, and then
         who, moment = np.nonzero(counts)

@@ -16,7 +16,7 @@ from infgen.geometry import wrap_angle
 from infgen.model.signal_features import StopLines
 from infgen.rollout.population import Population
 from infgen.rollout.recording import NOBODY
-from infgen.rollout.rules.off_road import lane_pieces, lanes_distance_m
+from infgen.rollout.rules.off_road import lane_segments, lanes_distance_m
 from infgen.scene import AgentType, Scene
 from infgen.tokens.scene_tokens import Presence, SignalClass
 
@@ -31,7 +31,7 @@ WAITS_M = 15.0
 RED = (SignalClass.STOP, SignalClass.CAUTION)
 
 
-class Patience:
+class StallRule:
     """Remembers since when everybody in a batch of rollouts has stood where it is."""
 
     def __init__(
@@ -44,13 +44,13 @@ class Patience:
         """Nobody has stood yet.
 
         Args:
-            maps: Scenes whose maps are played on.
+            maps: Scenes whose maps are simulated on.
             scene: Which of them each rollout plays.
             lines: Stop lines of those maps.
-            tokens: Half seconds that are long enough.
+            tokens: Token steps that are long enough.
         """
         self._scene, self._lines, self._tokens = scene, lines, tokens
-        self._lanes = [lane_pieces(one) for one in maps]
+        self._lanes = [lane_segments(one) for one in maps]
         self._life = np.zeros((len(scene), 0), dtype=np.int32)
         self._from_m = np.zeros((*self._life.shape, 2), dtype=np.float32)
         self._since = np.zeros(self._life.shape, dtype=np.int64)
@@ -63,11 +63,11 @@ class Patience:
 
         Args:
             everyone: At the end of half second ``token``.
-            token: That half second.
+            token: That token step.
         """
         self._remember(everyone, token)
         stood = token - self._since
-        vehicle = (everyone.kind == AgentType.VEHICLE) & (everyone.life != NOBODY)
+        vehicle = (everyone.kind == AgentType.VEHICLE) & (everyone.agent_number != NOBODY)
         vehicle &= everyone.presence != Presence.REMOVED
         new = vehicle & (stood == self._tokens)
         self._in_lane[new] = self._are_in_lane(everyone.pose[new], np.nonzero(new)[0])
@@ -80,14 +80,14 @@ class Patience:
     def _remember(self, everyone: Population, token: int) -> None:
         """Begin anew with those who have moved on, or are others than before."""
         xy_m = everyone.pose[..., :2]
-        if self._life.shape != everyone.life.shape:
-            self._life = np.full_like(everyone.life, NOBODY)
+        if self._life.shape != everyone.agent_number.shape:
+            self._life = np.full_like(everyone.agent_number, NOBODY)
             self._from_m = np.zeros_like(xy_m)
-            self._since = np.zeros(everyone.life.shape, dtype=np.int64)
-            self._in_lane = np.zeros(everyone.life.shape, dtype=bool)
-        stays = (everyone.life == self._life) & (everyone.life != NOBODY)
+            self._since = np.zeros(everyone.agent_number.shape, dtype=np.int64)
+            self._in_lane = np.zeros(everyone.agent_number.shape, dtype=bool)
+        stays = (everyone.agent_number == self._life) & (everyone.agent_number != NOBODY)
         stays &= np.linalg.norm(xy_m - self._from_m, axis=-1) < AWAY_M
-        self._life = everyone.life.copy()
+        self._life = everyone.agent_number.copy()
         self._from_m = np.where(stays[..., None], self._from_m, xy_m)
         self._since = np.where(stays, self._since, token)
         self._in_lane &= stays

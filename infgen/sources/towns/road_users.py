@@ -8,7 +8,7 @@ import numpy as np
 from infgen.scene import AgentType
 
 
-class Body(Enum):
+class BodyType(Enum):
     """What somebody is or drives. Values are SUMO's vehicle classes."""
 
     CAR = "passenger"
@@ -22,39 +22,39 @@ class Body(Enum):
     @property
     def kind(self) -> AgentType:
         """What a log calls it."""
-        kinds = {Body.BICYCLE: AgentType.CYCLIST, Body.WALKER: AgentType.PEDESTRIAN}
+        kinds = {BodyType.BICYCLE: AgentType.CYCLIST, BodyType.WALKER: AgentType.PEDESTRIAN}
         return kinds.get(self, AgentType.VEHICLE)
 
 
 MOTOR_SHARES = {
-    Body.CAR: 0.885,
-    Body.VAN: 0.05,
-    Body.TRUCK: 0.035,
-    Body.BUS: 0.012,
-    Body.MOTORCYCLE: 0.018,
+    BodyType.CAR: 0.885,
+    BodyType.VAN: 0.05,
+    BodyType.TRUCK: 0.035,
+    BodyType.BUS: 0.012,
+    BodyType.MOTORCYCLE: 0.018,
 }
 _MEAN_LWH_M = {
-    Body.CAR: (4.75, 2.06, 1.68),
-    Body.VAN: (6.1, 2.3, 2.5),
-    Body.TRUCK: (8.4, 2.65, 3.3),
-    Body.BUS: (11.8, 2.9, 3.2),
-    Body.MOTORCYCLE: (2.2, 0.95, 1.6),
-    Body.BICYCLE: (1.76, 0.82, 1.74),
-    Body.WALKER: (0.9, 0.86, 1.72),
+    BodyType.CAR: (4.75, 2.06, 1.68),
+    BodyType.VAN: (6.1, 2.3, 2.5),
+    BodyType.TRUCK: (8.4, 2.65, 3.3),
+    BodyType.BUS: (11.8, 2.9, 3.2),
+    BodyType.MOTORCYCLE: (2.2, 0.95, 1.6),
+    BodyType.BICYCLE: (1.76, 0.82, 1.74),
+    BodyType.WALKER: (0.9, 0.86, 1.72),
 }
 _SPREAD_LWH_M = {
-    Body.CAR: (0.38, 0.11, 0.17),
-    Body.VAN: (0.5, 0.1, 0.25),
-    Body.TRUCK: (1.2, 0.15, 0.4),
-    Body.BUS: (0.6, 0.1, 0.15),
-    Body.MOTORCYCLE: (0.1, 0.08, 0.1),
-    Body.BICYCLE: (0.08, 0.05, 0.08),
-    Body.WALKER: (0.1, 0.09, 0.1),
+    BodyType.CAR: (0.38, 0.11, 0.17),
+    BodyType.VAN: (0.5, 0.1, 0.25),
+    BodyType.TRUCK: (1.2, 0.15, 0.4),
+    BodyType.BUS: (0.6, 0.1, 0.15),
+    BodyType.MOTORCYCLE: (0.1, 0.08, 0.1),
+    BodyType.BICYCLE: (0.08, 0.05, 0.08),
+    BodyType.WALKER: (0.1, 0.09, 0.1),
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Person:
+class RoadUser:
     """Somebody on the road.
 
     Attributes:
@@ -68,7 +68,7 @@ class Person:
         hesitation_s: How long after they could they set off, if they have stood.
     """
 
-    body: Body
+    body: BodyType
     size_lwh_m: tuple[float, float, float]
     haste: float
     headway_s: float
@@ -78,12 +78,12 @@ class Person:
     hesitation_s: float
 
 
-def draw_motorist(rng: np.random.Generator) -> Person:
+def draw_motorist(rng: np.random.Generator) -> RoadUser:
     """Draw a driver and what they drive."""
     bodies = list(MOTOR_SHARES)
     body = bodies[rng.choice(len(bodies), p=list(MOTOR_SHARES.values()))]
-    heavy = body in (Body.TRUCK, Body.BUS)
-    return Person(
+    heavy = body in (BodyType.TRUCK, BodyType.BUS)
+    return RoadUser(
         body=body,
         size_lwh_m=draw_size(body, rng),
         haste=float(np.clip(rng.normal(0.98, 0.11), 0.7, 1.3)),
@@ -95,11 +95,11 @@ def draw_motorist(rng: np.random.Generator) -> Person:
     )
 
 
-def draw_cyclist(rng: np.random.Generator) -> Person:
+def draw_cyclist(rng: np.random.Generator) -> RoadUser:
     """Draw somebody on a bicycle."""
-    return Person(
-        body=Body.BICYCLE,
-        size_lwh_m=draw_size(Body.BICYCLE, rng),
+    return RoadUser(
+        body=BodyType.BICYCLE,
+        size_lwh_m=draw_size(BodyType.BICYCLE, rng),
         haste=float(np.clip(rng.normal(4.9, 1.2), 2.5, 8.0)),
         headway_s=float(rng.uniform(0.8, 1.4)),
         accel_mps2=float(rng.uniform(0.7, 1.3)),
@@ -109,11 +109,11 @@ def draw_cyclist(rng: np.random.Generator) -> Person:
     )
 
 
-def draw_walker(rng: np.random.Generator) -> Person:
+def draw_walker(rng: np.random.Generator) -> RoadUser:
     """Draw somebody on foot."""
-    return Person(
-        body=Body.WALKER,
-        size_lwh_m=draw_size(Body.WALKER, rng),
+    return RoadUser(
+        body=BodyType.WALKER,
+        size_lwh_m=draw_size(BodyType.WALKER, rng),
         haste=float(np.clip(rng.normal(1.35, 0.25), 0.6, 2.4)),
         headway_s=1.0,
         accel_mps2=1.0,
@@ -128,11 +128,11 @@ def draw_hesitation(rng: np.random.Generator) -> float:
     return float(min(rng.lognormal(np.log(0.7), 0.5), 2.5))
 
 
-def draw_size(body: Body, rng: np.random.Generator) -> tuple[float, float, float]:
+def draw_size(body: BodyType, rng: np.random.Generator) -> tuple[float, float, float]:
     """Draw a box: length, width, height, in whole millimetres as SUMO reads them."""
     noise = np.clip(rng.normal(size=3), -2.2, 2.2)
     # Some cars are pickups and large at that.
-    if body is Body.CAR and rng.random() < 0.2:
+    if body is BodyType.CAR and rng.random() < 0.2:
         noise[0], noise[1:] = rng.uniform(1.5, 3.2), rng.uniform(0.8, 2.6, 2)
     size_m = np.array(_MEAN_LWH_M[body]) + noise * np.array(_SPREAD_LWH_M[body])
     length_m, width_m, height_m = np.round(size_m, 3).tolist()

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from infgen.clock import CLOCK
 from infgen.scene import RoadMap
-from infgen.sources.towns.road_users import Body
+from infgen.sources.towns.road_users import BodyType
 from infgen.sources.towns.streets.boxes import clear_way
 from infgen.sources.towns.streets.layouts import draw_layout
 from infgen.sources.towns.streets.markings import (
@@ -22,7 +22,7 @@ from infgen.sources.towns.streets.markings import (
 from infgen.sources.towns.streets.network import Network, read_network
 from infgen.sources.towns.streets.plain_xml import build_net
 from infgen.sources.towns.streets.plots import draw_plenty
-from infgen.sources.towns.streets.road_edges import draw_kerbs
+from infgen.sources.towns.streets.road_edges import draw_road_edges
 from infgen.sources.towns.streets.road_map import Furniture, draw_map
 from infgen.sources.towns.streets.street_types import Street
 from infgen.sources.towns.streets.surroundings import Surroundings, surround
@@ -130,7 +130,7 @@ def _with_traffic(
     surroundings = replace(surroundings, parked=parked)
     furniture = Furniture(
         lines=list(draw_lines(network, streets)),
-        kerbs=list(draw_kerbs(network)),
+        road_edges=list(draw_road_edges(network)),
         crosswalks=draw_crosswalks(network, rng),
         driveways=surroundings.driveways,
         bumps=draw_bumps(network, streets, rng),
@@ -144,7 +144,7 @@ def _with_traffic(
         surroundings=surroundings,
         kind=np.array([trip.person.body.kind for trip in trips], np.int64),
         size_lwh_m=size_lwh_m,
-        car=np.array([trip.person.body is Body.CAR for trip in trips]),
+        car=np.array([trip.person.body is BodyType.CAR for trip in trips]),
         bodies=bodies,
         begins_s=begins_s,
     )

@@ -1,8 +1,8 @@
 """Motion samples made by rule: uniform motion along arcs, where logs show none.
 
 A vocabulary must be able to follow any road user, or the chain of motion tokens runs away
-from the log. Where logs hold no motion token nearby, a fan of arcs within the limits stands
-in.
+from the log. Where logs hold no motion token nearby, a motion_grid of arcs within the
+limits stands in.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ PIVOT_M = (1.4, 0.0, 0.5)
 """How far behind the centre of the box the point lies that goes along the arc."""
 
 REVERSE_MPS = (4.0, 1.5, 1.0)
-"""How fast a fan goes backwards."""
+"""How fast a motion_grid goes backwards."""
 
 MAX_LATERAL_MPS2 = 8.0
 """Sideways acceleration that tyres hold."""

@@ -35,7 +35,7 @@ svg { background: #fafafa; border: 1px solid #ddd; max-width: 100%; height: auto
 """
 
 
-def codebook_page(
+def vocabulary_page(
     report: Mapping[str, Any],
     motion: MotionVocabulary,
     move_origin: Int8[np.ndarray, "3 move"],

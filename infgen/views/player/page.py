@@ -12,7 +12,7 @@ from importlib.resources import files
 
 from infgen.views.player.payload import pack
 from infgen.views.scene.style import DARK, LIGHT, for_scripts
-from infgen.views.scene.view_model import Film
+from infgen.views.scene.view_model import ViewModel
 
 MODULES = (
     "looks",
@@ -37,21 +37,21 @@ _EXPORT = re.compile(r"^export ((?:async )?(?:function|class|const) (\w+))", re.
 _GAP = re.compile(r"\{\{(\w+)\}\}")
 
 
-def player_page(film: Film) -> str:
+def player_page(view_model: ViewModel) -> str:
     """Write the page (HTML) that plays a film."""
-    names = ", ".join(showing.name for showing in film.showings)
-    about = f"Scene {film.scenario_id}: {names}."
-    if film.weights:
-        about += f" Weights {film.weights}."
+    names = ", ".join(showing.name for showing in view_model.showings)
+    about = f"Scene {view_model.scenario_id}: {names}."
+    if view_model.weights:
+        about += f" Weights {view_model.weights}."
     return _fill(
         _read("page.html"),
         {
-            "title": escape(f"{film.scenario_id} - InfGen"),
-            "scene": escape(film.scenario_id),
+            "title": escape(f"{view_model.scenario_id} - InfGen"),
+            "scene": escape(view_model.scenario_id),
             "about": escape(about),
             "style": _fill(_read("page.css"), {"light": LIGHT.css(), "dark": DARK.css()}),
             "looks": json.dumps(for_scripts()),
-            "payload": pack(film),
+            "payload": pack(view_model),
             "script": joined_scripts(),
         },
     )

@@ -9,20 +9,20 @@ from infgen.clock import CLOCK
 from infgen.views.player.columns import PayloadError, pack_columns, unpack_columns
 from infgen.views.player.motion import PER_M, PER_RAD, Runs, from_runs, to_runs
 from infgen.views.scene.drawn_map import DrawnMap, Lights
-from infgen.views.scene.view_model import Film, Showing
+from infgen.views.scene.view_model import Showing, ViewModel
 
 VERSION = 1
 
 
-def pack(film: Film) -> str:
+def pack(view_model: ViewModel) -> str:
     """Write a film as text of base64's letters only."""
-    columns = {**_map_columns(film.drawn_map), **_light_columns(film.lights)}
-    for at, showing in enumerate(film.showings):
+    columns = {**_map_columns(view_model.drawn_map), **_light_columns(view_model.lights)}
+    for at, showing in enumerate(view_model.showings):
         columns |= {f"{at}.{k}": v for k, v in _showing_columns(showing).items()}
-    return pack_columns(_about(film), columns)
+    return pack_columns(_about(view_model), columns)
 
 
-def unpack(text: str) -> Film:
+def unpack(text: str) -> ViewModel:
     """Read a film back: positions to a centimetre, headings to a milliradian.
 
     Raises:
@@ -31,7 +31,7 @@ def unpack(text: str) -> Film:
     about, columns = unpack_columns(text)
     if about.get("version") != VERSION:
         raise PayloadError(f"payload version {about.get('version')}, expected {VERSION}")
-    return Film(
+    return ViewModel(
         scenario_id=about["scene"],
         now=about["now"],
         weights=about["weights"],
@@ -44,14 +44,14 @@ def unpack(text: str) -> Film:
     )
 
 
-def _about(film: Film) -> Mapping[str, Any]:
+def _about(view_model: ViewModel) -> Mapping[str, Any]:
     return {
         "version": VERSION,
-        "scene": film.scenario_id,
-        "now": film.now,
-        "weights": film.weights,
+        "scene": view_model.scenario_id,
+        "now": view_model.now,
+        "weights": view_model.weights,
         "stepS": CLOCK.step_s,
-        "lightSteps": film.lights.state.shape[1],
+        "lightSteps": view_model.lights.state.shape[1],
         "perM": PER_M,
         "perRad": PER_RAD,
         "showings": [
@@ -61,7 +61,7 @@ def _about(film: Film) -> Mapping[str, Any]:
                 "agents": len(showing.id),
                 "steps": showing.num_steps,
             }
-            for showing in film.showings
+            for showing in view_model.showings
         ],
     }
 

@@ -1,4 +1,4 @@
-"""Agents, their trails, and rings around newcomers as marks."""
+"""Agents, their trails, and rings around inserted agents as marks."""
 
 from collections.abc import Iterator
 
@@ -20,10 +20,10 @@ _BAND_ALPHAS = [
 _LEAST_WAY_PX = 0.5
 """Who has moved less has no trail."""
 _PING_PX = (3.0, 16.0)
-"""A newcomer's ring begins so far from its box, and grows by so much."""
+"""A inserted agent's ring begins so far from its box, and grows by so much."""
 
 
-class Crowd:
+class AgentMarks:
     """Everyone of a showing, with their shapes."""
 
     def __init__(self, showing: Showing) -> None:
@@ -35,10 +35,10 @@ class Crowd:
         self._colours = [_ROLES[Role(role)] for role in showing.role.tolist()]
 
     def marks(self, now: int, time: float, view: View, theme: Theme) -> Iterator[Mark]:
-        """Draw trails, agents, and rings around newcomers.
+        """Draw trails, agents, and rings around inserted agents.
 
         Args:
-            now: Last step of the history: whoever is there by then is no newcomer.
+            now: Last step of the history: whoever is there by then is no inserted agent.
             time: In steps, whole or not.
             view: The window.
             theme: The colours.
@@ -87,7 +87,7 @@ class Crowd:
         view: View,
         theme: Theme,
     ) -> Iterator[Mark]:
-        """Draw one agent, the ego's ring or a newcomer's dot included."""
+        """Draw one agent, the ego's ring or a inserted agent's dot included."""
         shape, alpha = self.shapes[row], float(moment.alpha[row])
         length_m, width_m = self.showing.size_lw_m[row].tolist()
         longest_px = max(length_m, width_m) * view.scale

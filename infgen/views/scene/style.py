@@ -201,7 +201,7 @@ STROKES = (
 
 
 @dataclass(frozen=True, slots=True)
-class AgentLooks:
+class AgentStyle:
     """Shapes of agents, as shares of their boxes, and how they come and go.
 
     Attributes:
@@ -223,9 +223,9 @@ class AgentLooks:
         fade_steps: An agent that leaves begins to fade so many steps before.
         ghost_steps: So many steps after it has left its outline is still seen.
         leaving_alpha: Opacity of whoever leaves in this step.
-        arrive_steps: A newcomer's opacity grows for so long.
+        arrive_steps: A inserted agent's opacity grows for so long.
         arrive_alpha: Opacity of whoever came in this step.
-        ping_steps: A ring grows around a newcomer for so long.
+        ping_steps: A ring grows around an inserted agent for so long.
         trail_steps: Length of a trail.
         trail_bands: Parts of a trail that are drawn alike.
         trail_alpha: Opacity of its newest part.
@@ -261,11 +261,11 @@ class AgentLooks:
     trail_px: float = 1.6
 
 
-AGENTS = AgentLooks()
+AGENTS = AgentStyle()
 
 
 @dataclass(frozen=True, slots=True)
-class LightLooks:
+class SignalStyle:
     """Shapes of traffic lights, around where the lane's traffic stops.
 
     Attributes:
@@ -287,7 +287,7 @@ class LightLooks:
     held_alpha: float = 0.45
 
 
-LIGHTS = LightLooks()
+LIGHTS = SignalStyle()
 SIGN_M, SIGN_LEAST_PX = 0.9, 3.5
 """Radius of a stop sign."""
 FIRST_REACH_M = 52.0
@@ -308,7 +308,7 @@ def for_scripts() -> dict[str, Any]:
     }
 
 
-def _for_scripts(looks: Stroke | AgentLooks | LightLooks) -> dict[str, Any]:
+def _for_scripts(looks: Stroke | AgentStyle | SignalStyle) -> dict[str, Any]:
     return {_camel(name): value for name, value in asdict(looks).items()}
 
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator
 
-from infgen.views.scene.agent_marks import Crowd
+from infgen.views.scene.agent_marks import AgentMarks
 from infgen.views.scene.interpolation import ego_place
 from infgen.views.scene.map_marks import light_marks, map_marks
 from infgen.views.scene.marks import Mark, View
 from infgen.views.scene.style import FIRST_REACH_M, Theme
-from infgen.views.scene.view_model import Film, Showing
+from infgen.views.scene.view_model import Showing, ViewModel
 
 
 def view_of(
@@ -24,16 +24,16 @@ def scale_of(width_px: float, height_px: float) -> float:
 
 
 def all_marks(
-    film: Film, crowd: Crowd, time: float, view: View, theme: Theme
+    view_model: ViewModel, agent_marks: AgentMarks, time: float, view: View, theme: Theme
 ) -> Iterator[Mark]:
     """Draw the map and whoever is on it."""
-    yield from map_marks(film.drawn_map, view, theme)
-    yield from moving_marks(film, crowd, time, view, theme)
+    yield from map_marks(view_model.drawn_map, view, theme)
+    yield from moving_marks(view_model, agent_marks, time, view, theme)
 
 
 def moving_marks(
-    film: Film, crowd: Crowd, time: float, view: View, theme: Theme
+    view_model: ViewModel, agent_marks: AgentMarks, time: float, view: View, theme: Theme
 ) -> Iterator[Mark]:
     """Draw all that changes from moment to moment."""
-    yield from light_marks(film.lights, time, view, theme)
-    yield from crowd.marks(film.now, time, view, theme)
+    yield from light_marks(view_model.lights, time, view, theme)
+    yield from agent_marks.marks(view_model.now, time, view, theme)

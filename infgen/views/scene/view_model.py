@@ -1,6 +1,7 @@
 """What there is to see of a scene: its map, its lights, and each played or logged future.
 
-Player, video and strips draw the same ``Film``. Positions are in the scene's local frame.
+Player, video and strips draw the same ``ViewModel``. Positions are in the scene's local
+frame.
 """
 
 from dataclasses import dataclass
@@ -62,7 +63,7 @@ class Showing:
 
 
 @dataclass(frozen=True, slots=True)
-class Film:
+class ViewModel:
     """A scene and what is shown of it.
 
     Attributes:
@@ -96,7 +97,9 @@ class Film:
         return max(showing.num_steps for showing in self.showings)
 
 
-def make_film(scene: Scene, rollouts: tuple[Rollout, ...], *, log: bool = True) -> Film:
+def make_view_model(
+    scene: Scene, rollouts: tuple[Rollout, ...], *, log: bool = True
+) -> ViewModel:
     """Gather what is shown of a scene.
 
     Raises:
@@ -109,7 +112,7 @@ def make_film(scene: Scene, rollouts: tuple[Rollout, ...], *, log: bool = True) 
                 f"not of {scene.scenario_id}"
             )
     logged = (show_log(scene),) if log else ()
-    return Film(
+    return ViewModel(
         scenario_id=scene.scenario_id,
         now=scene.now,
         weights=rollouts[0].weights if rollouts else "",

@@ -10,7 +10,7 @@ from infgen.views.scene.interpolation import ego_place
 from infgen.views.scene.map_marks import map_marks
 from infgen.views.scene.marks import View
 from infgen.views.scene.view import moving_marks, scale_of
-from infgen.views.scene.view_model import Film
+from infgen.views.scene.view_model import ViewModel
 from infgen.views.video.layout import (
     Format,
     Pane,
@@ -24,13 +24,13 @@ _VEIL = 0.5
 """How much of a showing that is over is covered."""
 
 
-def num_frames(film: Film, form: Format) -> int:
+def num_frames(view_model: ViewModel, form: Format) -> int:
     """Frames from now to the end of the longest showing."""
-    return round((film.num_steps - 1 - film.now) * CLOCK.step_s * form.fps)
+    return round((view_model.num_steps - 1 - view_model.now) * CLOCK.step_s * form.fps)
 
 
 def paint_frames(
-    film: Film, form: Format, first: int, count: int
+    view_model: ViewModel, form: Format, first: int, count: int
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Paint some frames, in order.
 
@@ -38,17 +38,18 @@ def paint_frames(
     quick to paint and small to hold. A frame is painted over by the next one.
     """
     times = [
-        film.now + at / (form.fps * CLOCK.step_s) for at in range(first, first + count)
+        view_model.now + at / (form.fps * CLOCK.step_s)
+        for at in range(first, first + count)
     ]
-    panes = make_panes(film, form)
-    backdrop = paint_backdrop(film, form, panes)
-    painters = [_PanePainter(film, pane, times, form) for pane in panes]
+    panes = make_panes(view_model, form)
+    backdrop = paint_backdrop(view_model, form, panes)
+    painters = [_PanePainter(view_model, pane, times, form) for pane in panes]
     canvas = Canvas(backdrop.copy())
     for time in times:
         canvas.pixels[...] = backdrop
         for pane, painter in zip(panes, painters, strict=True):
             canvas.put(painter.paint(time), pane.left_px, pane.top_px)
-        paint_time(canvas, film, form, time)
+        paint_time(canvas, view_model, form, time)
         yield canvas.pixels
 
 
@@ -56,16 +57,16 @@ class _PanePainter:
     """Paints one pane; the map under it is painted once for a stretch of time."""
 
     def __init__(
-        self, film: Film, pane: Pane, times: Sequence[float], form: Format
+        self, view_model: ViewModel, pane: Pane, times: Sequence[float], form: Format
     ) -> None:
-        self._film, self._pane, self._form = film, pane, form
+        self._film, self._pane, self._form = view_model, pane, form
         corners = np.array([self._corner_px(time) for time in times])
         self._left, self._top = int(corners[:, 0].min()), int(corners[:, 1].max())
         wide, high = np.ptp(corners, axis=0).tolist()
         width, height = wide + pane.width_px, high + pane.height_px
         whole = self._view(self._left, self._top, width, height)
         ground = Canvas.plain(width, height, form.colours.ground)
-        ground.paint(map_marks(film.drawn_map, whole, form.colours))
+        ground.paint(map_marks(view_model.drawn_map, whole, form.colours))
         self._ground = ground.pixels
         self._canvas = Canvas.plain(pane.width_px, pane.height_px, form.colours.ground)
 
@@ -74,7 +75,7 @@ class _PanePainter:
         showing, theme, canvas = self._pane.showing, self._form.colours, self._canvas
         shown = min(time, showing.num_steps - 1.0)
         view = self._lay_ground(shown)
-        canvas.paint(moving_marks(self._film, self._pane.crowd, shown, view, theme))
+        canvas.paint(moving_marks(self._film, self._pane.agent_marks, shown, view, theme))
         if time > shown:
             self._cover()
         self._write(int(showing.valid[:, int(shown)].sum()))

@@ -8,11 +8,11 @@ from jaxtyping import UInt8
 
 from infgen.clock import CLOCK
 from infgen.errors import ConfigError
-from infgen.views.scene.agent_marks import Crowd
+from infgen.views.scene.agent_marks import AgentMarks
 from infgen.views.scene.marks import Mark
 from infgen.views.scene.shapes import shape_of
 from infgen.views.scene.style import NUM_SERIES, THEMES, Theme
-from infgen.views.scene.view_model import LOG, Film, Showing
+from infgen.views.scene.view_model import LOG, Showing, ViewModel
 from infgen.views.video.painter import Canvas
 
 _HEAD, _FOOT, _FONT = 0.052, 0.13, 0.019
@@ -73,7 +73,7 @@ class Pane:
 
     Attributes:
         showing: What is seen in it.
-        crowd: Everyone of the showing.
+        agent_marks: Everyone of the showing.
         colour: Of its line in the chart.
         left_px: Left edge in the picture.
         top_px: Top edge.
@@ -82,7 +82,7 @@ class Pane:
     """
 
     showing: Showing
-    crowd: Crowd
+    agent_marks: AgentMarks
     colour: str
     left_px: int
     top_px: int
@@ -90,24 +90,24 @@ class Pane:
     height_px: int
 
 
-def make_panes(film: Film, form: Format) -> list[Pane]:
+def make_panes(view_model: ViewModel, form: Format) -> list[Pane]:
     """Share the picture out among the showings, so that their shorter sides are longest."""
     head, foot = round(_HEAD * form.height_px), round(_FOOT * form.height_px)
     width, height = form.width_px, form.height_px - head - foot
-    count = len(film.showings)
+    count = len(view_model.showings)
     columns = max(
         range(1, count + 1), key=lambda n: min(width / n, height / -(-count // n))
     )
     rows, gap = -(-count // columns), max(1, form.height_px // 540)
     lefts = np.linspace(0, width + gap, columns + 1).round().astype(int)
     tops = head + np.linspace(0, height + gap, rows + 1).round().astype(int)
-    colours, panes = _series(film, form.colours), []
-    for at, showing in enumerate(film.showings):
+    colours, panes = _series(view_model, form.colours), []
+    for at, showing in enumerate(view_model.showings):
         row, column = divmod(at, columns)
         panes.append(
             Pane(
                 showing,
-                Crowd(showing),
+                AgentMarks(showing),
                 colours[at],
                 left_px=int(lefts[column]),
                 top_px=int(tops[row]),
@@ -118,17 +118,17 @@ def make_panes(film: Film, form: Format) -> list[Pane]:
     return panes
 
 
-def _series(film: Film, theme: Theme) -> list[str]:
+def _series(view_model: ViewModel, theme: Theme) -> list[str]:
     """Colour of each showing: the log's own, and one after the other for rollouts."""
     rank, found = 0, []
-    for showing in film.showings:
+    for showing in view_model.showings:
         found.append(theme.log if showing.name == LOG else getattr(theme, f"s{rank}"))
         rank = (rank + (showing.name != LOG)) % NUM_SERIES
     return found
 
 
 def paint_backdrop(
-    film: Film, form: Format, panes: list[Pane]
+    view_model: ViewModel, form: Format, panes: list[Pane]
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Paint what stays: head, legend and the counts' lines."""
     theme, size = form.colours, form.font_px
@@ -138,7 +138,7 @@ def paint_backdrop(
     canvas.box(0, head, form.width_px, foot, theme.faint)
     base = head / 2 + 0.35 * size
     wide = canvas.write("InfGen", (size, base), 1.1 * size, theme.ink)
-    canvas.write(film.scenario_id, (1.8 * size + wide, base), size, theme.quiet)
+    canvas.write(view_model.scenario_id, (1.8 * size + wide, base), size, theme.quiet)
     right = form.width_px - size
     for name, words in reversed(_LEGEND):
         right -= (
@@ -147,50 +147,50 @@ def paint_backdrop(
         body = 0.34 * size * shape_of(0, 4.6, 2.0).body * (1, -1)
         canvas.paint([Mark(body + (right, head / 2), getattr(theme, name))])  # noqa: RUF005
         right -= 1.9 * size
-    canvas.paint(_count_marks(film, form, panes))
-    most = _most(film)
+    canvas.paint(_count_marks(view_model, form, panes))
+    most = _most(view_model)
     for count in (0, most):
         place = (_chart_left(form) - 0.5 * size, _chart_y(form, count, most) + 0.3 * size)
         canvas.write(f"{count}", place, 0.8 * size, theme.quiet, align=1.0)
     return canvas.pixels
 
 
-def _count_marks(film: Film, form: Format, panes: list[Pane]) -> Iterator[Mark]:
+def _count_marks(view_model: ViewModel, form: Format, panes: list[Pane]) -> Iterator[Mark]:
     """Lines of how many agents there are."""
-    most = _most(film)
+    most = _most(view_model)
     for pane in panes:
-        counts = pane.showing.valid.sum(axis=0)[film.now :]
-        steps = film.now + np.arange(len(counts), dtype=np.float64)
-        x = [_chart_x(film, form, step) for step in steps.tolist()]
+        counts = pane.showing.valid.sum(axis=0)[view_model.now :]
+        steps = view_model.now + np.arange(len(counts), dtype=np.float64)
+        x = [_chart_x(view_model, form, step) for step in steps.tolist()]
         y = [_chart_y(form, int(count), most) for count in counts.tolist()]
         width = (3 if pane.showing.name == LOG else 2) * form.density
         yield Mark(np.column_stack([x, y]), None, pane.colour, width, closed=False)
 
 
-def paint_time(canvas: Canvas, film: Film, form: Format, time: float) -> None:
+def paint_time(canvas: Canvas, view_model: ViewModel, form: Format, time: float) -> None:
     """Paint the head of the time over the counts, and say it."""
     theme, size = form.colours, form.font_px
-    x = _chart_x(film, form, time)
+    x = _chart_x(view_model, form, time)
     foot = form.height_px - round(_FOOT * form.height_px)
     margin, half = round(0.4 * size), form.density
     left = round(x - half)
     right = max(left + 1, round(x + half))
     canvas.box(left, foot + margin, right, form.height_px - margin, theme.accent)
-    seconds = (time - film.now) * CLOCK.step_s
+    seconds = (time - view_model.now) * CLOCK.step_s
     place = (_chart_left(form) - 2.2 * size, (foot + form.height_px) / 2 + 0.5 * size)
     canvas.write(f"{seconds:.1f} s", place, 1.5 * size, theme.ink, align=1.0)
 
 
-def _most(film: Film) -> int:
-    return max(int(showing.valid.sum(axis=0).max()) for showing in film.showings)
+def _most(view_model: ViewModel) -> int:
+    return max(int(showing.valid.sum(axis=0).max()) for showing in view_model.showings)
 
 
 def _chart_left(form: Format) -> float:
     return 8.5 * form.font_px
 
 
-def _chart_x(film: Film, form: Format, step: float) -> float:
-    share = (step - film.now) / max(1, film.num_steps - 1 - film.now)
+def _chart_x(view_model: ViewModel, form: Format, step: float) -> float:
+    share = (step - view_model.now) / max(1, view_model.num_steps - 1 - view_model.now)
     left = _chart_left(form)
     return left + share * (form.width_px - left - form.font_px)
 

@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from infgen.clock import CLOCK
-from infgen.views.scene.agent_marks import Crowd
+from infgen.views.scene.agent_marks import AgentMarks
 from infgen.views.scene.marks import Mark
 from infgen.views.scene.shapes import shape_of
 from infgen.views.scene.style import Theme
 from infgen.views.scene.view import all_marks, view_of
-from infgen.views.scene.view_model import Film, Showing
+from infgen.views.scene.view_model import Showing, ViewModel
 from infgen.views.video.painter import Canvas
 
 EVERY_S = 6.0
@@ -88,19 +88,19 @@ class Strip:
     scale: float
 
 
-def strip_times(film: Film, every_s: float = EVERY_S) -> list[float]:
+def strip_times(view_model: ViewModel, every_s: float = EVERY_S) -> list[float]:
     """Seconds from now on, as far as the longest showing goes."""
-    end_s = (film.num_steps - 1 - film.now) * CLOCK.step_s
+    end_s = (view_model.num_steps - 1 - view_model.now) * CLOCK.step_s
     return [float(t) for t in np.arange(0.0, end_s + 1e-6, every_s)]
 
 
 def make_strip(
-    film: Film, times_s: Sequence[float], theme: Theme, scale: float = 1.0
+    view_model: ViewModel, times_s: Sequence[float], theme: Theme, scale: float = 1.0
 ) -> Strip:
     """Lay out a strip.
 
     Args:
-        film: What is shown.
+        view_model: What is shown.
         times_s: Seconds from now, one column each.
         theme: The colours.
         scale: Enlarges everything.
@@ -108,23 +108,23 @@ def make_strip(
     Raises:
         ValueError: if a time is before the history or after the end.
     """
-    end_s = (film.num_steps - 1 - film.now) * CLOCK.step_s
+    end_s = (view_model.num_steps - 1 - view_model.now) * CLOCK.step_s
     for time_s in times_s:
-        if not -film.now * CLOCK.step_s <= time_s <= end_s + 1e-6:
+        if not -view_model.now * CLOCK.step_s <= time_s <= end_s + 1e-6:
             raise ValueError(f"{time_s:g} s is not shown; the film ends at {end_s:g} s")
     pictures = [
         picture
-        for row, showing in enumerate(film.showings)
-        for picture in _row(film, showing, row, times_s, theme, scale)
+        for row, showing in enumerate(view_model.showings)
+        for picture in _row(view_model, showing, row, times_s, theme, scale)
     ]
     step = PICTURE_PX + _GAP_PX
-    height = float(_TOP_PX + len(film.showings) * step + _LEGEND_PX - _GAP_PX)
+    height = float(_TOP_PX + len(view_model.showings) * step + _LEGEND_PX - _GAP_PX)
     return Strip(
-        title=f"Scene {film.scenario_id}",
+        title=f"Scene {view_model.scenario_id}",
         width_px=scale * (_LEFT_PX + len(times_s) * step - _GAP_PX),
         height_px=scale * height,
         pictures=pictures,
-        words=list(_words(film, times_s, scale, height)),
+        words=list(_words(view_model, times_s, scale, height)),
         legend=list(_signs(theme, scale, height)),
         scale=scale,
     )
@@ -174,37 +174,37 @@ def marks_svg(marks: Sequence[Mark]) -> str:
 
 
 def _row(
-    film: Film,
+    view_model: ViewModel,
     showing: Showing,
     row: int,
     times_s: Sequence[float],
     theme: Theme,
     scale: float,
 ) -> Iterator[Picture]:
-    crowd, side = Crowd(showing), scale * PICTURE_PX
+    agent_marks, side = AgentMarks(showing), scale * PICTURE_PX
     for column, time_s in enumerate(times_s):
-        time = film.now + time_s / CLOCK.step_s
+        time = view_model.now + time_s / CLOCK.step_s
         marks = None
         if time <= showing.num_steps - 1 + 1e-6:
             view = view_of(showing, time, side, side, scale)
-            marks = list(all_marks(film, crowd, time, view, theme))
+            marks = list(all_marks(view_model, agent_marks, time, view, theme))
         x_px = _LEFT_PX + column * (PICTURE_PX + _GAP_PX)
         y_px = _TOP_PX + row * (PICTURE_PX + _GAP_PX)
         yield Picture(scale * x_px, scale * y_px, marks)
 
 
 def _words(
-    film: Film, times_s: Sequence[float], scale: float, height: float
+    view_model: ViewModel, times_s: Sequence[float], scale: float, height: float
 ) -> Iterator[Words]:
     step, half = PICTURE_PX + _GAP_PX, PICTURE_PX / 2
     for column, time_s in enumerate(times_s):
         x_px = _LEFT_PX + column * step + half
         yield Words(scale * x_px, scale * 17, f"t = {time_s:g} s")
-    for row, showing in enumerate(film.showings):
+    for row, showing in enumerate(view_model.showings):
         y_px = _TOP_PX + row * step + half
         yield Words(scale * 19, scale * y_px, showing.name, upright=True)
         for column, time_s in enumerate(times_s):
-            if film.now + time_s / CLOCK.step_s > showing.num_steps - 1 + 1e-6:
+            if view_model.now + time_s / CLOCK.step_s > showing.num_steps - 1 + 1e-6:
                 x_px = _LEFT_PX + column * step + half
                 yield Words(scale * x_px, scale * y_px, f"the {showing.name} has ended")
     for _, text, x_px in _LEGEND:

@@ -21,7 +21,7 @@ MAX_VIEWS = 6
 Curves = Mapping[str, Series]
 
 
-class Played(NamedTuple):
+class SimulatedScene(NamedTuple):
     """A rollout and the scene that it goes on from."""
 
     rollout: "Rollout"
@@ -71,7 +71,7 @@ def score_charts(summary: Mapping[str, Any], curves: Curves) -> list[str]:
     return [drawing for drawing in drawn if drawing]
 
 
-def first_played(inputs: Inputs) -> Played | None:
+def first_simulated(inputs: Inputs) -> SimulatedScene | None:
     """Read the first rollout there is, and its scene."""
     from pipeline.storage.rollouts import read_rollouts  # noqa: PLC0415
     from pipeline.storage.scenes import read_scenes  # noqa: PLC0415
@@ -84,11 +84,11 @@ def first_played(inputs: Inputs) -> Played | None:
             continue
         for scene in read_scenes(log.path):
             if scene.scenario_id == rollout.scenario_id:
-                return Played(rollout, scene)
+                return SimulatedScene(rollout, scene)
     return None
 
 
-def strips(played: Played) -> list[str]:
+def strips(played: SimulatedScene) -> list[str]:
     """Draw a log and a rollout of it every few seconds."""
     from infgen.views.scene.picture import rollout_strip, scene_strip  # noqa: PLC0415
 

@@ -34,7 +34,7 @@ def write_players(
         The page of each of ``lowest``, relative to the report; empty for those without.
     """
     from infgen.views.player import player_page  # noqa: PLC0415
-    from infgen.views.scene.view_model import make_film  # noqa: PLC0415
+    from infgen.views.scene.view_model import make_view_model  # noqa: PLC0415
     from pipeline.storage.scenes import file_name  # noqa: PLC0415
 
     places = dict(_places(inputs)) if most and lowest else {}
@@ -45,7 +45,7 @@ def write_players(
         scene, rollout = _read(places[scenario_id], scenario_id, index)
         pages.append(f"players/{file_name(scenario_id)}-{index}.html")
         (target / "players").mkdir(exist_ok=True)
-        page = player_page(make_film(scene, (rollout,)))
+        page = player_page(make_view_model(scene, (rollout,)))
         write_file(target / pages[-1], page.encode())
     return [*pages, *[""] * (len(lowest) - len(pages))]
 

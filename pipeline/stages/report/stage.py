@@ -158,7 +158,7 @@ def _page(
 
     curves = drawings.read_curves(inputs.folder("score") / "curves.parquet", summary)
     training = training_figures(inputs.folder("train") / LOG, "this run")
-    played = drawings.first_played(inputs)
+    played = drawings.first_simulated(inputs)
     weights = manifests["train"]["report"].get("weights", "unknown")
     scores, long_term, short_term, *more = (table.to_html() for table in tables)
     return [

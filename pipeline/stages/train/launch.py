@@ -35,7 +35,7 @@ def joined(environ: Mapping[str, str]) -> Iterator[bool]:
     from pipeline.stages.train import process_group  # noqa: PLC0415
     from pipeline.stages.train.stage import take_part  # noqa: PLC0415
 
-    with process_group.met():
+    with process_group.joined_group():
         if rank.number:
             process_group.follow(take_part)
         yield rank.number == 0

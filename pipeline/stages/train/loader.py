@@ -21,10 +21,10 @@ from torch.utils.data import DataLoader, Dataset
 
 from infgen.model.batching.batch import Batch, Limits, collate
 from infgen.model.batching.perturbation import Perturbation
-from infgen.model.tensors import map_tensors
+from infgen.model.batching.tensors import map_tensors
 from infgen.tokens.scene_tokens import SceneTokens
 from pipeline.stages.tokenize import open_tokens
-from pipeline.stages.train.sampler import Order
+from pipeline.stages.train.sampler import ScenePermutation
 
 T = TypeVar("T")
 
@@ -90,7 +90,7 @@ class Recipe(Dataset[list[Batch]]):
 
     scenes: Sequence[SceneTokens]
     limits: Limits
-    order: Order
+    order: ScenePermutation
     parts: int = 1
     own: range = range(1)
     noise: Perturbation | None = None
@@ -168,7 +168,7 @@ def _pin(parts: list[Batch]) -> list[Batch]:
     return map_tensors(parts, Tensor.pin_memory)
 
 
-def held_out_batches(
+def validation_batches(
     scenes: Sequence[SceneTokens], limits: Limits, batch: int, seed: int, count: int
 ) -> Iterator[Batch]:
     """Yield batches of so many held-out scenes, seen the same however they are cut."""

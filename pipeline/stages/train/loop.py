@@ -12,11 +12,11 @@ from pipeline.engine import signals
 from pipeline.engine.signals import Stopped
 from pipeline.engine.stage import Progress
 from pipeline.stages.train.loader import Recipe, train_batches
-from pipeline.stages.train.optimizer_step import Descent, NotFiniteError, Stepped
+from pipeline.stages.train.optimizer_step import NotFiniteError, OptimizerStep, StepResult
 from pipeline.stages.train.precision import Pass
-from pipeline.stages.train.process_group import PeerError, Team, own_device
-from pipeline.stages.train.recorder import Journal, is_validated
-from pipeline.stages.train.setup import Course, TrainingError, repeatable
+from pipeline.stages.train.process_group import PeerError, ProcessGroup, own_device
+from pipeline.stages.train.recorder import TrainingRecorder, is_validated
+from pipeline.stages.train.setup import TrainingError, TrainingSetup, repeatable
 from pipeline.stages.train.validation import validate
 from pipeline.storage.checkpoint import TrainingState, load_checkpoint
 
@@ -35,45 +35,48 @@ class Trained:
 
 
 def train(
-    course: Course, training: TrainingState, progress: Progress, team: Team | None = None
+    setup: TrainingSetup,
+    training: TrainingState,
+    progress: Progress,
+    group: ProcessGroup | None = None,
 ) -> Trained:
     """Train from the last checkpoint on, to the last step.
 
     Args:
-        course: What on what; only the first process of a team writes to its folder.
+        setup: What on what; only the first process of a team writes to its folder.
         training: The network with its first weights.
         progress: Told by the first process.
-        team: The processes that train together; None for this one alone.
+        group: The processes that train together; None for this one alone.
 
     Raises:
         TrainingError: if there is nothing to train on, or a loss is not finite.
         PeerError: if another process is gone.
         Stopped: if the run is to stop; all is saved to go on.
     """
-    team = team or Team(device=own_device())
-    recipe = replace(course.recipe(team), noise=_noise(course, training))
+    group = group or ProcessGroup(device=own_device())
+    recipe = replace(setup.recipe(group), noise=_noise(setup, training))
     with repeatable(), ExitStack() as stack:
-        first = load_checkpoint(course.folder, training)
-        team.check_same(first, "steps done")
-        descent = Descent(training, course.train, team, recipe.parts)
-        if not team.leads:
-            _go_down(course, recipe, descent, team, first, None)
+        first = load_checkpoint(setup.folder, training)
+        group.check_same(first, "steps done")
+        optimizer_step = OptimizerStep(training, setup.train, group, recipe.parts)
+        if not group.leads:
+            _run_steps(setup, recipe, optimizer_step, group, first, None)
             return Trained({}, {})
-        journal = stack.enter_context(Journal(course, training, first, progress))
-        run = _Run(course, training, descent.forward, journal)
-        _go_down(course, recipe, descent, team, first, run)
-        if first < course.train.steps:
-            journal.save()  # Whatever ends what is left to do costs no step.
+        recorder = stack.enter_context(TrainingRecorder(setup, training, first, progress))
+        run = _Run(setup, training, optimizer_step.forward, recorder)
+        _run_steps(setup, recipe, optimizer_step, group, first, run)
+        if first < setup.train.steps:
+            recorder.save()  # Whatever ends what is left to do costs no step.
         found = run.validate()
-        journal.flush()
+        recorder.flush()
         return Trained(found, run.figures())
 
 
-def _noise(course: Course, training: TrainingState) -> Perturbation | None:
+def _noise(setup: TrainingSetup, training: TrainingState) -> Perturbation | None:
     """How scenes are disturbed to learn from; held-out ones never are."""
     network = training.network
     return make_perturbation(
-        course.train, network.motion_vocabulary(), network.map_vocabulary()
+        setup.train, network.motion_vocabulary(), network.map_vocabulary()
     )
 
 
@@ -81,51 +84,53 @@ def _noise(course: Course, training: TrainingState) -> Perturbation | None:
 class _Run:
     """What the first process does besides the steps."""
 
-    course: Course
+    setup: TrainingSetup
     training: TrainingState
     forward: Pass
-    journal: Journal
+    recorder: TrainingRecorder
 
-    def after(self, done: int, stepped: Stepped) -> None:
+    def after(self, done: int, stepped: StepResult) -> None:
         """Write down one step, and all that is due after it."""
-        self.journal.add(done, stepped)
-        if is_validated(self.course.train, done):
+        self.recorder.add(done, stepped)
+        if is_validated(self.setup.train, done):
             self.validate()
-        self.journal.keep_up(stepped)
+        self.recorder.keep_up(stepped)
 
     def validate(self) -> dict[str, Any]:
         """Find the figures of the held-out scenes and write them down."""
-        found = validate(self.course, self.training, self.forward)
-        self.journal.add_validation(found)
+        found = validate(self.setup, self.training, self.forward)
+        self.recorder.add_validation(found)
         return found
 
     def figures(self) -> dict[str, Any]:
         """What differs from run to run."""
         return {
-            "scenes_per_s": round(self.journal.pace.overall(self.course.train.steps), 3),
+            "scenes_per_s": round(
+                self.recorder.throughput.overall(self.setup.train.steps), 3
+            ),
             "bf16": self.forward.bf16,
             "compiled": self.forward.compiled,
         }
 
 
-def _go_down(
-    course: Course,
+def _run_steps(
+    setup: TrainingSetup,
     recipe: Recipe,
-    descent: Descent,
-    team: Team,
+    optimizer_step: OptimizerStep,
+    group: ProcessGroup,
     first: int,
     run: _Run | None,
 ) -> None:
     """Do all steps from ``first`` on. All processes of a team stop after the same one."""
-    steps = range(first, course.train.steps)
+    steps = range(first, setup.train.steps)
     stop: Stopped | None = None
     try:
-        with closing(train_batches(recipe, steps, course.train.loader_workers)) as batches:
+        with closing(train_batches(recipe, steps, setup.train.loader_workers)) as batches:
             for step, parts in zip(steps, batches, strict=True):
-                if team.any(stop is not None or signals.pending_signal() > 0):
+                if group.any(stop is not None or signals.pending_signal() > 0):
                     stop = stop or Stopped(signals.pending_signal() or SIGTERM)
                     break
-                stepped = _step(descent, recipe, parts, step)
+                stepped = _step(optimizer_step, recipe, parts, step)
                 try:
                     if run is not None:
                         run.after(step + 1, stepped)
@@ -133,18 +138,20 @@ def _go_down(
                     stop = asked
     except (TrainingError, PeerError):
         if run is not None:
-            run.journal.save()  # The weights are still the last good ones.
+            run.recorder.save()  # The weights are still the last good ones.
         raise
     if stop is not None:
         if run is not None:
-            run.journal.save()
+            run.recorder.save()
         raise stop
 
 
-def _step(descent: Descent, recipe: Recipe, parts: list[Any], step: int) -> Stepped:
+def _step(
+    optimizer_step: OptimizerStep, recipe: Recipe, parts: list[Any], step: int
+) -> StepResult:
     """Do a step; if its loss is not finite, say of which scenes."""
     try:
-        return descent.step(parts, recipe.own, step)
+        return optimizer_step.step(parts, recipe.own, step)
     except NotFiniteError as error:
         bad = error.parts or range(recipe.parts)
         rows = [row for part in bad for row in recipe.rows(step, part)]

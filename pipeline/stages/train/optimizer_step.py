@@ -16,11 +16,11 @@ from torch import Tensor
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import Batch, to_device
 from infgen.model.training.closed_loop import close_loop
-from infgen.model.training.diagnostics import move_surprise
+from infgen.model.training.diagnostics import motion_surprise
 from infgen.model.training.loss_weights import TERMS, supervised
 from infgen.model.training.losses import Term, Terms, losses
 from pipeline.stages.train.precision import Pass
-from pipeline.stages.train.process_group import Team
+from pipeline.stages.train.process_group import ProcessGroup
 from pipeline.stages.train.setup import TrainingError
 from pipeline.storage.checkpoint import TrainingState
 
@@ -44,7 +44,7 @@ class NotFiniteError(TrainingError):
 
 
 @dataclass(frozen=True, slots=True)
-class Stepped:
+class StepResult:
     """What is known of one step.
 
     Attributes:
@@ -64,7 +64,7 @@ class Stepped:
         return math.exp(min(total / max(count, 1.0), 700.0))
 
 
-class Descent:
+class OptimizerStep:
     """Does optimiser steps.
 
     All gradients lie in one tensor, zeroed before each step, followed by all other sums:
@@ -73,9 +73,13 @@ class Descent:
     """
 
     def __init__(
-        self, training: TrainingState, settings: TrainSettings, team: Team, parts: int
+        self,
+        training: TrainingState,
+        settings: TrainSettings,
+        group: ProcessGroup,
+        parts: int,
     ) -> None:
-        self._training, self._settings, self._team = training, settings, team
+        self._training, self._settings, self._process_group = training, settings, group
         self.forward = Pass(training.network, settings)
         parameters = list(training.network.parameters())
         sizes = [p.numel() for p in parameters]
@@ -88,7 +92,7 @@ class Descent:
         for parameter, own in zip(parameters, torch.split(gradient, sizes), strict=True):
             parameter.grad = own.view_as(parameter)
 
-    def step(self, parts: Sequence[Batch], own: range, step: int) -> Stepped:
+    def step(self, parts: Sequence[Batch], own: range, step: int) -> StepResult:
         """Do one step.
 
         Args:
@@ -104,13 +108,13 @@ class Descent:
         network = training.network.train()
         batches = [self._prepared(part) for part in parts]
         weight = torch.stack([supervised(batch, settings) for batch in batches]).sum(dim=0)
-        self._team.add_up(weight)
+        self._process_group.add_up(weight)
         self._sums.zero_()
         names: list[str] = []
         for number, batch in zip(own, batches, strict=True):
             torch.manual_seed(noise_of_part(step, settings.seed, number))  # For dropout.
             names = self._add(batch, weight, number)
-        self._team.add_up(self._sums)
+        self._process_group.add_up(self._sums)
         clipped = torch.nn.utils.clip_grad_norm_(
             network.parameters(), settings.max_gradient_norm
         )
@@ -121,7 +125,7 @@ class Descent:
             group["lr"] = learning_rate(settings, step)
         training.optimiser.step()
         _move_average(training, settings, step)
-        return Stepped(terms, norm, self._surprise.clone())
+        return StepResult(terms, norm, self._surprise.clone())
 
     def _prepared(self, part: Batch) -> Batch:
         """Put a part where it is computed, and play it if it is to be played."""
@@ -138,7 +142,7 @@ class Descent:
         for name, term in terms.items():
             found = [getattr(term, figure).detach().float() for figure in FIGURES]
             self._terms[TERMS.index(name)] += torch.stack(found)
-        self._surprise += move_surprise(outputs, batch)
+        self._surprise += motion_surprise(outputs, batch)
         self._bad[number] = (~torch.isfinite(loss.detach())).float()
         return list(terms)
 

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import Batch
+from infgen.model.batching.tensors import in_float32
 from infgen.model.logits import Outputs
 from infgen.model.network import Network
-from infgen.model.tensors import in_float32
 
 
 class Pass:

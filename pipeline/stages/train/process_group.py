@@ -32,7 +32,7 @@ class PeerError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Team:
+class ProcessGroup:
     """Processes that do the same steps on different scenes. Alone, nothing is to be done.
 
     Attributes:
@@ -105,7 +105,7 @@ _MEETING = _Meeting()
 
 
 @contextmanager
-def met() -> Iterator[None]:
+def joined_group() -> Iterator[None]:
     """Meet the other processes; in the end the first one sends them home."""
     store, rank, _ = next(rendezvous("env://", timeout=MEETING))
     _MEETING.store = _part(store, "infgen")
@@ -119,7 +119,7 @@ def met() -> Iterator[None]:
 
 
 @contextmanager
-def called_together(work: Mapping[str, Any], timeout_s: float) -> Iterator[Team]:
+def form_group(work: Mapping[str, Any], timeout_s: float) -> Iterator[ProcessGroup]:
     """Form a team for one piece of work, if there are others; for the first process.
 
     Args:
@@ -127,15 +127,15 @@ def called_together(work: Mapping[str, Any], timeout_s: float) -> Iterator[Team]
         timeout_s: Longest wait for one of them.
     """
     if _MEETING.store is None:
-        yield Team(device=own_device())
+        yield ProcessGroup(device=own_device())
         return
     call = {"work": work, "timeout_s": timeout_s}
     _MEETING.store.set(str(_MEETING.calls), json.dumps(call))
-    with _team(timeout_s) as team:
-        yield team
+    with _process_group(timeout_s) as group:
+        yield group
 
 
-def follow(take_part: Callable[[Mapping[str, Any], Team], None]) -> None:
+def follow(take_part: Callable[[Mapping[str, Any], ProcessGroup], None]) -> None:
     """Take part in whatever the first process calls for, until it is done.
 
     Args:
@@ -147,8 +147,8 @@ def follow(take_part: Callable[[Mapping[str, Any], Team], None]) -> None:
     """
     with signals.handling_signals():
         while (call := _next_call()) is not None:
-            with signals.deferred(), _team(call["timeout_s"]) as team:
-                take_part(call["work"], team)
+            with signals.deferred(), _process_group(call["timeout_s"]) as group:
+                take_part(call["work"], group)
 
 
 def _next_call() -> dict[str, Any] | None:
@@ -168,10 +168,10 @@ def _next_call() -> dict[str, Any] | None:
 
 
 @contextmanager
-def _team(timeout_s: float) -> Iterator[Team]:
+def _process_group(timeout_s: float) -> Iterator[ProcessGroup]:
     rank, device = own_rank(), own_device()
     if _MEETING.store is None:
-        raise PeerError("nobody was met")
+        raise PeerError("nobody was joined_group")
     store = _part(_MEETING.store, f"call-{_MEETING.calls}")
     _MEETING.calls += 1
     if device.type == "cuda":
@@ -187,7 +187,7 @@ def _team(timeout_s: float) -> Iterator[Team]:
     except RuntimeError as error:
         raise PeerError(f"process {rank.number} waited in vain: {error}") from error
     try:
-        yield Team(rank.number, rank.count, device)
+        yield ProcessGroup(rank.number, rank.count, device)
     finally:
         dist.destroy_process_group()
 

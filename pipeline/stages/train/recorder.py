@@ -9,10 +9,10 @@ from infgen.config import TrainSettings
 from infgen.model.training.losses import figures, total
 from pipeline.engine.layout import RUN_FOLDER
 from pipeline.engine.stage import Progress
-from pipeline.stages.train.optimizer_step import Stepped, learning_rate
-from pipeline.stages.train.setup import Course
+from pipeline.stages.train.optimizer_step import StepResult, learning_rate
+from pipeline.stages.train.setup import TrainingSetup
 from pipeline.stages.train.tensorboard import EventFiles
-from pipeline.stages.train.throughput import Pace
+from pipeline.stages.train.throughput import ThroughputMeter
 from pipeline.stages.train.train_log import TrainLog
 from pipeline.storage.checkpoint import TrainingState, save_checkpoint
 
@@ -22,26 +22,26 @@ LOG_LINES = 1000
 S_PER_MINUTE = 60
 
 
-class Journal:
+class TrainingRecorder:
     """Writes down what each step gave, and saves what is needed to go on from it."""
 
     def __init__(
-        self, course: Course, training: TrainingState, first: int, progress: Progress
+        self, setup: TrainingSetup, training: TrainingState, first: int, progress: Progress
     ) -> None:
-        how, folder = course.train, course.folder
-        self._course, self._training, self._progress = course, training, progress
+        how, folder = setup.train, setup.folder
+        self._course, self._training, self._progress = setup, training, progress
         self._every = max(1, how.steps // LOG_LINES)
         self._done = self._saved = first
         self._saved_at = time.monotonic()
         self._log = TrainLog(folder / LOG, first, validated=is_validated(how, first))
         run = folder / RUN_FOLDER
-        self.pace = Pace(run / PACE, how.steps, first, how.batch_scenes)
+        self.throughput = ThroughputMeter(run / PACE, how.steps, first, how.batch_scenes)
         self._events: EventFiles | None = None
         self._files: AbstractContextManager[object] = nullcontext()
         if how.tensorboard:
             self._files = self._events = EventFiles(run / EVENTS, first)
 
-    def __enter__(self) -> "Journal":
+    def __enter__(self) -> "TrainingRecorder":
         self._files.__enter__()
         return self
 
@@ -53,7 +53,7 @@ class Journal:
     ) -> None:
         self._files.__exit__(kind, error, trace)
 
-    def add(self, done: int, stepped: Stepped) -> None:
+    def add(self, done: int, stepped: StepResult) -> None:
         """Take down one step, if its turn has come."""
         self._done = done
         if done % self._every:
@@ -66,16 +66,16 @@ class Journal:
             "motion_perplexity": stepped.perplexity,
         }
         self._write("train", {"step": done, **line}, line)
-        pace = self.pace.note(done)
+        throughput = self.throughput.note(done)
         if self._events is not None:
-            self._events.add("run", done, pace)
+            self._events.add("run", done, throughput)
 
     def add_validation(self, found: dict[str, Any]) -> None:
         """Take down the figures of the held-out scenes."""
         line = {"step": self._done, "validation": found}
         self._write("validation", line, found)
 
-    def keep_up(self, stepped: Stepped) -> None:
+    def keep_up(self, stepped: StepResult) -> None:
         """Save a checkpoint and tell progress where they are due.
 
         Raises:
@@ -83,9 +83,9 @@ class Journal:
         """
         if self._is_due():
             self.save()
-        if self.pace.due(self._done):
+        if self.throughput.due(self._done):
             loss = float(total(stepped.terms, self._course.train))
-            self.pace.tell(self._done, loss, self._progress)
+            self.throughput.tell(self._done, loss, self._progress)
 
     def save(self) -> None:
         """Save a checkpoint, the log before it: lines beyond it are cut when going on."""

@@ -17,7 +17,7 @@ from jaxtyping import Int64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Order:
+class ScenePermutation:
     """The order in which scenes are read.
 
     Attributes:
@@ -40,7 +40,7 @@ class Order:
 
 
 @lru_cache(maxsize=4)
-def _rows_of_epoch(order: Order, epoch: int) -> np.ndarray:
+def _rows_of_epoch(order: ScenePermutation, epoch: int) -> np.ndarray:
     """All scenes in the order of one epoch; what is cut at its ends stays as drawn."""
     random = np.random.default_rng([order.seed, epoch])
     rows = random.permutation(len(order.size))
@@ -53,7 +53,9 @@ def _rows_of_epoch(order: Order, epoch: int) -> np.ndarray:
     return rows
 
 
-def _bucketed(order: Order, rows: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def _bucketed(
+    order: ScenePermutation, rows: np.ndarray, random: np.random.Generator
+) -> np.ndarray:
     """Batches of scenes of about one size, in any order [batch, scene]."""
     alike = []
     for pool in _cut(rows, order.pool * order.batch):

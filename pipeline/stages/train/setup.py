@@ -13,8 +13,8 @@ from infgen.model.network import Network
 from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from pipeline.stages.train.loader import Recipe, TokenScenes
-from pipeline.stages.train.process_group import Team, own_device
-from pipeline.stages.train.sampler import Order
+from pipeline.stages.train.process_group import ProcessGroup, own_device
+from pipeline.stages.train.sampler import ScenePermutation
 from pipeline.storage.checkpoint import TrainingState
 from pipeline.storage.weights import copy_weights
 
@@ -24,7 +24,7 @@ class TrainingError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class TrainingSetup:
     """What is trained on what.
 
     Attributes:
@@ -50,7 +50,7 @@ class Course:
         """How much of a scene a batch holds."""
         return Limits.of(self.model, self.train, self.grid)
 
-    def recipe(self, team: Team) -> Recipe:
+    def recipe(self, group: ProcessGroup) -> Recipe:
         """Say what this process makes of the batch of each step.
 
         Raises:
@@ -59,43 +59,45 @@ class Course:
         how = self.train
         if how.steps and not len(self.scenes):
             raise TrainingError(f"no scenes of split {how.split!r} to train on")
-        parts = how.gradient_accumulation * team.size
+        parts = how.gradient_accumulation * group.size
         if parts > how.batch_scenes:
             raise TrainingError(
-                f"train.batch_scenes is {how.batch_scenes}, too few for {team.size} "
+                f"train.batch_scenes is {how.batch_scenes}, too few for {group.size} "
                 f"processes with {how.gradient_accumulation} parts each; expected {parts} "
                 "or more"
             )
         sizes = self.scenes.sizes(self.limits)
-        order = Order(sizes, how.batch_scenes, how.bucket_batches, how.seed)
-        first = team.rank * how.gradient_accumulation
+        order = ScenePermutation(sizes, how.batch_scenes, how.bucket_batches, how.seed)
+        first = group.rank * how.gradient_accumulation
         own = range(first, first + how.gradient_accumulation)
         return Recipe(self.scenes, self.limits, order, parts, own)
 
 
-def begin(course: Course, motion: MotionVocabulary, roads: MapVocabulary) -> TrainingState:
+def begin(
+    setup: TrainingSetup, motion: MotionVocabulary, roads: MapVocabulary
+) -> TrainingState:
     """Make a network with its first weights, and its optimiser.
 
     Raises:
         StoreError: if the weights to begin with do not fit.
     """
-    torch.manual_seed(course.train.seed)
-    network = Network(course.model, motion, roads, course.grid)
-    if course.start is not None:
-        copy_weights(network, course.start)
+    torch.manual_seed(setup.train.seed)
+    network = Network(setup.model, motion, roads, setup.grid)
+    if setup.start is not None:
+        copy_weights(network, setup.start)
     network = network.to(own_device())
     parameters = list(network.parameters())
-    decay = course.train.weight_decay
+    decay = setup.train.weight_decay
     optimiser = torch.optim.AdamW(
         [
             {"params": [p for p in parameters if p.dim() > 1], "weight_decay": decay},
             {"params": [p for p in parameters if p.dim() <= 1], "weight_decay": 0.0},
         ],
-        lr=course.train.learning_rate,
+        lr=setup.train.learning_rate,
         fused=True,
     )
     average = {name: p.detach().clone() for name, p in network.named_parameters()}
-    return TrainingState(network, average if course.train.ema_decay else {}, optimiser)
+    return TrainingState(network, average if setup.train.ema_decay else {}, optimiser)
 
 
 @contextmanager

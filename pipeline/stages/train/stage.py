@@ -34,8 +34,8 @@ from pipeline.storage.splits import in_split
 
 if TYPE_CHECKING:
     from infgen.model.network import Network
-    from pipeline.stages.train.process_group import Team
-    from pipeline.stages.train.setup import Course
+    from pipeline.stages.train.process_group import ProcessGroup
+    from pipeline.stages.train.setup import TrainingSetup
     from pipeline.storage.checkpoint import TrainingState
 
 VOCABULARIES = ("motion.zarr", "roads.zarr")
@@ -110,7 +110,7 @@ def _train(
     import torch  # noqa: PLC0415
 
     from pipeline.stages.train.loop import final_state, train  # noqa: PLC0415
-    from pipeline.stages.train.process_group import called_together  # noqa: PLC0415
+    from pipeline.stages.train.process_group import form_group  # noqa: PLC0415
     from pipeline.stages.train.throughput import peak_memory_mib  # noqa: PLC0415
     from pipeline.storage.weights import save_network  # noqa: PLC0415
 
@@ -119,14 +119,14 @@ def _train(
     how: TrainSettings = settings["train"]
     plain = {name: asdict(section) for name, section in settings.items()}
     call = {"task": dict(unit.task), "target": str(target), "settings": plain}
-    with called_together(call, how.peer_timeout_s) as team:
-        course, training = _prepare(unit.task, target, settings)
-        found = train(course, training, progress, team)
+    with form_group(call, how.peer_timeout_s) as group:
+        setup, training = _prepare(unit.task, target, settings)
+        found = train(setup, training, progress, group)
     weights = save_network(target, training.network, final_state(training), how.steps)
     return {
         "steps": how.steps,
-        "scenes": len(course.scenes),
-        "validation_split": len(course.validation_split),
+        "scenes": len(setup.scenes),
+        "validation_split": len(setup.validation_split),
         "parameters": sum(p.numel() for p in training.network.parameters()),
         "weights": weights,
         "validation": found.validation,
@@ -134,14 +134,14 @@ def _train(
             **found.run,
             "seconds": round(time.monotonic() - begun, 1),
             "threads": torch.get_num_threads(),
-            "processes": team.size,
-            "device": team.device.type,
+            "processes": group.size,
+            "device": group.device.type,
             "peak_memory_mib": round(peak_memory_mib(), 1),
         },
     }
 
 
-def take_part(call: Mapping[str, Any], team: "Team") -> None:
+def take_part(call: Mapping[str, Any], group: "ProcessGroup") -> None:
     """Do the steps of another process's ``work`` with it; write nothing."""
     from pipeline.stages.train.loop import train  # noqa: PLC0415
 
@@ -149,18 +149,18 @@ def take_part(call: Mapping[str, Any], team: "Team") -> None:
         name: build(kind, call["settings"][name], name)
         for name, kind in STAGE.settings.items()
     }
-    course, training = _prepare(call["task"], Path(call["target"]), settings)
-    train(course, training, _say_nothing, team)
+    setup, training = _prepare(call["task"], Path(call["target"]), settings)
+    train(setup, training, _say_nothing, group)
 
 
 def _prepare(
     task: Mapping[str, Any], target: Path, settings: Mapping[str, Any]
-) -> "tuple[Course, TrainingState]":
+) -> "tuple[TrainingSetup, TrainingState]":
     from pipeline.stages.train.loader import TokenScenes  # noqa: PLC0415
-    from pipeline.stages.train.setup import Course, begin  # noqa: PLC0415
+    from pipeline.stages.train.setup import TrainingSetup, begin  # noqa: PLC0415
     from pipeline.stages.vocabulary import load_vocabularies  # noqa: PLC0415
 
-    course = Course(
+    setup = TrainingSetup(
         model=settings["model"],
         train=settings["train"],
         grid=settings["tokenize"],
@@ -169,7 +169,7 @@ def _prepare(
         folder=target,
         start=Path(task[INITIAL_WEIGHTS]) if INITIAL_WEIGHTS in task else None,
     )
-    return course, begin(course, *load_vocabularies(Path(task["vocabularies"])))
+    return setup, begin(setup, *load_vocabularies(Path(task["vocabularies"])))
 
 
 def _say_nothing(done: float, total: float, note: str = "") -> None:

@@ -13,7 +13,7 @@ TELL_EVERY_S = 0.5
 KIB_PER_MIB = 1024
 
 
-class Pace:
+class ThroughputMeter:
     """Measures steps, tells progress (not more often than anyone can read), notes figures.
 
     What it notes goes below the folder ``run``, which no manifest lists.

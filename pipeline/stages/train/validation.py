@@ -10,13 +10,13 @@ from infgen.model.batching.batch import to_device
 from infgen.model.training.diagnostics import (
     BIN_EDGES,
     decisions,
-    move_surprise,
+    motion_surprise,
     reliability,
 )
 from infgen.model.training.losses import Terms, figures, losses, total
-from pipeline.stages.train.loader import held_out_batches
+from pipeline.stages.train.loader import validation_batches
 from pipeline.stages.train.precision import Pass
-from pipeline.stages.train.setup import Course
+from pipeline.stages.train.setup import TrainingSetup
 from pipeline.storage.checkpoint import TrainingState
 
 Found = dict[str, Any]
@@ -24,17 +24,17 @@ Found = dict[str, Any]
 
 
 @torch.no_grad()
-def validate(course: Course, training: TrainingState, forward: Pass) -> Found:
+def validate(setup: TrainingSetup, training: TrainingState, forward: Pass) -> Found:
     """Figures of the averaged weights over the held-out scenes; empty without any."""
-    settings = course.train
+    settings = setup.train
     training.network.eval()
     device = next(training.network.parameters()).device
     terms: Terms = {}
     bins: dict[str, Tensor] = {}
     surprise = torch.zeros(2, device=device)
-    for batch in held_out_batches(
-        course.validation_split,
-        course.limits,
+    for batch in validation_batches(
+        setup.validation_split,
+        setup.limits,
         max(1, settings.batch_scenes // settings.gradient_accumulation),
         settings.seed,
         settings.validation_scenes,
@@ -46,7 +46,7 @@ def validate(course: Course, training: TrainingState, forward: Pass) -> Found:
         for name, (probability, happened) in decisions(outputs, here).items():
             found = reliability(probability, happened)
             bins[name] = bins[name] + found if name in bins else found
-        surprise += move_surprise(outputs, here)
+        surprise += motion_surprise(outputs, here)
     if not terms:
         return {}
     nats, count = surprise.tolist()

@@ -130,7 +130,7 @@ def test_windows_slide_by_half_a_second():
 
 
 def test_numbers_of_entries_and_exits_by_hand():
-    # Three enter in one half second (bin 1: 2 or 3), nobody in the other fifteen.
+    # Three enter in one token step (bin 1: 2 or 3), nobody in the other fifteen.
     entries = ([4, 4, 4], [10, 20, 30])
     found = score(binned(entries=entries), num_entries=[0.5, 0.125])
 

@@ -6,7 +6,7 @@ import pytest
 from infgen.config import TokenSettings
 from infgen.metrics.long_term.binned import bin_traffic
 from infgen.metrics.long_term.protocols import CORRECTED, PROTOCOLS
-from infgen.metrics.long_term.radius import live_within
+from infgen.metrics.long_term.radius import present_within_radius
 from infgen.metrics.long_term.reference import count_log, count_simulated, log_probabilities
 from infgen.metrics.long_term.table import Against, make_row
 from infgen.metrics.long_term.tune_radius import (
@@ -53,7 +53,7 @@ def test_a_radius_scores_as_the_score_stage_would_score_it(
     found = placement_by_radius([driving], against, protocol, (20.0, 40.0, 60.0))
 
     for radius_m, value in found.items():
-        lived = from_rollout(live_within(driving, radius_m))
+        lived = from_rollout(present_within_radius(driving, radius_m))
         binned = bin_traffic(lived, scene_road_edges(scene), 75.0, as_logged=False)
         row = make_row(binned, against)
         assert value == pytest.approx(row.numbers[f"{protocol.name}/placement"])
@@ -61,7 +61,7 @@ def test_a_radius_scores_as_the_score_stage_would_score_it(
 
 def test_the_radius_that_made_the_reference_is_found_again(scene, driving):
     windows = cut_windows(80, 8.0, 0.5)
-    lived = from_rollout(live_within(driving, 40.0))
+    lived = from_rollout(present_within_radius(driving, 40.0))
     binned = bin_traffic(lived, scene_road_edges(scene), 75.0, as_logged=False)
     against = against_counts(count_simulated(binned, windows))
 

@@ -8,7 +8,7 @@ import torch
 
 from infgen.config import TokenSettings, TrainSettings
 from infgen.model.batching.batch import collate, collate_roads, to_device
-from infgen.model.batching.crop import cut_window, hide_far
+from infgen.model.batching.crop import cut_window, hide_until_near
 from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.batching.padding import NOBODY
 from infgen.model.batching.perturbation import make_perturbation
@@ -218,7 +218,7 @@ def test_noise_changes_only_what_agents_do_and_where_they_are(pair):
         for field in fields(part)
         if not torch.equal(getattr(part, field.name), getattr(other, field.name))
     }
-    told = {"Entries.cell", "Details.cell", "Details.heading", "Details.offset_m"}
+    told = {"Insertions.cell", "Details.cell", "Details.heading", "Details.offset_m"}
     asked = {"Details.agent", "Details.token", "Details.kind", "Details.size_lwh_m"}
     agents = {"Agents.pose", "Agents.move", "Agents.label", "Agents.cell"}
     assert agents | {"Details.offset_m", "Roads.token"} <= changed
@@ -429,7 +429,7 @@ def coming(record):
 def hidden(coming, known=2, enter_m=40.0):
     scene, part = coming
     settings = TokenSettings(insertion_distance_m=enter_m)
-    part = hide_far(part, settings, known)
+    part = hide_until_near(part, settings, known)
     rows = [row_in(part, scene, row) for row in range(1, len(scene.pose))]
     return part, rows
 

@@ -1,7 +1,7 @@
 """Agents led astray, and the moves that lead them back.
 
-The vocabulary moves by decimetres straight ahead, and the agents by a metre each half
-second, so every expected number can be done in the head.
+The vocabulary moves by decimetres straight ahead, and the agents by a metre each token
+step, so every expected number can be done in the head.
 """
 
 import numpy as np

@@ -38,7 +38,7 @@ def with_a_gap(scene):
 
 @pytest.fixture(scope="module")
 def logged(record, limits):
-    """Scenes with newcomers, leavers, a gap and padding, all written exactly."""
+    """Scenes with inserted agents, leavers, a gap and padding, all written exactly."""
     lives = [(0, 8), (0, 8), (3, 8), (2, 6), (0, 5), (5, 8), (4, 8)]
     scene = with_a_gap(record(3, tokens=9, lives=lives, spread_m=20.0))
     batch = collate([scene, record(4, agents=14, spread_m=25.0)], limits, 7)
@@ -116,7 +116,7 @@ def test_each_move_is_the_nearest_of_the_networks_most_likely(
     vocabulary = vocabularies()[0]
     with torch.no_grad():
         motion = network(played).motion
-    logits = motion.rows.spread(motion.move_logits)[scene, token - 1, row]
+    logits = motion.rows.spread(motion.motion_logits)[scene, token - 1, row]
     likely = logits.topk(top).indices.numpy()
     kind = played.agents.kind[scene, row].numpy().astype(np.int8)
     before = played.agents.pose[scene, token - 1, row].numpy()
@@ -170,7 +170,7 @@ def test_who_comes_goes_and_is_not_seen_is_the_logs(logged, played):
         "Agents.move",
         "Agents.label",
         "Agents.cell",
-        "Entries.cell",
+        "Insertions.cell",
         "Details.cell",
         "Details.heading",
         "Details.offset_m",

@@ -11,7 +11,7 @@ from infgen.model.batching.batch import collate
 from infgen.model.training.diagnostics import (
     BIN_EDGES,
     decisions,
-    move_surprise,
+    motion_surprise,
     reliability,
 )
 from infgen.model.training.losses import losses
@@ -67,7 +67,7 @@ def test_surprise_is_the_unsmoothed_unweighted_loss_of_moves(passed):
     plain = TrainSettings(label_smoothing=0.0, first_motion_weight=1.0)
     motion = losses(outputs, batch, plain)["motion"]
 
-    nats, count = move_surprise(outputs, batch).tolist()
+    nats, count = motion_surprise(outputs, batch).tolist()
 
     assert nats == pytest.approx(float(motion.loss), rel=1e-5)
     assert count == float(motion.count)

@@ -43,7 +43,10 @@ def marks(mask):
     ("life", "supervised"),
     [
         ("Epppp", "xxxx."),  # There throughout: every next move but the unknown last.
-        ("..Epp", "..xx."),  # A newcomer's first move is supervised, and the one after.
+        (
+            "..Epp",
+            "..xx.",
+        ),  # A inserted agent's first move is supervised, and the one after.
         ("EppL.", "xxx.."),  # Nothing after leaving.
         ("EL...", "x...."),
         ("....E", "....."),  # Entering at the last token: nothing follows.
@@ -114,7 +117,7 @@ def terms_of(network, scenes, limits, settings):
 
 
 def test_add_is_asked_once_per_newcomer_and_begin_once(network, record, limits, settings):
-    # Two newcomers at token 2, none at 1 and 3; at the last token nobody can come.
+    # Two inserted agents at token 2, none at 1 and 3; at the last token nobody can come.
     scene = record(8, tokens=5, lives=[(0, 4), (2, 4), (2, 4)], spread_m=20.0)
 
     _, _, terms = terms_of(network, [scene], limits, settings)
@@ -158,9 +161,9 @@ def test_the_label_is_learned_and_not_the_move(network, record, limits, settings
     other = replace(batch, agents=replace(batch.agents, label=label))
     outputs = network(batch)
 
-    said = outputs.motion.move_logits.new_zeros(outputs.motion.move_logits.shape)
+    said = outputs.motion.motion_logits.new_zeros(outputs.motion.motion_logits.shape)
     said[:, 5] = 50.0
-    sure = replace(outputs, motion=replace(outputs.motion, move_logits=said))
+    sure = replace(outputs, motion=replace(outputs.motion, motion_logits=said))
 
     assert float(losses(sure, other, settings)["motion"].mean) < 1e-4
     assert float(losses(sure, batch, settings)["motion"].mean) > 10
@@ -172,10 +175,11 @@ def test_the_first_move_of_a_newcomer_counts_three_times(network, record, limits
     with torch.no_grad():
         batch, outputs, terms = terms_of(network, [scene], limits, settings)
 
-    # The ego: 3 moves, the first from token 0, where everybody starts. The newcomer: 1.
+    # The ego: 3 moves, the first from token 0, where everybody starts. The inserted agent:
+    # 1.
     assert float(terms["motion"].count) == 4
     assert float(terms["motion"].weight) == 3 + 3
-    logits = outputs.motion.rows.spread(outputs.motion.move_logits)[0].log_softmax(-1)
+    logits = outputs.motion.rows.spread(outputs.motion.motion_logits)[0].log_softmax(-1)
     move = batch.agents.move[0]
     ego = sum(-float(logits[k, 0, move[k + 1, 0]]) for k in range(3))
     newcomer = -float(logits[2, 1, move[3, 1]])
@@ -185,13 +189,13 @@ def test_the_first_move_of_a_newcomer_counts_three_times(network, record, limits
 def test_label_smoothing_has_its_floor(network, record, limits):
     settings = TrainSettings(label_smoothing=0.1)
     batch, outputs, _ = terms_of(network, [record(1)], limits, settings)
-    moves = outputs.motion.move_logits.shape[-1]
+    moves = outputs.motion.motion_logits.shape[-1]
     agents = batch.agents
     target = outputs.motion.rows.pack(torch.roll(agents.move, -1, dims=1)).clamp(min=0)
     best = torch.full((len(target), moves), math.log(0.1 / moves))
     best.scatter_(1, target[:, None], math.log(0.9 + 0.1 / moves))
 
-    perfect = replace(outputs, motion=replace(outputs.motion, move_logits=best))
+    perfect = replace(outputs, motion=replace(outputs.motion, motion_logits=best))
     term = losses(perfect, batch, settings)["motion"]
 
     sure, unsure = 0.9 + 0.1 / moves, 0.1 / moves

@@ -149,7 +149,7 @@ def test_a_submission_is_an_archive_of_numbered_shards_with_all_fields(order, sc
     assert {one.account_name for one in messages} == {"me@example.org"}
     assert (found.scenes, found.rollouts, found.files) == (3, 96, 2)
     assert found.bytes == order.out.stat().st_size
-    assert found.not_played == ["odd: no agent is there"]
+    assert found.not_simulated == ["odd: no agent is there"]
     assert not order.partial.exists()
 
 

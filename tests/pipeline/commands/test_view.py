@@ -10,7 +10,7 @@ from cli import main
 from infgen.errors import ConfigError
 from infgen.rollout.rollout import Rollout
 from infgen.views.player.payload import unpack
-from pipeline.commands.view import Wanted, find_film, view
+from pipeline.commands.view import Wanted, find_view_model, view
 from pipeline.commands.view_scenes import choose
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import Root, link
@@ -63,43 +63,45 @@ def played(ingested, scenes, tmp_path_factory):
     return path
 
 
-def names(film):
-    return [showing.name for showing in film.showings]
+def names(view_model):
+    return [showing.name for showing in view_model.showings]
 
 
 def test_where_nothing_is_named_the_first_rollouts_and_their_log_are_shown(played, scenes):
-    film = find_film(Wanted(Root(played)))
+    view_model = find_view_model(Wanted(Root(played)))
 
-    assert film.scenario_id == scenes[1].scenario_id
-    assert names(film) == ["log", "rollout 0", "rollout 1", "rollout 2"]
+    assert view_model.scenario_id == scenes[1].scenario_id
+    assert names(view_model) == ["log", "rollout 0", "rollout 1", "rollout 2"]
 
 
 def test_a_scene_is_found_by_the_start_of_its_id(played, scenes):
     wanted = scenes[2].scenario_id
 
-    assert find_film(Wanted(Root(played), scene=wanted)).scenario_id == wanted
+    assert find_view_model(Wanted(Root(played), scene=wanted)).scenario_id == wanted
 
 
 def test_the_rollouts_that_are_asked_for_are_shown_in_that_order(played):
-    film = find_film(Wanted(Root(played), rollouts=(4, 1), log=False))
+    view_model = find_view_model(Wanted(Root(played), rollouts=(4, 1), log=False))
 
-    assert names(film) == ["rollout 4", "rollout 1"]
+    assert names(view_model) == ["rollout 4", "rollout 1"]
 
 
 def test_a_scene_without_rollouts_is_shown_as_its_log(played, ingested, scenes):
     first = scenes[0].scenario_id
 
-    assert names(find_film(Wanted(Root(played), scene=first))) == ["log"]
-    assert find_film(Wanted(Root(ingested))).scenario_id == first
-    assert names(find_film(Wanted(Root(played), rollouts=()))) == ["log"]
+    assert names(find_view_model(Wanted(Root(played), scene=first))) == ["log"]
+    assert find_view_model(Wanted(Root(ingested))).scenario_id == first
+    assert names(find_view_model(Wanted(Root(played), rollouts=()))) == ["log"]
 
 
 def test_a_log_needs_no_root(source, scenes, tmp_path):
     second = scenes[1].scenario_id
-    film = find_film(Wanted(Root(tmp_path), records=(str(source),), scene=second))
+    view_model = find_view_model(
+        Wanted(Root(tmp_path), records=(str(source),), scene=second)
+    )
 
-    assert film.scenario_id == second
-    assert names(film) == ["log"]
+    assert view_model.scenario_id == second
+    assert names(view_model) == ["log"]
 
 
 @pytest.mark.parametrize(
@@ -117,7 +119,7 @@ def test_wrong_words_are_told_with_the_way_out(played, scenes, changed, message)
     first, second = scenes[0].scenario_id, scenes[1].scenario_id
 
     with pytest.raises(ConfigError, match=message.format(first=first, second=second)):
-        find_film(Wanted(Root(played), **changed))
+        find_view_model(Wanted(Root(played), **changed))
 
 
 def test_of_many_scenes_that_begin_alike_some_are_named():
@@ -132,7 +134,7 @@ def test_a_scene_that_no_record_holds_is_told_with_some_that_there_are(source, s
     with pytest.raises(
         ConfigError, match=f"these records .*'x'; there is .*{scenes[0].scenario_id}"
     ):
-        find_film(Wanted(Root(source), records=(str(source),), scene="x"))
+        find_view_model(Wanted(Root(source), records=(str(source),), scene="x"))
 
 
 def test_a_file_without_records_says_what_is_wrong_with_it(tmp_path, capsys):
@@ -154,9 +156,9 @@ def test_what_is_neither_a_root_nor_records_is_told_so(tmp_path, capsys, name):
 
 def test_an_empty_root_says_how_to_fill_it(tmp_path):
     with pytest.raises(ConfigError, match="holds no scenes; `infgen demo` makes some"):
-        find_film(Wanted(Root(tmp_path)))
+        find_view_model(Wanted(Root(tmp_path)))
     with pytest.raises(ConfigError, match="holds no rollouts; `infgen rollout --root"):
-        find_film(Wanted(Root(tmp_path), rollouts=(1,)))
+        find_view_model(Wanted(Root(tmp_path), rollouts=(1,)))
 
 
 def test_the_verb_writes_a_page_and_prints_its_path(

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from infgen.errors import ConfigError
-from infgen.views.scene.view_model import make_film
+from infgen.views.scene.view_model import make_view_model
 from infgen.views.video import painter
 from infgen.views.video.layout import Format
 from infgen.views.video.painter import MissingExtraError, rgb
@@ -17,13 +17,15 @@ FORM = Format(320, 240, 10)
 
 
 @pytest.fixture(scope="module")
-def film(scenes):
-    return make_film(scenes[0], (replay(scenes[0]),))
+def view_model(scenes):
+    return make_view_model(scenes[0], (replay(scenes[0]),))
 
 
-def test_an_mp4_plays_every_frame_in_order(film, tmp_path):
+def test_an_mp4_plays_every_frame_in_order(view_model, tmp_path):
     told = []
-    path = write_video(film, tmp_path / "out" / "film.mp4", FORM, told.append, workers=0)
+    path = write_video(
+        view_model, tmp_path / "out" / "film.mp4", FORM, told.append, workers=0
+    )
 
     with av.open(str(path)) as file:
         stream = file.streams.video[0]
@@ -36,15 +38,15 @@ def test_an_mp4_plays_every_frame_in_order(film, tmp_path):
     assert [each.name for each in path.parent.iterdir()] == ["film.mp4"]
 
 
-def test_the_bytes_do_not_depend_on_the_number_of_processes(film, tmp_path):
-    alone = write_video(film, tmp_path / "a.mp4", FORM, workers=0)
-    by_two = write_video(film, tmp_path / "b.mp4", FORM, workers=2)
+def test_the_bytes_do_not_depend_on_the_number_of_processes(view_model, tmp_path):
+    alone = write_video(view_model, tmp_path / "a.mp4", FORM, workers=0)
+    by_two = write_video(view_model, tmp_path / "b.mp4", FORM, workers=2)
 
     assert alone.read_bytes() == by_two.read_bytes()
 
 
-def test_a_gif_repeats_and_lasts_as_long(film, tmp_path):
-    path = write_video(film, tmp_path / "film.gif", FORM, workers=0)
+def test_a_gif_repeats_and_lasts_as_long(view_model, tmp_path):
+    path = write_video(view_model, tmp_path / "film.gif", FORM, workers=0)
 
     with image.open(path) as file:
         assert file.size == (320, 240)
@@ -59,9 +61,9 @@ def test_a_gif_repeats_and_lasts_as_long(film, tmp_path):
         assert (shown == rgb(getattr(FORM.colours, name))).all(axis=1).any()
 
 
-def test_strips_are_written_as_drawings_and_as_pictures(film, tmp_path):
-    drawing = write_strip(film, tmp_path / "s.svg", "light", 4.0)
-    picture = write_strip(film, tmp_path / "s.png", "dark", 4.0)
+def test_strips_are_written_as_drawings_and_as_pictures(view_model, tmp_path):
+    drawing = write_strip(view_model, tmp_path / "s.svg", "light", 4.0)
+    picture = write_strip(view_model, tmp_path / "s.png", "dark", 4.0)
 
     assert drawing.read_text().startswith("<svg")
     with image.open(picture) as file:
@@ -69,31 +71,31 @@ def test_strips_are_written_as_drawings_and_as_pictures(film, tmp_path):
         assert np.asarray(file).mean() < 128
 
 
-@pytest.mark.parametrize("name", ["film.avi", "film", "film.mp4.txt"])
-def test_another_ending_is_refused(film, tmp_path, name):
+@pytest.mark.parametrize("name", ["film.avi", "view_model", "film.mp4.txt"])
+def test_another_ending_is_refused(view_model, tmp_path, name):
     with pytest.raises(ConfigError, match=r"expected a name that ends in \.mp4 or \.gif"):
-        write_video(film, tmp_path / name, FORM)
+        write_video(view_model, tmp_path / name, FORM)
     with pytest.raises(ConfigError, match=r"ends in \.svg or \.png"):
-        write_strip(film, tmp_path / name, "light", 6.0)
+        write_strip(view_model, tmp_path / name, "light", 6.0)
 
 
-def test_whoever_is_stopped_leaves_nothing(film, tmp_path, monkeypatch):
+def test_whoever_is_stopped_leaves_nothing(view_model, tmp_path, monkeypatch):
     def stop():
         raise Stopped(15)
 
     monkeypatch.setattr(view_files.signals, "check", stop)
 
     with pytest.raises(Stopped):
-        write_video(film, tmp_path / "film.mp4", FORM, workers=0)
+        write_video(view_model, tmp_path / "film.mp4", FORM, workers=0)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_missing_package_is_told_before_any_work(film, tmp_path, monkeypatch):
+def test_a_missing_package_is_told_before_any_work(view_model, tmp_path, monkeypatch):
     def refuse(name):
         raise ImportError(f"No module named {name!r}")
 
     monkeypatch.setattr(painter, "import_module", refuse)
 
     with pytest.raises(MissingExtraError, match=r"pip install 'infgen\[video\]'"):
-        write_video(film, tmp_path / "film.mp4", FORM, workers=0)
-    assert write_strip(film, tmp_path / "s.svg", "light", 6.0).is_file()
+        write_video(view_model, tmp_path / "film.mp4", FORM, workers=0)
+    assert write_strip(view_model, tmp_path / "s.svg", "light", 6.0).is_file()

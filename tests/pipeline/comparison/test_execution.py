@@ -6,10 +6,10 @@ import sys
 import pytest
 
 from infgen.errors import ConfigError
-from pipeline.comparison.dry_run import look_ahead
-from pipeline.comparison.execution import Ran, run_legs
+from pipeline.comparison.dry_run import plan_dry_run
+from pipeline.comparison.execution import ExecutedRun, execute_arm_runs
 from pipeline.comparison.records import find_records
-from pipeline.comparison.runs import Comparison, legs_of
+from pipeline.comparison.runs import Comparison, arm_runs_of
 from pipeline.comparison.write import write_comparison
 from pipeline.engine.atomic import MANIFEST
 from pipeline.engine.events import Events
@@ -70,33 +70,35 @@ class _Shop:
             self.root, path, file, preset, profile, words, records, tuple(targets)
         )
 
-    def legs(self, *words, arms=(), seeds=1, **more):
+    def arm_runs(self, *words, arms=(), seeds=1, **more):
         comparison = self.comparison(*words, **more)
-        return legs_of(comparison, comparison.preset.chosen(arms), seeds)
+        return arm_runs_of(comparison, comparison.preset.chosen(arms), seeds)
 
     def run(self, *words, arms=(), seeds=1, run_options=None, **more):
         comparison = self.comparison(*words, **more)
-        legs = legs_of(comparison, comparison.preset.chosen(arms), seeds)
+        arm_runs = arm_runs_of(comparison, comparison.preset.chosen(arms), seeds)
         events = Events(self.root, (self.told.append,))
-        return run_legs(comparison, legs, lambda plan: run_options or RunOptions(), events)
+        return execute_arm_runs(
+            comparison, arm_runs, lambda plan: run_options or RunOptions(), events
+        )
 
     def made(self, stage):
         return len(list(self.root.stage(stage).glob("*/manifest.json")))
 
 
-def names(legs):
-    return [(leg.arm.name, leg.seed, leg.play) for leg in legs]
+def names(arm_runs):
+    return [(arm_run.arm.name, arm_run.seed, arm_run.play) for arm_run in arm_runs]
 
 
 def test_every_arm_is_run_with_every_seed_and_play_starts_first(shop):
     first = [("plain", 0, "long"), ("plain", 0, "brief"), ("tuned", 0, "brief")]
     first += [("other", 0, "long")]
 
-    assert names(shop.legs(seeds=2)) == first + [(a, 1, p) for a, _, p in first]
+    assert names(shop.arm_runs(seeds=2)) == first + [(a, 1, p) for a, _, p in first]
 
 
 def test_a_start_that_is_not_compared_is_trained_only(shop):
-    assert names(shop.legs(arms=["tuned"])) == [("plain", 0, ""), ("tuned", 0, "brief")]
+    assert names(shop.arm_runs(arms=["tuned"])) == [("plain", 0, ""), ("tuned", 0, "brief")]
     (weights, _) = shop.run(arms=["tuned"])
     assert list(weights.keys) == ["count", "train"]
 
@@ -104,7 +106,7 @@ def test_a_start_that_is_not_compared_is_trained_only(shop):
 def test_an_early_target_is_made_once_an_arm(shop):
     ran = shop.run(targets=["train"])
 
-    assert names(one.leg for one in ran) == [
+    assert names(one.arm_run for one in ran) == [
         ("plain", 0, ""),
         ("tuned", 0, ""),
         ("other", 0, ""),
@@ -119,13 +121,15 @@ def test_what_runs_have_in_common_is_made_once(shop):
     assert {one.state for one in ran} == {"made"}
     assert len({one.keys["count"] for one in ran}) == shop.made("count") == 1
     assert len({one.keys["train"] for one in ran}) == shop.made("train") == 6
-    plain = [one.keys for one in ran if one.leg.arm.name == "plain" and not one.leg.seed]
+    plain = [
+        one.keys for one in ran if one.arm_run.arm.name == "plain" and not one.arm_run.seed
+    ]
     assert plain[0]["train"] == plain[1]["train"]
     assert plain[0]["score"] != plain[1]["score"]
 
 
 def test_an_arm_goes_on_from_the_weights_of_its_start_and_its_own_seed(shop):
-    ran = {(one.leg.arm.name, one.leg.seed): one for one in shop.run(seeds=2)}
+    ran = {(one.arm_run.arm.name, one.arm_run.seed): one for one in shop.run(seeds=2)}
 
     def weights(arm, seed):
         (result,) = [r for r in ran[arm, seed].results if r.stage == "train"]
@@ -136,10 +140,10 @@ def test_an_arm_goes_on_from_the_weights_of_its_start_and_its_own_seed(shop):
 
 
 def test_a_play_has_the_settings_of_its_arm(shop):
-    ran = {(one.leg.arm.name, one.leg.play): one for one in shop.run()}
+    ran = {(one.arm_run.arm.name, one.arm_run.play): one for one in shop.run()}
 
-    def told(*leg):
-        return ran[leg].results[-1].report
+    def told(*arm_run):
+        return ran[arm_run].results[-1].report
 
     assert told("plain", "long") == {"mode": "long", "weights": 5, "radius_m": 75.0}
     assert told("plain", "brief") == {"mode": "brief", "weights": 5, "radius_m": 0.0}
@@ -167,7 +171,7 @@ def test_a_failing_arm_stops_neither_others_nor_their_seeds(shop):
     text = text.replace("other: {train: {steps: 7}", "other: {train: {fail: true}")
     (shop.folder / "stages.yaml").write_text(text)
 
-    states = {(one.leg.arm.name, one.leg.seed): one for one in shop.run(seeds=2)}
+    states = {(one.arm_run.arm.name, one.arm_run.seed): one for one in shop.run(seeds=2)}
 
     assert states["other", 0].state == states["other", 1].state == "failed"
     assert states["other", 0].why == "train: weights: ValueError: told to fail"
@@ -180,7 +184,7 @@ def test_who_goes_on_from_failed_weights_is_left_out_and_says_so(shop):
     text = text.replace("plain: {rollout_sets", "plain: {train: {fail: true}, rollout_sets")
     (shop.folder / "stages.yaml").write_text(text)
 
-    ran = {(one.leg.arm.name, one.leg.play): one for one in shop.run()}
+    ran = {(one.arm_run.arm.name, one.arm_run.play): one for one in shop.run()}
 
     assert ran["plain", "long"].state == "failed"
     assert ran["plain", "brief"].state == "skipped"  # The same weights are not tried twice.
@@ -204,7 +208,7 @@ def test_wrong_settings_are_told_with_their_line_before_anything_is_made(shop):
     text = (shop.folder / "stages.yaml").read_text()
     text = text.replace("other: {train: {steps: 7}", "other: {train: {stps: 7}")
     (shop.folder / "stages.yaml").write_text(text)
-    comparison, wrong = shop.comparison(), shop.legs(arms=["other"])[0]
+    comparison, wrong = shop.comparison(), shop.arm_runs(arms=["other"])[0]
 
     with pytest.raises(ConfigError, match=r"stages.yaml:20: train: no setting 'stps'"):
         comparison.sketch(wrong)
@@ -239,16 +243,16 @@ def test_a_run_is_remembered_as_if_it_had_been_asked_for_alone(shop):
 
 def test_a_dry_run_tells_what_each_run_adds(shop):
     comparison = shop.comparison()
-    legs = shop.legs()
+    arm_runs = shop.arm_runs()
 
-    before = {each.run: each for each in look_ahead(comparison, legs)}
+    before = {each.run: each for each in plan_dry_run(comparison, arm_runs)}
     assert before["plain, seed 0, long"].makes == ("count", "train", "rollout", "score")
     assert before["plain, seed 0, brief"].makes == ("rollout", "score")
     assert before["tuned, seed 0, brief"].makes == ("train", "rollout", "score")
     assert before["tuned, seed 0, brief"].note == "after plain"
     assert not shop.root.store.exists()
     shop.run(arms=["plain"])
-    after = {each.run: each for each in look_ahead(comparison, legs)}
+    after = {each.run: each for each in plan_dry_run(comparison, arm_runs)}
     assert after["plain, seed 0, long"].makes == ()
     assert after["tuned, seed 0, brief"].makes == ("train", "rollout", "score")
     assert after["tuned, seed 0, brief"].note == ""
@@ -271,7 +275,7 @@ def test_towns_are_written_once_where_no_records_are_named(shop, monkeypatch):
     monkeypatch.setattr(
         "pipeline.comparison.records.write_towns", lambda order, tell: asked.append(order)
     )
-    before = look_ahead(shop.comparison(), shop.legs(arms=["plain"]))
+    before = plan_dry_run(shop.comparison(), shop.arm_runs(arms=["plain"]))
     assert before[0].note == "after 2 files of towns are written"
 
     found = find_records(shop.comparison(), shop.told.append)
@@ -282,7 +286,7 @@ def test_towns_are_written_once_where_no_records_are_named(shop, monkeypatch):
 
 
 def test_a_comparison_that_was_half_removed_is_written_anew(shop):
-    ran = [Ran(leg, "skipped", "nobody made it") for leg in shop.legs()]
+    ran = [ExecutedRun(arm_run, "skipped", "nobody made it") for arm_run in shop.arm_runs()]
     shown = write_comparison(shop.comparison(), ran, again=False)
     page = (shown / "comparison.html").read_bytes()
     (shown / MANIFEST).unlink()

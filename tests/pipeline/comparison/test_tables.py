@@ -8,10 +8,10 @@ import pytest
 from infgen.metrics.long_term.protocols import FEATURES
 from infgen.views.published import ABLATIONS, PAPER
 from infgen.views.sheets import Measured
-from pipeline.comparison.execution import Ran
+from pipeline.comparison.execution import ExecutedRun
 from pipeline.comparison.figures import curve_sheet, figures
-from pipeline.comparison.result import Compared
-from pipeline.comparison.runs import Leg
+from pipeline.comparison.result import ComparisonResult
+from pipeline.comparison.runs import ArmRun
 from pipeline.comparison.tables import caveats, standing_alone, tables
 from pipeline.stages.score_summary import Tally
 from tests.pipeline.compared import arm, compared, scored
@@ -55,7 +55,7 @@ def run(method, ace, score, *, seed=0, entries=1.0):
 
 
 @pytest.fixture
-def found() -> Compared:
+def found() -> ComparisonResult:
     """Three methods and an ablation, played long; two of them for eight seconds too."""
     wosac = [
         scored(
@@ -74,7 +74,9 @@ def found() -> Compared:
         run(CATK, 5.0, 0.4),
         run(NO_CELL, 3.0, 0.3),
     ]
-    lost = Ran(Leg("mini", CATK, 0, "wosac"), "failed", "rollout: x: ValueError: y")
+    lost = ExecutedRun(
+        ArmRun("mini", CATK, 0, "wosac"), "failed", "rollout: x: ValueError: y"
+    )
     return compared([*runs, *wosac], logs, missing=[lost])
 
 
@@ -209,7 +211,9 @@ def test_curves_of_all_arms_are_in_one_chart_of_each_number(found):
 
 
 def test_a_comparison_of_nothing_is_a_list_of_what_failed():
-    lost = Ran(Leg("mini", INFGEN, 0, "long"), "failed", "train: weights: OSError: full")
+    lost = ExecutedRun(
+        ArmRun("mini", INFGEN, 0, "long"), "failed", "train: weights: OSError: full"
+    )
 
     empty = compared([], missing=[lost])
 

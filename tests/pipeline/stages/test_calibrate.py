@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from infgen.config import CalibrateSettings, RolloutSettings, TokenSettings
-from infgen.metrics.flow import Turnover
+from infgen.metrics.flow import FlowCounts
 from infgen.scene import Scene
 from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import FinishedUnit
@@ -62,7 +62,7 @@ def told(point, played, logged=None):
         "point": point,
         "scenes": 2,
         "played": dataclasses.asdict(played),
-        "logged": dataclasses.asdict(logged or Turnover(1000, 1000, 9000, 1000)),
+        "logged": dataclasses.asdict(logged or FlowCounts(1000, 1000, 9000, 1000)),
         "refused": ["scene 1: too short"],
     }
     return FinishedUnit(f"play-{point}-000", "key", Path(), report)
@@ -184,7 +184,9 @@ def test_the_biases_with_which_plays_are_as_logs_are_left_for_rollouts(
     inputs, tmp_path, quiet
 ):
     played = [
-        Turnover(round(1000 * math.exp(add - 0.5)), round(1000 * math.exp(leave)), 0, 1000)
+        FlowCounts(
+            round(1000 * math.exp(add - 0.5)), round(1000 * math.exp(leave)), 0, 1000
+        )
         for add, leave in DESIGN
     ]
     units = [told(point, counts) for point, counts in enumerate(played)]
@@ -207,7 +209,7 @@ def test_the_biases_with_which_plays_are_as_logs_are_left_for_rollouts(
 def test_where_too_few_come_to_tell_the_odds_decide_and_the_report_says_so(
     inputs, tmp_path, quiet
 ):
-    units = [told(point, Turnover(0, 9, 0, 1000)) for point in range(len(DESIGN))]
+    units = [told(point, FlowCounts(0, 9, 0, 1000)) for point in range(len(DESIGN))]
 
     report = stage.finish(inputs, units, tmp_path / "out", NARROW, quiet)
 

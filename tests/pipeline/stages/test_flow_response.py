@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infgen.metrics.flow import Turnover
+from infgen.metrics.flow import FlowCounts
 from pipeline.stages.calibration import Biases
 from pipeline.stages.flow_response import BEYOND, DESIGN, FEWEST, Reach, find_best
 
 REACH = Reach(Biases(add=0.1, leave=-0.05), add=0.8, leave=0.4)
 TOKENS = 1_000_000
-LOGS = Turnover(came=TOKENS, went=TOKENS, agents=0, tokens=TOKENS)
+LOGS = FlowCounts(came=TOKENS, went=TOKENS, agents=0, tokens=TOKENS)
 
 
 def plays(come, go, stay=lambda *_: -99.0):
@@ -22,7 +22,7 @@ def plays(come, go, stay=lambda *_: -99.0):
         return round(TOKENS * math.exp(rate))
 
     return [
-        Turnover(times(come(*at)), times(go(*at)), times(stay(*at)), TOKENS)
+        FlowCounts(times(come(*at)), times(go(*at)), times(stay(*at)), TOKENS)
         for at in DESIGN
     ]
 
@@ -68,18 +68,18 @@ def test_where_nobody_goes_only_who_comes_decides():
 
 
 @pytest.mark.parametrize(
-    "logs", [Turnover(FEWEST - 1, TOKENS, 0, TOKENS), Turnover(0, 0, 0, 0)]
+    "logs", [FlowCounts(FEWEST - 1, TOKENS, 0, TOKENS), FlowCounts(0, 0, 0, 0)]
 )
 def test_too_few_newcomers_decide_nothing(logs):
     some = plays(lambda a, _: a, lambda _, b: b)
 
     assert find_best(some, logs, REACH) is None
-    assert find_best([*some[:-1], Turnover(0, 9, 0, TOKENS)], LOGS, REACH) is None
+    assert find_best([*some[:-1], FlowCounts(0, 9, 0, TOKENS)], LOGS, REACH) is None
 
 
 def test_who_is_there_weighs_as_much_as_who_comes_and_who_goes():
     """Right rates of both, and e^0.3 times as many: what they disagree about is shared."""
-    crowd = Turnover(TOKENS, TOKENS, TOKENS, TOKENS)
+    crowd = FlowCounts(TOKENS, TOKENS, TOKENS, TOKENS)
     some = plays(lambda a, _: a - 0.5, lambda _, b: b, lambda a, _: a - 0.2)
 
     best = find_best(some, crowd, REACH)

@@ -222,11 +222,11 @@ def test_agents_far_away_are_played_where_everyone_is_asked_for(
 
 
 @pytest.mark.parametrize(
-    ("model", "plays"),
+    ("model", "simulates"),
     [({}, "motion, entries, exits"), ({"insertion_and_removal": False}, "motion only")],
 )
 def test_the_report_says_what_the_weights_play(
-    inputs, tmp_path, metre_moves, bent_roads, model, plays
+    inputs, tmp_path, metre_moves, bent_roads, model, simulates
 ):
     sizes = dataclasses.replace(TINY, **model)
     network = Network(sizes, metre_moves, bent_roads, TokenSettings())
@@ -236,7 +236,7 @@ def test_the_report_says_what_the_weights_play(
 
     report, rollouts = play(unit, tmp_path / "out", settings)
 
-    assert report["plays"] == plays
+    assert report["simulates"] == simulates
     if model:
         assert all(rollout.logged.all() for rollout in rollouts)
 
@@ -252,6 +252,6 @@ def test_the_stage_sums_up_its_units(inputs, tmp_path):
     report = stage.STAGE.finish(inputs, done, target, SETTINGS, no_progress)
 
     assert report["rollouts"] == 8
-    assert report["plays"] == "motion, entries, exits"
+    assert report["simulates"] == "motion, entries, exits"
     assert len(report["refused"]) == 1
     assert len(pl.read_parquet(target / "index.parquet")) == 8

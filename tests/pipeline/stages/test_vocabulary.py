@@ -124,7 +124,7 @@ def test_without_a_split_to_learn_from_the_error_names_those_there_are(two_split
         vocabulary.plan(two_splits, settings)
 
 
-def test_codebooks_that_are_taken_need_nothing_to_learn_from(two_splits):
+def test_vocabularies_that_are_taken_need_nothing_to_learn_from(two_splits):
     settings = dataclasses.replace(SETTINGS, split="trainig", initial_weights="builtin")
 
     (unit,) = vocabulary.plan(two_splits, settings)
@@ -134,7 +134,7 @@ def test_codebooks_that_are_taken_need_nothing_to_learn_from(two_splits):
         vocabulary.plan(two_splits, dataclasses.replace(settings, validation_split="none"))
 
 
-def test_codebooks_come_back_as_they_were_written_with_a_report(two_splits, tmp_path):
+def test_vocabularies_come_back_as_they_were_written_with_a_report(two_splits, tmp_path):
     folder, figures = build(two_splits, tmp_path)
     motion, roads = load_vocabularies(folder)
     assert isinstance(motion, MotionVocabulary)
@@ -168,7 +168,7 @@ def test_bytes_do_not_depend_on_the_order_of_units(two_splits, tmp_path):
     assert all_bytes(one) == all_bytes(two)
 
 
-def test_bytes_of_codebooks_do_not_depend_on_how_scenes_are_spread_over_files(
+def test_bytes_of_vocabularies_do_not_depend_on_how_scenes_are_spread_over_files(
     tmp_path, traffic
 ):
     scenes = traffic(8)
@@ -183,7 +183,7 @@ def test_bytes_of_codebooks_do_not_depend_on_how_scenes_are_spread_over_files(
     assert fingerprint(folders[0]) == fingerprint(folders[1])
 
 
-def test_the_fingerprint_tells_codebooks_apart(two_splits, tmp_path):
+def test_the_fingerprint_tells_vocabularies_apart(two_splits, tmp_path):
     one, _ = build(two_splits, tmp_path / "one")
     other = dataclasses.replace(SETTINGS, seed=1)
     two, _ = build(two_splits, tmp_path / "two", other)
@@ -203,7 +203,7 @@ def test_without_a_held_out_split_some_scenes_are_held_out_by_their_hash(tmp_pat
     assert report["motion"]["vehicle"]["held_out_tokens"] > 0
 
 
-def test_scenes_without_cyclists_or_maps_still_give_whole_codebooks(
+def test_scenes_without_cyclists_or_maps_still_give_whole_vocabularies(
     tmp_path, drive, build_map
 ):
     bare = [
@@ -246,14 +246,14 @@ def test_samples_of_a_file_are_bounded(tmp_path, traffic):
     assert len(paths) == 8
 
 
-def test_a_missing_codebook_is_an_error_that_says_so(tmp_path):
+def test_a_missing_vocabulary_is_an_error_that_says_so(tmp_path):
     with pytest.raises((StoreError, FileNotFoundError)):
         load_vocabularies(tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs real records in ../shared/data/womd")
-def test_codebooks_from_a_few_real_files_write_held_out_scenes_closely(tmp_path):
+def test_vocabularies_from_a_few_real_files_write_held_out_scenes_closely(tmp_path):
     files = [*sorted(SHARED.glob("training*"))[:2], *sorted(SHARED.glob("validation*"))]
     done = []
     for file in files:

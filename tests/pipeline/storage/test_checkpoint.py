@@ -10,10 +10,10 @@ from pipeline.storage.checkpoint import load_checkpoint, save_checkpoint
 from pipeline.storage.weights import state_dict_of
 
 
-def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(course, books):
-    training = begin(course, *books)
-    save_checkpoint(course.folder, training, 2)
-    half = course.folder / "checkpoint-000000004"
+def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(setup, books):
+    training = begin(setup, *books)
+    save_checkpoint(setup.folder, training, 2)
+    half = setup.folder / "checkpoint-000000004"
     half.mkdir()
     (half / "network.safetensors").write_bytes(b"half")
     before = {
@@ -22,20 +22,20 @@ def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(course, book
     for parameter in training.network.parameters():
         parameter.data += 1
 
-    assert load_checkpoint(course.folder, training) == 2
+    assert load_checkpoint(setup.folder, training) == 2
 
     after = state_dict_of(training.network)
     assert all(torch.equal(after[name], value) for name, value in before.items())
-    save_checkpoint(course.folder, training, 4)
-    assert [p.name for p in course.folder.glob("checkpoint-*")] == [half.name]
+    save_checkpoint(setup.folder, training, 4)
+    assert [p.name for p in setup.folder.glob("checkpoint-*")] == [half.name]
 
 
-def test_a_checkpoint_holds_the_optimiser_and_the_average(course, books, quiet):
-    training = begin(course, *books)
-    train(replace(course, train=replace(course.train, steps=2)), training, quiet)
-    other = begin(course, *books)
+def test_a_checkpoint_holds_the_optimiser_and_the_average(setup, books, quiet):
+    training = begin(setup, *books)
+    train(replace(setup, train=replace(setup.train, steps=2)), training, quiet)
+    other = begin(setup, *books)
 
-    assert load_checkpoint(course.folder, other) == 2
+    assert load_checkpoint(setup.folder, other) == 2
 
     for name, value in training.average.items():
         assert torch.equal(other.average[name], value)

@@ -116,7 +116,7 @@ def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_i
     assert len(message) < 1000
 
 
-def test_codebooks_are_those_of_the_weights_and_measured_on_the_records(tmp_path, drive):
+def test_vocabularies_are_those_of_the_weights_and_measured_on_the_records(tmp_path, drive):
     settings = VocabSettings(initial_weights="builtin")
     files = []
     for split, speed_mps in (("training", 5.0), ("validation", 7.0)):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from infgen.rollout.population import Population
-from infgen.rollout.rules.collision import find_hits, repeat
+from infgen.rollout.rules.collision import find_collisions, repeat
 from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence
 
@@ -19,14 +19,14 @@ def everyone(*poses, kind=CAR) -> Population:
     size_lwh_m = np.empty((*one, 3), dtype=np.float32)
     size_lwh_m[:] = 4.0, 2.0, 1.5
     return Population(
-        life=np.zeros(one, dtype=np.int32),
+        agent_number=np.zeros(one, dtype=np.int32),
         kind=np.full(one, kind, dtype=np.int8),
         size_lwh_m=size_lwh_m,
         pose=np.array([poses], dtype=np.float32),
         move=np.zeros(one, dtype=np.int16),
         presence=np.full(one, Presence.PRESENT, dtype=np.int8),
         observed=np.ones(one, dtype=bool),
-        born=np.zeros(1, dtype=np.int32),
+        num_agents_so_far=np.zeros(1, dtype=np.int32),
     )
 
 
@@ -41,7 +41,7 @@ def ways(population, *metres):
 
 def hits(population, *metres):
     there = population.presence != Presence.ABSENT
-    return find_hits(population, there, ways(population, *metres))[0].tolist()
+    return find_collisions(population, there, ways(population, *metres))[0].tolist()
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_who_is_gone_is_in_nobodys_way():
     population = everyone((0, 0, 0), (10, 0, 0))
     there = np.array([[True, False]])
 
-    assert not find_hits(population, there, ways(population, 8.0, 0.0)).any()
+    assert not find_collisions(population, there, ways(population, 8.0, 0.0)).any()
 
 
 def test_walkers_pass_through_each_other_but_not_through_cars():
@@ -96,7 +96,7 @@ def test_who_is_alone_hits_nobody():
 
 
 def test_a_move_that_is_made_again_leads_as_far_again(metre_moves):
-    """Two half seconds of five metres each, northwards, looked at twice each."""
+    """Two token steps of five metres each, northwards, looked at twice each."""
     population = everyone((1, 2, np.pi / 2))
 
     found = repeat(population, np.array([[5]]), metre_moves, 2)

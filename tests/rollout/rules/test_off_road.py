@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from infgen.rollout.population import Population
-from infgen.rollout.rules.off_road import LANE_M, Kerbs, find_departures
+from infgen.rollout.rules.off_road import LANE_M, RoadEdgeTiles, find_off_road
 from infgen.scene import AgentType, FeatureType
 from tests.conftest import EDGE_ID, LANE_ID, make_map, make_scene
 from tests.rollout.rules.test_collision import everyone, ways
@@ -33,28 +33,32 @@ def scene_of(lines):
     return make_scene(path, [CAR], road_map=make_map(lines))
 
 
-def off_m(kerbs, *xy_m):
-    return kerbs.off_m(np.array(xy_m, dtype=np.float32)).tolist()
+def off_m(road_edge_tiles, *xy_m):
+    return road_edge_tiles.off_m(np.array(xy_m, dtype=np.float32)).tolist()
 
 
 @given(st.floats(-90, 90), st.floats(-40, 40))
 def test_places_off_the_road_are_as_far_off_as_they_are(x_m, y_m):
     """The lane is elsewhere, so that only the edges decide."""
-    kerbs = Kerbs(street(lane_y_m=500.0))
+    road_edge_tiles = RoadEdgeTiles(street(lane_y_m=500.0))
 
-    assert off_m(kerbs, (x_m, y_m)) == [pytest.approx(abs(y_m) - 3, abs=1e-4)]
-    assert off_m(kerbs, (x_m, y_m), (x_m, y_m + 16)) == [
+    assert off_m(road_edge_tiles, (x_m, y_m)) == [pytest.approx(abs(y_m) - 3, abs=1e-4)]
+    assert off_m(road_edge_tiles, (x_m, y_m), (x_m, y_m + 16)) == [
         pytest.approx(abs(y_m) - 3, abs=1e-4),
         pytest.approx(abs(y_m + 16) - 3, abs=1e-4),
     ]
 
 
 def test_what_was_looked_at_is_not_looked_at_again():
-    kerbs = Kerbs(street())
+    road_edge_tiles = RoadEdgeTiles(street())
     place = np.random.default_rng(0).uniform(-40, 40, (200, 2)).astype(np.float32)
-    alone = [Kerbs(street()).off_m(one[None])[0] for one in place[:9]]
+    alone = [RoadEdgeTiles(street()).off_m(one[None])[0] for one in place[:9]]
 
-    first, some, again = kerbs.off_m(place), kerbs.off_m(place[:9]), kerbs.off_m(place)
+    first, some, again = (
+        road_edge_tiles.off_m(place),
+        road_edge_tiles.off_m(place[:9]),
+        road_edge_tiles.off_m(place),
+    )
 
     np.testing.assert_array_equal(again, first)
     np.testing.assert_array_equal(some, first[:9])
@@ -65,9 +69,11 @@ def test_a_bridge_over_the_lane_does_not_take_the_road_away():
     """Its edge crosses at x = 0 with its own road on the side of -x."""
     y = np.arange(-20.0, 21.0)
     bridge = (EDGE_ID + 2, FeatureType.ROAD_EDGE, 0, np.column_stack([0 * y, y]))
-    kerbs = Kerbs(street(bridge))
+    road_edge_tiles = RoadEdgeTiles(street(bridge))
 
-    on_the_lane, beside_it, farther = off_m(kerbs, (0.5, 0.5), (0.5, 1.5), (0.5, 2.0))
+    on_the_lane, beside_it, farther = off_m(
+        road_edge_tiles, (0.5, 0.5), (0.5, 1.5), (0.5, 2.0)
+    )
 
     assert on_the_lane <= 0
     assert beside_it == pytest.approx(1.5 - LANE_M, abs=1e-5)
@@ -78,25 +84,25 @@ def test_without_edges_everywhere_is_road():
     x = np.arange(-10.0, 11.0)
     lane = (LANE_ID, FeatureType.LANE, 0, np.column_stack([x, 0 * x]))
 
-    assert off_m(Kerbs(scene_of([lane])), (0, 50)) == [-np.inf]
+    assert off_m(RoadEdgeTiles(scene_of([lane])), (0, 50)) == [-np.inf]
 
 
 def test_without_lanes_edges_decide():
     x = np.arange(-10.0, 11.0)
     edge = (EDGE_ID, FeatureType.ROAD_EDGE, 0, np.column_stack([x, 0 * x]))
 
-    assert off_m(Kerbs(scene_of([edge])), (0, -2), (0, 2)) == [2, -2]
+    assert off_m(RoadEdgeTiles(scene_of([edge])), (0, -2), (0, 2)) == [2, -2]
 
 
 def departs(y_m, heading_rad, metres, kind=CAR, moments=2):
     """A car 4 m long and 2 m wide at (0, y) goes straight on."""
     population = everyone((0, y_m, heading_rad), kind=kind)
-    found = find_departures(
+    found = find_off_road(
         population,
         np.ones((1, 1), dtype=bool),
         ways(population, metres),
         np.array([[moments]]),
-        [Kerbs(street())],
+        [RoadEdgeTiles(street())],
         np.zeros(1, dtype=np.int64),
     )
     return found.item()
@@ -136,12 +142,12 @@ def test_everyone_is_held_against_the_map_of_its_own_rollout_if_asked_about():
         **{f.name: np.concatenate([getattr(one, f.name)] * 2) for f in fields(one)}
     )
     way = np.concatenate([ways(one, 5.0, 5.0)] * 2)
-    kerbs = [Kerbs(street()), Kerbs(scene_of([]))]
+    road_edge_tiles = [RoadEdgeTiles(street()), RoadEdgeTiles(scene_of([]))]
     which, moments = np.ones((2, 2), dtype=bool), np.full((2, 2), 2)
 
     def ask(which, scene):
         one_map = np.array(scene)
-        return find_departures(both, which, way, moments, kerbs, one_map).tolist()
+        return find_off_road(both, which, way, moments, road_edge_tiles, one_map).tolist()
 
     assert ask(which, [0, 0]) == [[True, False], [True, False]]
     assert ask(which, [1, 0]) == [[False, False], [True, False]]

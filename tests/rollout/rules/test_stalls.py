@@ -8,7 +8,7 @@ import pytest
 from infgen.config import RolloutSettings
 from infgen.model.signal_features import StopLines
 from infgen.rollout.recording import NOBODY
-from infgen.rollout.rules.stalls import AWAY_M, IN_LANE_M, WAITS_M, Patience
+from infgen.rollout.rules.stalls import AWAY_M, IN_LANE_M, WAITS_M, StallRule
 from infgen.rollout.session import Session
 from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence, SignalClass
@@ -19,26 +19,26 @@ from tests.rollout.rules.test_off_road import street
 
 CAR, WALKER, RIDER = AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST
 LONG = 4
-"""Half seconds that are long enough."""
+"""Token steps that are long enough."""
 NO_LINES = StopLines.of(roads([(0, 0, 0)], [0], [[0]]))
 
 
-def patience(lines=NO_LINES):
-    return Patience([street()], np.zeros(1, dtype=np.int64), lines, LONG)
+def stall_rule(lines=NO_LINES):
+    return StallRule([street()], np.zeros(1, dtype=np.int64), lines, LONG)
 
 
 def ask(remembers, population, tokens):
-    """Ask half second by half second; nobody moves meanwhile."""
+    """Ask token step by token step; nobody moves meanwhile."""
     return [remembers.stalled(population, token).tolist()[0] for token in tokens]
 
 
 def stalls(pose, kind=CAR, lines=NO_LINES, token=LONG):
     population = everyone(pose, kind=kind)
-    return ask(patience(lines), population, range(token + 1))[-1][0]
+    return ask(stall_rule(lines), population, range(token + 1))[-1][0]
 
 
 def test_who_stands_in_a_lane_stalls_after_so_many_half_seconds():
-    found = ask(patience(), everyone((0, 0, 0), (20, 1.5, 0)), range(LONG + 3))
+    found = ask(stall_rule(), everyone((0, 0, 0), (20, 1.5, 0)), range(LONG + 3))
 
     assert found == [[False, False]] * LONG + [[True, True]] * 3
 
@@ -63,7 +63,7 @@ def test_only_vehicles_do(kind):
 
 
 def test_who_only_trembled_has_stood_and_who_got_farther_has_not():
-    remembers = patience()
+    remembers = stall_rule()
     for token in range(LONG):
         shift_m = 0.9 * AWAY_M * (token % 2)
         remembers.stalled(everyone((shift_m, 0, 0), (20 + 0.3 * token, 0, 0)), token)
@@ -74,18 +74,20 @@ def test_who_only_trembled_has_stood_and_who_got_farther_has_not():
 
 
 def test_who_has_taken_the_place_of_another_begins_anew():
-    remembers, first = patience(), everyone((0, 0, 0), (20, 0, 0))
+    remembers, first = stall_rule(), everyone((0, 0, 0), (20, 0, 0))
     ask(remembers, first, range(LONG))
-    life = np.array([[0, 1]], dtype=np.int32)
+    agent_number = np.array([[0, 1]], dtype=np.int32)
 
-    assert ask(remembers, replace(first, life=life), [LONG]) == [[True, False]]
+    assert ask(remembers, replace(first, agent_number=agent_number), [LONG]) == [
+        [True, False]
+    ]
 
 
 def test_who_leaves_and_who_is_not_there_do_not():
     nobody = everyone((0, 0, 0), (20, 0, 0))
-    nobody.life[0, 0], nobody.presence[0, 1] = NOBODY, Presence.REMOVED
+    nobody.agent_number[0, 0], nobody.presence[0, 1] = NOBODY, Presence.REMOVED
 
-    assert ask(patience(), nobody, range(LONG + 1))[-1] == [False, False]
+    assert ask(stall_rule(), nobody, range(LONG + 1))[-1] == [False, False]
 
 
 @pytest.mark.parametrize(
@@ -109,7 +111,7 @@ def test_who_waited_stalls_when_it_turns_green():
     turns = [[SignalClass.STOP] * (LONG + 2) + [SignalClass.GO] * 2]
     lines = StopLines.of(roads([(5, 0, 0)], [1], turns))
 
-    found = ask(patience(lines), everyone((0, 0, 0)), range(LONG + 4))
+    found = ask(stall_rule(lines), everyone((0, 0, 0)), range(LONG + 4))
 
     assert found == [[False]] * (LONG + 2) + [[True]] * 2
 
@@ -124,28 +126,30 @@ def stood(playing, begin, tokens):
     return int((way_m < AWAY_M).sum())
 
 
-def never_sets_off(player, metre_moves, **settings):
+def never_sets_off(simulator, metre_moves, **settings):
     """An untrained network to which all but standing is next to impossible."""
-    playing = player(insert=False, remove=False, motion_top_k=0, max_agents=1, **settings)
-    step, standing = playing.stepper.motion_step, playing.tensor(metre_moves.standing)
+    playing = simulator(
+        insert=False, remove=False, motion_top_k=0, max_agents=1, **settings
+    )
+    step, standing = playing.stepper.motion_step, playing.tensor(metre_moves.stationary)
 
-    def still(memory, column):
-        said = step(memory, column)
-        kind = said.packed.rows.pack(column.kind.long())
-        said.packed.move_logits[:] += 50.0 * standing[kind]
+    def still(memory, token_step):
+        said = step(memory, token_step)
+        kind = said.packed.rows.pack(token_step.kind.long())
+        said.packed.motion_logits[:] += 50.0 * standing[kind]
         return said
 
     playing.stepper.motion_step = still
     return playing
 
 
-def test_in_rollouts_who_has_stood_too_long_sets_off(drive, start, player, metre_moves):
+def test_in_rollouts_who_has_stood_too_long_sets_off(drive, start, simulator, metre_moves):
     begin = [start(drive(), at) for at in range(8)]
     settings = {"max_motion_samples": 8}
 
-    for_good = never_sets_off(player, metre_moves, **settings)
-    patient = never_sets_off(player, metre_moves, max_stall_s=1.5, **settings)
-    careful = never_sets_off(player, metre_moves, max_stall_s=9.0, **settings)
+    for_good = never_sets_off(simulator, metre_moves, **settings)
+    patient = never_sets_off(simulator, metre_moves, max_stall_s=1.5, **settings)
+    careful = never_sets_off(simulator, metre_moves, max_stall_s=9.0, **settings)
 
     assert stood(for_good, begin, 8) == 8
     assert stood(patient, begin, 8) < 4

@@ -7,7 +7,7 @@ import pytest
 from infgen.config import VocabSettings
 from infgen.tokens.clustering.coverage import Matches, describe_map, describe_motion
 from infgen.tokens.clustering.vocabularies import Origin
-from infgen.views.charts.vocabularies import codebook_page
+from infgen.views.charts.vocabularies import vocabulary_page
 
 NOTHING = Matches(np.empty(0, np.int8), np.empty(0, int), np.empty(0))
 
@@ -28,7 +28,7 @@ def page(metre_moves, bent_roads):
         ),
         "roads": describe_map(bent_roads, road_origin, curves, curves),
     }
-    return codebook_page(report, metre_moves, move_origin, bent_roads, road_origin)
+    return vocabulary_page(report, metre_moves, move_origin, bent_roads, road_origin)
 
 
 def pictures(page):

@@ -8,7 +8,7 @@ import pytest
 
 from infgen.views.player import player_page
 from infgen.views.scene.interpolation import moment_at
-from infgen.views.scene.view_model import make_film
+from infgen.views.scene.view_model import make_view_model
 from tests.exports.replays import replay, with_newcomer
 
 playwright = pytest.importorskip(
@@ -31,9 +31,9 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def file(film, tmp_path_factory):
+def file(view_model, tmp_path_factory):
     path = tmp_path_factory.mktemp("player") / "film.html"
-    path.write_text(player_page(film))
+    path.write_text(player_page(view_model))
     return path
 
 
@@ -103,7 +103,7 @@ def colour(page, name):
     return np.array([int(text[at : at + 2], 16) for at in (1, 3, 5)])
 
 
-def test_all_is_read_as_python_packed_it(opened, film):
+def test_all_is_read_as_python_packed_it(opened, view_model):
     page = opened()
 
     found = page.evaluate(
@@ -113,7 +113,7 @@ def test_all_is_read_as_python_packed_it(opened, film):
         }))"""
     )
 
-    for showing, read in zip(film.showings, found, strict=True):
+    for showing, read in zip(view_model.showings, found, strict=True):
         valid = showing.valid
         assert read["name"] == showing.name
         assert read["present"] == valid.sum(axis=0).tolist()
@@ -204,9 +204,9 @@ def test_the_slider_the_strip_and_the_arrows_scrub(opened):
     assert page.inner_text("#time") == "6.0 s"
 
 
-def test_between_two_steps_an_agent_is_between_its_places(opened, film):
+def test_between_two_steps_an_agent_is_between_its_places(opened, view_model):
     page = opened(hash_="t=1.05")
-    log = film.showings[0]
+    log = view_model.showings[0]
     row = log.ego
 
     pose = page.evaluate("(row) => player.panes[0].poses[row]", row)
@@ -216,9 +216,11 @@ def test_between_two_steps_an_agent_is_between_its_places(opened, film):
     )
 
 
-def test_everyone_is_where_videos_and_strips_have_them(opened, film, tmp_path, crossing):
+def test_everyone_is_where_videos_and_strips_have_them(
+    opened, view_model, tmp_path, crossing
+):
     path = tmp_path / "crossing.html"
-    short = make_film(crossing(), (with_newcomer(replay(crossing()), 40),))
+    short = make_view_model(crossing(), (with_newcomer(replay(crossing()), 40),))
     path.write_text(player_page(short))
     page = opened(path=path)
     times = [0.0, 9.5, 41.5, 42.0, 55.25, 60.5, 64.0, 68.0, 90.0]
@@ -352,9 +354,9 @@ def test_chips_and_keys_show_and_hide_and_one_always_stays(opened):
     assert visible() == 3
 
 
-def test_pointing_at_an_agent_tells_what_is_known_of_it(opened, film):
+def test_pointing_at_an_agent_tells_what_is_known_of_it(opened, view_model):
     page = opened(hash_="t=5")
-    newcomer = film.showings[1].id[-1].item()
+    newcomer = view_model.showings[1].id[-1].item()
     place = page.evaluate("(id) => player.panes[1].placeOf(id)", newcomer)
     frame = page.locator(".pane canvas").nth(1).bounding_box()
 
@@ -369,9 +371,9 @@ def test_pointing_at_an_agent_tells_what_is_known_of_it(opened, film):
     page.wait_for_selector("#tooltip", state="hidden")
 
 
-def test_a_click_keeps_an_agent_chosen_and_the_camera_follows_it(opened, film):
+def test_a_click_keeps_an_agent_chosen_and_the_camera_follows_it(opened, view_model):
     page = opened(hash_="t=5")
-    newcomer = film.showings[1].id[-1].item()
+    newcomer = view_model.showings[1].id[-1].item()
     place = page.evaluate("(id) => player.panes[1].placeOf(id)", newcomer)
     frame = page.locator(".pane canvas").nth(1).bounding_box()
 
@@ -387,7 +389,9 @@ def test_a_click_keeps_an_agent_chosen_and_the_camera_follows_it(opened, film):
 
 def test_who_leaves_fades_and_who_has_left_is_a_fading_outline(opened, tmp_path, crossing):
     path = tmp_path / "leaving.html"
-    path.write_text(player_page(make_film(crossing(), ())))  # Row 3 leaves at step 60.
+    path.write_text(
+        player_page(make_view_model(crossing(), ()))
+    )  # Row 3 leaves at step 60.
     page = opened(path=path)
 
     alphas = page.evaluate(
@@ -403,7 +407,7 @@ def test_who_leaves_fades_and_who_has_left_is_a_fading_outline(opened, tmp_path,
     assert 1 > alphas[1]["alpha"] > alphas[2]["alpha"] > alphas[3]["alpha"] > 0
 
 
-def test_the_log_says_where_it_ends(opened, tmp_path, town, film):
+def test_the_log_says_where_it_ends(opened, tmp_path, town, view_model):
     page = opened(hash_="t=8")
     assert page.locator(".over:visible").count() == 0
 
@@ -442,12 +446,12 @@ def test_nothing_is_cut_off_on_a_phone(opened):
         assert frame["y"] + frame["height"] <= 844, name
 
 
-def test_ids_are_written_as_they_are(opened, tmp_path, film):
+def test_ids_are_written_as_they_are(opened, tmp_path, view_model):
     from dataclasses import replace  # noqa: PLC0415
 
     path = tmp_path / "evil.html"
     evil = "<img src=x onerror=throw(1)></script>"
-    path.write_text(player_page(replace(film, scenario_id=evil)))
+    path.write_text(player_page(replace(view_model, scenario_id=evil)))
 
     page = opened(path=path)
 
@@ -455,8 +459,8 @@ def test_ids_are_written_as_they_are(opened, tmp_path, film):
     assert page.locator("img").count() == 0
 
 
-def test_a_page_whose_film_is_damaged_says_so(browser, tmp_path, film):
-    html = player_page(film)
+def test_a_page_whose_film_is_damaged_says_so(browser, tmp_path, view_model):
+    html = player_page(view_model)
     start = html.index('type="text/plain">') + 18
     path = tmp_path / "damaged.html"
     path.write_text(html[: start + 400] + "AAAA" + html[start + 404 :])

@@ -32,35 +32,35 @@ class Reader(HTMLParser):
             self.words.append(data)
 
 
-def test_the_page_holds_the_film(film, same):
+def test_the_page_holds_the_film(view_model, same):
     (packed,) = [
         text
-        for about, text in Reader(player_page(film)).scripts
+        for about, text in Reader(player_page(view_model)).scripts
         if about.get("id") == "payload"
     ]
 
-    same(film, unpack(packed))
+    same(view_model, unpack(packed))
 
 
-def test_ids_from_records_are_data_and_no_markup(film, same):
-    evil = replace(film, scenario_id=EVIL, weights="<b>")
+def test_ids_from_records_are_data_and_no_markup(view_model, same):
+    evil = replace(view_model, scenario_id=EVIL, weights="<b>")
     reader = Reader(player_page(evil))
 
-    assert len(reader.scripts) == len(Reader(player_page(film)).scripts) == 3
+    assert len(reader.scripts) == len(Reader(player_page(view_model)).scripts) == 3
     assert any(EVIL in words for words in reader.words)
     same(evil, unpack(reader.scripts[1][1]))
 
 
-def test_the_page_loads_nothing_from_elsewhere(film):
-    html = player_page(film).replace("http://www.w3.org", "")
+def test_the_page_loads_nothing_from_elsewhere(view_model):
+    html = player_page(view_model).replace("http://www.w3.org", "")
     about = html.replace(Reader(html).scripts[1][1], "")
 
     assert not re.findall(r"https?://|@import|url\(|src=", about)
     assert "default-src 'none'" in about
 
 
-def test_every_gap_is_filled(film):
-    assert not re.findall(r"\{\{\w+\}\}", player_page(film))
+def test_every_gap_is_filled(view_model):
+    assert not re.findall(r"\{\{\w+\}\}", player_page(view_model))
 
 
 def test_every_script_is_joined_after_those_it_imports():
@@ -80,8 +80,8 @@ def test_the_joined_scripts_import_and_export_nothing():
     assert not re.findall(r"^(?:import|export)\b", player.joined_scripts(), re.MULTILINE)
 
 
-def test_every_id_is_given_once(film):
-    ids = Reader(player_page(film)).ids
+def test_every_id_is_given_once(view_model):
+    ids = Reader(player_page(view_model)).ids
 
     assert len(ids) == len(set(ids))
 

@@ -3,21 +3,21 @@ import pytest
 
 from infgen.views.player.columns import PayloadError, pack_columns
 from infgen.views.player.payload import pack, unpack
-from infgen.views.scene.view_model import make_film
+from infgen.views.scene.view_model import make_view_model
 
 
-def test_a_film_comes_back_to_a_centimetre_and_a_hundredth_of_a_radian(film, same):
-    same(film, unpack(pack(film)))
+def test_a_film_comes_back_to_a_centimetre_and_a_hundredth_of_a_radian(view_model, same):
+    same(view_model, unpack(pack(view_model)))
 
 
 def test_so_does_one_with_gaps_without_lights_and_without_a_map(crossing, build_map, same):
     scene = crossing(road_map=build_map([]))
 
-    same(make_film(scene, ()), unpack(pack(make_film(scene, ()))))
+    same(make_view_model(scene, ()), unpack(pack(make_view_model(scene, ()))))
 
 
-def test_the_same_film_is_the_same_text(film):
-    assert pack(film) == pack(film)
+def test_the_same_film_is_the_same_text(view_model):
+    assert pack(view_model) == pack(view_model)
 
 
 def test_thirty_seconds_of_four_crowds_are_far_below_two_megabytes(busy_film):

@@ -5,21 +5,21 @@ import numpy as np
 import pytest
 
 from infgen.scene import AgentType, FeatureType, RoadLineType, SignalState
-from infgen.views.scene.agent_marks import Crowd
+from infgen.views.scene.agent_marks import AgentMarks
 from infgen.views.scene.drawn_map import draw_map, find_lights
 from infgen.views.scene.map_marks import dashes, light_marks, map_marks, within
 from infgen.views.scene.marks import View
 from infgen.views.scene.shapes import shape_of
 from infgen.views.scene.style import AGENTS, LIGHT, LIGHTS
 from infgen.views.scene.view import all_marks, view_of
-from infgen.views.scene.view_model import make_film, show_log, show_rollout
+from infgen.views.scene.view_model import make_view_model, show_log, show_rollout
 from tests.exports.replays import replay, with_newcomer
 
 VIEW = View((0.0, 0.0), 10.0, 400.0, 200.0)
 
 
 def crowd_marks(showing, time=10.0, view=VIEW):
-    return list(Crowd(showing).marks(10, time, view, LIGHT))
+    return list(AgentMarks(showing).marks(10, time, view, LIGHT))
 
 
 def filled(marks, colour):
@@ -207,10 +207,10 @@ def test_once_the_log_is_over_lights_are_held_and_pale(drive, build_signals):
 
 
 def test_all_of_a_scene_is_the_map_and_then_whoever_is_on_it(drive):
-    film = make_film(drive(), ())
-    crowd = Crowd(film.showings[0])
+    view_model = make_view_model(drive(), ())
+    crowd = AgentMarks(view_model.showings[0])
 
-    marks = list(all_marks(film, crowd, 10.0, VIEW, LIGHT))
+    marks = list(all_marks(view_model, crowd, 10.0, VIEW, LIGHT))
 
     fills = [mark.fill or mark.line for mark in marks]
     assert fills.index(LIGHT.edge) < fills.index(LIGHT.ego)

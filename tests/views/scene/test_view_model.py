@@ -3,7 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from infgen.views.scene.view_model import Film, Role, make_film, show_log, show_rollout
+from infgen.views.scene.view_model import (
+    Role,
+    ViewModel,
+    make_view_model,
+    show_log,
+    show_rollout,
+)
 from tests.exports.replays import replay, with_newcomer
 
 
@@ -56,10 +62,14 @@ def test_a_box_has_the_mean_of_its_logged_sizes(drive):
 
 def test_a_film_holds_the_log_and_then_the_rollouts(crossing):
     scene = crossing()
-    film = make_film(scene, (replay(scene, 0), replay(scene, 5)))
+    view_model = make_view_model(scene, (replay(scene, 0), replay(scene, 5)))
 
-    assert [showing.name for showing in film.showings] == ["log", "rollout 0", "rollout 5"]
-    assert film.num_steps == 91
+    assert [showing.name for showing in view_model.showings] == [
+        "log",
+        "rollout 0",
+        "rollout 5",
+    ]
+    assert view_model.num_steps == 91
 
 
 def test_a_rollout_of_another_scene_is_refused(crossing):
@@ -68,16 +78,18 @@ def test_a_rollout_of_another_scene_is_refused(crossing):
     with pytest.raises(
         ValueError, match="rollout 0 is of scene other, not of made-by-hand"
     ):
-        make_film(crossing(), (other,))
+        make_view_model(crossing(), (other,))
 
 
 def test_a_film_without_a_picture_is_refused(crossing):
     with pytest.raises(ValueError, match="nothing to show of scene made-by-hand"):
-        make_film(crossing(), (), log=False)
+        make_view_model(crossing(), (), log=False)
 
 
 def test_a_film_may_be_of_rollouts_alone(crossing):
-    film = make_film(crossing(), (replay(crossing()),), log=False)
+    view_model = make_view_model(crossing(), (replay(crossing()),), log=False)
 
-    assert isinstance(film, Film)
-    assert np.array_equal(film.showings[0].pose[..., :2], replay(crossing()).xyz_m[..., :2])
+    assert isinstance(view_model, ViewModel)
+    assert np.array_equal(
+        view_model.showings[0].pose[..., :2], replay(crossing()).xyz_m[..., :2]
+    )

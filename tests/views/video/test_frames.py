@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from infgen.errors import ConfigError
-from infgen.views.scene.view_model import make_film
+from infgen.views.scene.view_model import make_view_model
 from infgen.views.video.frames import num_frames, paint_frames
 from infgen.views.video.layout import Format, make_panes
 from tests.exports.replays import replay
@@ -16,19 +16,19 @@ def like(pixels, colour):
     return np.abs(pixels.astype(int) - wanted).max(axis=-1) < 6
 
 
-def painted(film, form, first, count):
-    return [frame.copy() for frame in paint_frames(film, form, first, count)]
+def painted(view_model, form, first, count):
+    return [frame.copy() for frame in paint_frames(view_model, form, first, count)]
 
 
-def test_a_video_lasts_from_now_to_the_end_of_the_longest_showing(film):
-    assert num_frames(film, FORM) == 80
-    assert num_frames(film, Format(640, 360, 25)) == 200
+def test_a_video_lasts_from_now_to_the_end_of_the_longest_showing(view_model):
+    assert num_frames(view_model, FORM) == 80
+    assert num_frames(view_model, Format(640, 360, 25)) == 200
 
 
-def test_panes_fill_the_picture_without_overlapping(film):
+def test_panes_fill_the_picture_without_overlapping(view_model):
     for size in ((640, 360), (360, 640), (1920, 1080)):
         taken = np.zeros(size[::-1], int)
-        for pane in make_panes(film, Format(*size)):
+        for pane in make_panes(view_model, Format(*size)):
             rows = slice(pane.top_px, pane.top_px + pane.height_px)
             taken[rows, pane.left_px : pane.left_px + pane.width_px] += 1
         assert taken.max() == 1
@@ -36,27 +36,27 @@ def test_panes_fill_the_picture_without_overlapping(film):
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_the_ego_is_in_the_middle_of_every_pane_in_its_colour(film, theme):
+def test_the_ego_is_in_the_middle_of_every_pane_in_its_colour(view_model, theme):
     form = Format(960, 540, 10, theme)
-    (frame,) = painted(film, form, 40, 1)
+    (frame,) = painted(view_model, form, 40, 1)
 
-    for pane in make_panes(film, form):
+    for pane in make_panes(view_model, form):
         x = pane.left_px + pane.width_px // 2
         y = pane.top_px + pane.height_px // 2
         assert like(frame[y - 4 : y + 4, x - 4 : x + 4], form.colours.ego).sum() > 8
 
 
-def test_a_frame_does_not_depend_on_which_others_are_painted_with_it(film):
-    together = painted(film, FORM, 20, 6)
+def test_a_frame_does_not_depend_on_which_others_are_painted_with_it(view_model):
+    together = painted(view_model, FORM, 20, 6)
 
     for at, frame in enumerate(together):
         # A coordinate may be rounded otherwise in its last bit, and a shade by a little.
-        (alone,) = painted(film, FORM, 20 + at, 1)
+        (alone,) = painted(view_model, FORM, 20 + at, 1)
         assert np.abs(frame.astype(int) - alone).max() <= 2
 
 
-def test_time_goes_on_below(film):
-    early, late = painted(film, FORM, 5, 1)[0], painted(film, FORM, 70, 1)[0]
+def test_time_goes_on_below(view_model):
+    early, late = painted(view_model, FORM, 5, 1)[0], painted(view_model, FORM, 70, 1)[0]
 
     accent = [
         like(frame[-20], FORM.colours.accent).nonzero()[0].mean() for frame in (early, late)
@@ -67,9 +67,12 @@ def test_time_goes_on_below(film):
 def test_a_showing_that_is_over_stands_back_and_says_so(crossing):
     scene = crossing()
     longer = replay(crossing(steps=131))
-    film = make_film(scene, (longer,))
-    log, _ = make_panes(film, FORM)
-    (before,), (after,) = painted(film, FORM, 70, 1), painted(film, FORM, 110, 1)
+    view_model = make_view_model(scene, (longer,))
+    log, _ = make_panes(view_model, FORM)
+    (before,), (after,) = (
+        painted(view_model, FORM, 70, 1),
+        painted(view_model, FORM, 110, 1),
+    )
 
     def ego_pixels(frame):
         part = frame[log.top_px :, log.left_px : log.left_px + log.width_px]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from infgen.views.scene.style import DARK, LIGHT
-from infgen.views.scene.view_model import make_film
+from infgen.views.scene.view_model import make_view_model
 from infgen.views.video.strips import (
     PICTURE_PX,
     make_strip,
@@ -33,11 +33,11 @@ def short(crossing):
             },
         ),
     )
-    return make_film(early, (replay(scene),))
+    return make_view_model(early, (replay(scene),))
 
 
-def drawn(film, times, theme=LIGHT):
-    return ET.fromstring(strip_svg(make_strip(film, times, theme), theme))
+def drawn(view_model, times, theme=LIGHT):
+    return ET.fromstring(strip_svg(make_strip(view_model, times, theme), theme))
 
 
 def test_moments_are_six_seconds_apart_as_far_as_the_longest_showing_goes(short):
@@ -86,9 +86,9 @@ def test_a_moment_that_is_not_shown_is_refused(short):
 
 
 def test_names_are_escaped(short):
-    film = replace(short, scenario_id="<b>&")
+    view_model = replace(short, scenario_id="<b>&")
 
-    assert drawn(film, [0.0]).find(f"{SVG}title").text == "Scene <b>&"
+    assert drawn(view_model, [0.0]).find(f"{SVG}title").text == "Scene <b>&"
 
 
 def test_a_strip_is_painted_as_it_is_drawn(short):

@@ -15,7 +15,7 @@ from infgen.sources.towns.streets.road_edges import reverse_of
 from infgen.sources.towns.streets.street_types import Rank, Street
 
 NARROWEST_PARKING_M = 1.0
-"""Narrower strips along the kerb are gutters."""
+"""Narrower strips along the road edge are gutters."""
 SIGN_ASIDE_M = 0.7
 BUMP_SHARE = 0.4
 """Share of the local streets that have a speed bump."""

@@ -82,7 +82,7 @@ class Edge:
 
     @property
     def outer(self) -> Lane:
-        """The rightmost lane within the kerbs."""
+        """The rightmost lane within the road edges."""
         return next(lane for lane in self.lanes if lane.use is not Use.WALKERS)
 
     @property
@@ -91,7 +91,7 @@ class Edge:
         return tuple(lane for lane in self.lanes if lane.driven)
 
     def kerb(self) -> Points:
-        """Draw the kerb on the right."""
+        """Draw the road edge on the right."""
         return self.outer.border(-self.outer.width_m / 2)
 
     def middle(self) -> Points:
@@ -100,7 +100,7 @@ class Edge:
 
     @property
     def half_m(self) -> float:
-        """From the left border to the kerb."""
+        """From the left border to the road edge."""
         return sum(lane.width_m for lane in self.lanes if lane.use is not Use.WALKERS)
 
 
@@ -139,7 +139,7 @@ class Crossing:
 
     Attributes:
         junction: Where it is.
-        xy_m: Its middle, from kerb to kerb.
+        xy_m: Its middle, from road edge to road edge.
         width_m: Across the walkers' way.
         edges: Names of the edges it crosses.
     """

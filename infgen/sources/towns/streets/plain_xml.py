@@ -13,7 +13,7 @@ from infgen.sources.towns.streets.street_types import Rank, Street
 from infgen.sources.towns.sumo import run_program
 
 CURB_M = 0.3
-"""What lies between the outermost lane and the kerb where nothing else does."""
+"""What lies between the outermost lane and the road edge where nothing else does."""
 NOBODY = "nobody"
 """User of strips of the road that are no lanes."""
 DRIVERS = "drivers"

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from infgen.geometry import to_local
-from infgen.sources.towns.road_users import MOTOR_SHARES, Body, draw_size
+from infgen.sources.towns.road_users import MOTOR_SHARES, BodyType, draw_size
 from infgen.sources.towns.streets import curves
 from infgen.sources.towns.streets.boxes import Boxes, meet
 from infgen.sources.towns.streets.curves import Points
@@ -15,7 +15,7 @@ from infgen.sources.towns.streets.network import Edge
 from infgen.sources.towns.streets.street_types import Rank, Street
 
 CLEAR_M = 1.0
-"""Nothing stands nearer to a kerb, but what is parked along it."""
+"""Nothing stands nearer to a road edge, but what is parked along it."""
 _STALL_M = 2.75
 """Width of a stall in a parking lot."""
 _AISLE_M = 11.5
@@ -27,7 +27,7 @@ _LARGEST_M = 40.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plenty:
+class SurroundingsDensity:
     """How much stands beside the roads of a town.
 
     Attributes:
@@ -54,10 +54,10 @@ class Plot:
     pavement_m: float
 
 
-def draw_plenty(rng: np.random.Generator) -> Plenty:
+def draw_plenty(rng: np.random.Generator) -> SurroundingsDensity:
     """Draw how much stands beside the roads."""
     lots, houses, blocks, _ = rng.dirichlet([1.2, 4.0, 3.0, 2.0])
-    return Plenty(
+    return SurroundingsDensity(
         lots=float(lots),
         houses=float(houses),
         blocks=float(blocks),
@@ -112,7 +112,7 @@ class Site:
 def cut_plots(
     edge: Edge, street: Street, rng: np.random.Generator
 ) -> Iterator[tuple[float, Plot]]:
-    """Cut the land on the right of an edge into plots, with their middle along the kerb."""
+    """Cut the land right of a street into plots; each has its middle on the road edge."""
     kerb_m = edge.kerb()
     total_m = curves.length(kerb_m)
     heading_rad, known_m = curves.headings(kerb_m), curves.arc_lengths(kerb_m)
@@ -130,7 +130,7 @@ def cut_plots(
 
 
 def build_on(
-    plot: Plot, plenty: Plenty, site: Site, rng: np.random.Generator
+    plot: Plot, plenty: SurroundingsDensity, site: Site, rng: np.random.Generator
 ) -> Points | None:
     """Build on a plot; return the outline of its driveway, if it has one."""
     drawn = rng.random()
@@ -152,7 +152,7 @@ def _wall(plot: Plot, left_m: float, back_m: float, size_m: tuple[float, float])
 
 
 def _at(plot: Plot, away_m: float, left_m: float, turn_rad: float) -> np.ndarray:
-    """Pose on a plot: so far away from the kerb, so far left of its middle."""
+    """Pose on a plot: so far away from the road edge, so far left of its middle."""
     x_m, y_m, facing_rad = plot.pose
     cos, sin = np.cos(facing_rad), np.sin(facing_rad)
     return np.array(
@@ -177,7 +177,7 @@ def _build_house(
     away_m = plot.pavement_m + 0.6
     for _ in range(2):
         if rng.random() < taken:
-            length_m, width_m, height_m = draw_size(Body.CAR, rng)
+            length_m, width_m, height_m = draw_size(BodyType.CAR, rng)
             turn_rad = float(rng.choice([0.0, np.pi])) + float(rng.normal(0.0, 0.03))
             left_m = drive_m + float(rng.normal(0.0, 0.12))
             pose = _at(plot, away_m + length_m / 2, left_m, turn_rad)
@@ -209,9 +209,9 @@ def _park_lot(
     return _driveway(plot, float(rng.uniform(-0.3, 0.3)) * plot.wide_m, 6.0)
 
 
-def _parked_body(rng: np.random.Generator) -> Body:
+def _parked_body(rng: np.random.Generator) -> BodyType:
     """Mostly cars, now and then a van."""
-    return Body.VAN if rng.random() < MOTOR_SHARES[Body.VAN] else Body.CAR
+    return BodyType.VAN if rng.random() < MOTOR_SHARES[BodyType.VAN] else BodyType.CAR
 
 
 def _driveway(plot: Plot, left_m: float, wide_m: float) -> Points:

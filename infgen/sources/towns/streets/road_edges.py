@@ -1,8 +1,8 @@
-"""Where the road ends: kerbs around blocks and islands, the road on their left.
+"""Where the road ends: road edges around blocks and islands, the road on their left.
 
 Around every junction stand arms, each a street with its two directions or a one-way edge.
-The kerb comes in along the right of one arm and goes out along the right of the next arm
-counter-clockwise; between the two it rounds the corner.
+The road edge comes in along the right of one arm and goes out along the right of the next
+arm counter-clockwise; between the two it rounds the corner.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ LEAST_ISLAND_M = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Kerb:
+class RoadEdge:
     """One road edge."""
 
     kind: RoadEdgeType
@@ -30,14 +30,14 @@ class Kerb:
 
 @dataclass(frozen=True, slots=True)
 class _Arm:
-    """A street at a junction: its kerb towards the junction, and away from it."""
+    """A street at a junction: its road edge towards the junction, and away from it."""
 
     bearing_rad: float
     coming_m: Points
     going_m: Points
 
 
-def draw_kerbs(network: Network) -> Iterator[Kerb]:
+def draw_road_edges(network: Network) -> Iterator[RoadEdge]:
     """Draw all road edges of a town."""
     arms: dict[str, list[_Arm]] = {name: [] for name in network.places_m}
     for edge in network.edges.values():
@@ -57,7 +57,7 @@ def reverse_of(edge: str) -> str:
     return edge[:-1] + {"f": "b", "b": "f"}.get(edge[-1], "")
 
 
-def _arm(going: Edge | None, coming: Edge | None, place_m: tuple[float, float]) -> _Arm:
+def _arm(going: Edge | None, coming: Edge | None, position_m: tuple[float, float]) -> _Arm:
     """Make the arm of an edge that goes out, one that comes in, or both."""
     if going is not None and coming is not None:
         out_m, in_m = going.kerb(), coming.kerb()
@@ -66,26 +66,26 @@ def _arm(going: Edge | None, coming: Edge | None, place_m: tuple[float, float]) 
     else:
         assert coming is not None
         out_m, in_m = coming.middle()[::-1], coming.kerb()
-    x_m, y_m = (out_m[0] + in_m[-1]) / 2 - np.array(place_m)
+    x_m, y_m = (out_m[0] + in_m[-1]) / 2 - np.array(position_m)
     return _Arm(float(np.arctan2(y_m, x_m)), in_m, out_m)
 
 
-def _corners(arms: list[_Arm]) -> Iterator[Kerb]:
-    """Draw every kerb that comes in, and the corner it rounds."""
+def _corners(arms: list[_Arm]) -> Iterator[RoadEdge]:
+    """Draw every road edge that comes in, and the corner it rounds."""
     for at, arm in enumerate(arms):
         following = arms[(at + 1) % len(arms)]
-        if following is arm:  # The street ends here, and so do its kerbs.
-            yield Kerb(RoadEdgeType.BOUNDARY, arm.coming_m)
+        if following is arm:  # The street ends here, and so do its road edges.
+            yield RoadEdge(RoadEdgeType.BOUNDARY, arm.coming_m)
             return
         start, end = curves.end_pose(arm.coming_m), curves.start_pose(following.going_m)
         if np.linalg.norm(end[:2] - start[:2]) > CORNER_SPACING_M:
             corner_m = curves.join(start, end, CORNER_SPACING_M)
-            yield Kerb(RoadEdgeType.BOUNDARY, curves.chain(arm.coming_m, corner_m))
+            yield RoadEdge(RoadEdgeType.BOUNDARY, curves.chain(arm.coming_m, corner_m))
         else:
-            yield Kerb(RoadEdgeType.BOUNDARY, arm.coming_m)
+            yield RoadEdge(RoadEdgeType.BOUNDARY, arm.coming_m)
 
 
-def _islands(network: Network) -> Iterator[Kerb]:
+def _islands(network: Network) -> Iterator[RoadEdge]:
     """Draw the islands between the directions of streets, as closed lines."""
     for edge in network.edges.values():
         back = network.edges.get(reverse_of(edge.name))
@@ -94,4 +94,4 @@ def _islands(network: Network) -> Iterator[Kerb]:
         if edge.inner.use is Use.NOBODY and edge.inner.width_m > LEAST_ISLAND_M:
             sides_m = [each.inner.border(-each.inner.width_m / 2) for each in (edge, back)]
             outline_m = curves.chain(*(side_m[::-1] for side_m in sides_m))
-            yield Kerb(RoadEdgeType.MEDIAN, np.concatenate([outline_m, outline_m[:1]]))
+            yield RoadEdge(RoadEdgeType.MEDIAN, np.concatenate([outline_m, outline_m[:1]]))

@@ -16,7 +16,7 @@ from infgen.scene import (
 from infgen.sources.towns.streets.curves import Points, resample
 from infgen.sources.towns.streets.markings import Line, Sign
 from infgen.sources.towns.streets.network import Connector, Lane, Network, Use
-from infgen.sources.towns.streets.road_edges import Kerb
+from infgen.sources.towns.streets.road_edges import RoadEdge
 from infgen.sources.towns.streets.street_types import MPS_PER_MPH
 
 SPACING_M = 1.0
@@ -28,7 +28,7 @@ class Furniture:
 
     Attributes:
         lines: Painted lines.
-        kerbs: Road edges.
+        road_edges: Road edges.
         crosswalks: Outlines.
         driveways: Outlines.
         bumps: Outlines of speed bumps.
@@ -36,7 +36,7 @@ class Furniture:
     """
 
     lines: Sequence[Line]
-    kerbs: Sequence[Kerb]
+    road_edges: Sequence[RoadEdge]
     crosswalks: Sequence[Points]
     driveways: Sequence[Points]
     bumps: Sequence[Points]
@@ -79,7 +79,7 @@ def draw_map(network: Network, furniture: Furniture) -> tuple[RoadMap, dict[str,
         tables.add(FeatureType.ROAD_LINE, resample(line.xy_m, SPACING_M), line.kind)
         for line in furniture.lines
     ]
-    for kerb in furniture.kerbs:
+    for kerb in furniture.road_edges:
         tables.add(FeatureType.ROAD_EDGE, resample(kerb.xy_m, SPACING_M), kerb.kind)
     for outlines, kind in (
         (furniture.crosswalks, FeatureType.CROSSWALK),

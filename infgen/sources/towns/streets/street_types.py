@@ -1,4 +1,4 @@
-"""Kinds of streets: how wide, how fast, and what lies between the lanes and the kerb."""
+"""Street types: widths, speed limits, and what lies between the lanes and the road edge."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -27,8 +27,8 @@ class Street:
         limit_mph: Speed limit.
         median_m: Half of the island between the directions; 0 without one.
         bike_m: Bicycle lane; 0 without one.
-        parking_m: Room for parked cars along the kerb; 0 without any.
-        pavement_m: Pavement beyond the kerb.
+        parking_m: Room for parked cars along the road edge; 0 without any.
+        pavement_m: Pavement beyond the road edge.
         lined: Whether opposite lanes are kept apart by a painted line.
         taken: Share of the parking room that is taken.
     """
@@ -51,7 +51,7 @@ class Street:
 
     @property
     def half_m(self) -> float:
-        """From the middle of the street to the kerb."""
+        """From the middle of the street to the road edge."""
         lanes_m = self.num_lanes * self.lane_m
         return self.median_m + lanes_m + self.bike_m + self.parking_m
 

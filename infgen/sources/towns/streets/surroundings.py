@@ -6,12 +6,17 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from infgen.scene import AgentType
-from infgen.sources.towns.road_users import Body, draw_size
+from infgen.sources.towns.road_users import BodyType, draw_size
 from infgen.sources.towns.streets import curves
 from infgen.sources.towns.streets.boxes import Boxes
 from infgen.sources.towns.streets.curves import Points
 from infgen.sources.towns.streets.network import Edge, Network, Use
-from infgen.sources.towns.streets.plots import Plenty, Site, build_on, cut_plots
+from infgen.sources.towns.streets.plots import (
+    Site,
+    SurroundingsDensity,
+    build_on,
+    cut_plots,
+)
 from infgen.sources.towns.streets.street_types import Street
 
 _KERB_SPACING_M = 3.0
@@ -28,7 +33,7 @@ class Surroundings:
         walls: Buildings.
         parked: Cars, vans and trucks without a driver.
         people: Who stands on the pavement.
-        driveways: Outlines, from the kerb to the plot.
+        driveways: Outlines, from the road edge to the plot.
     """
 
     walls: Boxes
@@ -38,7 +43,10 @@ class Surroundings:
 
 
 def surround(
-    network: Network, streets: dict[str, Street], plenty: Plenty, rng: np.random.Generator
+    network: Network,
+    streets: dict[str, Street],
+    plenty: SurroundingsDensity,
+    rng: np.random.Generator,
 ) -> Surroundings:
     """Build on the plots along all streets, and park cars."""
     kerbs_m = [
@@ -73,7 +81,7 @@ def surround(
 def _along_kerb(
     edge: Edge, street: Street, openings_m: list[float], rng: np.random.Generator
 ) -> Boxes:
-    """Park cars along a kerb where there is room for them, driveways left free."""
+    """Park cars along a road edge where there is room for them, driveways left free."""
     strip = edge.outer
     length_m = curves.length(strip.xy_m)
     if street.parking_m <= 0 or strip.use is not Use.NOBODY:
@@ -87,7 +95,7 @@ def _along_kerb(
             along_rad = float(np.interp(at_m, known_m, heading_rad))
             aside_m = float(np.clip(rng.normal(-0.05, 0.08), -0.2, 0.1))
             size_m = np.minimum(
-                draw_size(Body.CAR, rng), [5.6, street.parking_m - 0.1, 9.0]
+                draw_size(BodyType.CAR, rng), [5.6, street.parking_m - 0.1, 9.0]
             )
             rows.append(
                 [
@@ -113,7 +121,7 @@ def _on_pavement(edge: Edge, per_km: float, rng: np.random.Generator) -> Boxes:
         for _ in range(int(rng.choice([1, 2, 3], p=[0.65, 0.25, 0.1]))):
             shift_m = rng.uniform(-1.3, 1.3, 2)
             heading_rad = float(rng.uniform(-np.pi, np.pi))
-            size_m = draw_size(Body.WALKER, rng)
+            size_m = draw_size(BodyType.WALKER, rng)
             rows.append([x_m + shift_m[0], y_m + shift_m[1], heading_rad, *size_m])
     return np.array(rows).reshape(-1, 6)
 

@@ -8,8 +8,8 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from infgen.sources.towns.road_users import (
-    Body,
-    Person,
+    BodyType,
+    RoadUser,
     draw_cyclist,
     draw_motorist,
     draw_walker,
@@ -54,7 +54,7 @@ class Trip:
         anywhere: Whether they begin anywhere on the first edge, not at its start.
     """
 
-    person: Person
+    person: RoadUser
     depart_s: float
     route: list[str]
     anywhere: bool
@@ -62,7 +62,7 @@ class Trip:
     @property
     def drives(self) -> bool:
         """Whether they go by vehicle or bicycle."""
-        return self.person.body is not Body.WALKER
+        return self.person.body is not BodyType.WALKER
 
 
 def draw_level(rng: np.random.Generator) -> Level:
@@ -83,7 +83,7 @@ def draw_trips(
     reach_m = FASTEST_MPS * seconds
     driving, cycling = (find_ways(network, cycling=each) for each in (False, True))
     trips = [
-        Trip(draw_motorist_of(Body.CAR, rng), 0.0, route, anywhere=True)
+        Trip(draw_motorist_of(BodyType.CAR, rng), 0.0, route, anywhere=True)
         for route in _wanderings(driving, reach_m, rng)
     ]
     share = level.cyclists / 100.0
@@ -108,7 +108,7 @@ def draw_trips(
     return sorted(trips, key=lambda trip: trip.depart_s)
 
 
-def draw_motorist_of(body: Body, rng: np.random.Generator) -> Person:
+def draw_motorist_of(body: BodyType, rng: np.random.Generator) -> RoadUser:
     """Draw a driver of a kind of vehicle."""
     while True:
         person = draw_motorist(rng)
@@ -159,7 +159,7 @@ def write_routes(trips: list[Trip], path: Path) -> None:
     ElementTree.ElementTree(root).write(path)
 
 
-def _write_type(root: Element, name: str, person: Person) -> None:
+def _write_type(root: Element, name: str, person: RoadUser) -> None:
     length_m, width_m, height_m = person.size_lwh_m
     about = {
         "id": name,
@@ -168,15 +168,15 @@ def _write_type(root: Element, name: str, person: Person) -> None:
         "width": f"{width_m:.3f}",
         "height": f"{height_m:.3f}",
     }
-    if person.body is Body.WALKER:
+    if person.body is BodyType.WALKER:
         about |= {"maxSpeed": f"{person.haste:.3f}", "speedDev": "0"}
     else:
         about |= _driving(person)
     SubElement(root, "vType", about)
 
 
-def _driving(person: Person) -> dict[str, str]:
-    cycling = person.body is Body.BICYCLE
+def _driving(person: RoadUser) -> dict[str, str]:
+    cycling = person.body is BodyType.BICYCLE
     limits = (
         {"maxSpeed": f"{person.haste:.3f}", "speedDev": "0"}
         if cycling

@@ -13,14 +13,14 @@ import pytest
 import torch
 
 from infgen.model.batching.perturbation import make_perturbation
-from infgen.model.tensors import map_tensors
+from infgen.model.batching.tensors import map_tensors
 from pipeline.stages.train.loader import (
     TokenScenes,
     draw_of_step,
-    held_out_batches,
     train_batches,
+    validation_batches,
 )
-from pipeline.stages.train.process_group import Team
+from pipeline.stages.train.process_group import ProcessGroup
 
 
 def numbers(parts):
@@ -43,8 +43,8 @@ def test_every_step_and_seed_has_its_own_draw():
     assert len(draws) == 2500
 
 
-def test_the_batch_of_a_step_does_not_depend_on_where_training_began(course):
-    recipe = course.recipe(Team())
+def test_the_batch_of_a_step_does_not_depend_on_where_training_began(setup):
+    recipe = setup.recipe(ProcessGroup())
     from_start = list(train_batches(recipe, range(5), 0))
     from_three = list(train_batches(recipe, range(3, 5), 0))
 
@@ -53,8 +53,8 @@ def test_the_batch_of_a_step_does_not_depend_on_where_training_began(course):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_the_batch_of_a_step_does_not_depend_on_who_makes_it(course, workers):
-    recipe = course.recipe(Team())
+def test_the_batch_of_a_step_does_not_depend_on_who_makes_it(setup, workers):
+    recipe = setup.recipe(ProcessGroup())
 
     by_thread = list(train_batches(recipe, range(5), 0))
     by_workers = list(train_batches(recipe, range(5), workers))
@@ -66,10 +66,10 @@ def test_the_batch_of_a_step_does_not_depend_on_who_makes_it(course, workers):
 
 @pytest.mark.parametrize("workers", [0, 1])
 def test_noise_is_the_same_whoever_makes_it_and_never_in_held_out_scenes(
-    course, books, workers
+    setup, books, workers
 ):
-    recipe = course.recipe(Team())
-    noise = make_perturbation(replace(course.train, motion_noise_neighbours=3), *books)
+    recipe = setup.recipe(ProcessGroup())
+    noise = make_perturbation(replace(setup.train, motion_noise_neighbours=3), *books)
     noisy = replace(recipe, noise=noise)
 
     made = list(train_batches(noisy, range(3), workers))
@@ -79,42 +79,44 @@ def test_noise_is_the_same_whoever_makes_it_and_never_in_held_out_scenes(
         logged = recipe[step][0].agents
         assert torch.equal(logged.presence, parts[0].agents.presence)
         assert not torch.equal(logged.label, parts[0].agents.label)
-    (validation_split,) = held_out_batches(course.validation_split, course.limits, 9, 0, 9)
+    (validation_split,) = validation_batches(setup.validation_split, setup.limits, 9, 0, 9)
     assert torch.equal(validation_split.agents.label, validation_split.agents.move)
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_whoever_stops_early_leaves_nothing_behind(course, workers):
-    with closing(train_batches(course.recipe(Team()), range(1000), workers)) as batches:
+def test_whoever_stops_early_leaves_nothing_behind(setup, workers):
+    with closing(
+        train_batches(setup.recipe(ProcessGroup()), range(1000), workers)
+    ) as batches:
         next(batches)
 
 
-def test_an_error_while_a_batch_is_made_comes_through(course):
-    recipe = course.recipe(Team())
+def test_an_error_while_a_batch_is_made_comes_through(setup):
+    recipe = setup.recipe(ProcessGroup())
     broken = replace(recipe, order=replace(recipe.order, size=np.zeros((9, 2), int)))
 
     with pytest.raises(IndexError, match="of 3"):
         list(train_batches(broken, range(4), 0))
 
 
-def test_parts_of_a_batch_are_together_the_batch(course):
-    how = replace(course.train, batch_scenes=3, gradient_accumulation=1)
-    wide = replace(course, train=how).recipe(Team())
+def test_parts_of_a_batch_are_together_the_batch(setup):
+    how = replace(setup.train, batch_scenes=3, gradient_accumulation=1)
+    wide = replace(setup, train=how).recipe(ProcessGroup())
     parts = [
-        replace(course, train=how).recipe(Team(rank, 3))[7][0].scenario_ids
+        replace(setup, train=how).recipe(ProcessGroup(rank, 3))[7][0].scenario_ids
         for rank in range(3)
     ]
 
     assert sum(parts, ()) == wide[7][0].scenario_ids
-    own = replace(course, train=replace(how, gradient_accumulation=3)).recipe(Team())
+    own = replace(setup, train=replace(how, gradient_accumulation=3)).recipe(ProcessGroup())
     assert [part.scenario_ids for part in own[7]] == parts
 
 
-def test_held_out_batches_are_the_same_each_time_and_no_more_than_asked_for(course):
+def test_held_out_batches_are_the_same_each_time_and_no_more_than_asked_for(setup):
     first, again = (
         [
             b.scenario_ids
-            for b in held_out_batches(course.validation_split, course.limits, 2, 0, 3)
+            for b in validation_batches(setup.validation_split, setup.limits, 2, 0, 3)
         ]
         for _ in range(2)
     )
@@ -137,9 +139,9 @@ OVER_MANY_SHARDS = """
 import json, os, resource, sys
 from pathlib import Path
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
-from infgen.model.tensors import map_tensors
-from pipeline.stages.train.setup import Course
-from pipeline.stages.train.process_group import Team
+from infgen.model.batching.tensors import map_tensors
+from pipeline.stages.train.setup import TrainingSetup
+from pipeline.stages.train.process_group import ProcessGroup
 from pipeline.stages.train.loader import TokenScenes, train_batches
 
 def main():
@@ -147,9 +149,9 @@ def main():
     scenes = TokenScenes([shards] * count)
     grid = TokenSettings(grid_radius_m=60.0, grid_cell_m=4.0)
     how = TrainSettings(batch_scenes=3 * count)
-    recipe = Course(ModelSettings(), how, grid, scenes, [], shards).recipe(Team())
-    ids = [parts[0].scenario_ids for parts in train_batches(recipe, range(2), workers)]
-    maps = Path("/proc/self/maps").read_text()
+    recipe = TrainingSetup(ModelSettings(), how, grid, scenes, [],
+    shards).recipe(ProcessGroup()) ids = [parts[0].scenario_ids for parts in
+    train_batches(recipe, range(2), workers)] maps = Path("/proc/self/maps").read_text()
     print(json.dumps([ids, len(os.listdir("/proc/self/fd")), str(shards) in maps]))
 
 if __name__ == "__main__":
@@ -181,9 +183,9 @@ def test_there_may_be_more_shards_than_files_that_may_be_open(shards, tmp_path, 
     assert not mapped
 
 
-def test_sizes_are_known_without_reading_scenes(shards, course):
+def test_sizes_are_known_without_reading_scenes(shards, setup):
     scenes = TokenScenes([shards / "training", shards / "validation"])
-    limits = replace(course.limits, roads=30, tokens=10)
+    limits = replace(setup.limits, roads=30, tokens=10)
 
     expected = [(s.num_agents * min(s.num_tokens, 10), 30) for s in scenes]
 

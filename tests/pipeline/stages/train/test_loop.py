@@ -33,32 +33,32 @@ def spoilt(monkeypatch):
 
 
 def test_a_loss_that_is_not_finite_names_its_terms_and_scenes_and_keeps_the_weights(
-    course, books, quiet, spoilt
+    setup, books, quiet, spoilt
 ):
-    training = begin(course, *books)
+    training = begin(setup, *books)
     spoilt(step=3)
 
     with pytest.raises(
         TrainingError, match=r"step 3: .*\(motion, .*training-\d, training-\d"
     ):
-        train(course, training, quiet)
+        train(setup, training, quiet)
 
-    other = begin(course, *books)
-    assert load_checkpoint(course.folder, other) == 3
+    other = begin(setup, *books)
+    assert load_checkpoint(setup.folder, other) == 3
     assert all(torch.isfinite(p).all() for p in other.network.parameters())
 
 
 def test_only_the_scenes_of_the_part_that_is_not_finite_are_named(
-    course, books, quiet, spoilt
+    setup, books, quiet, spoilt
 ):
-    course = replace(course, train=replace(course.train, gradient_accumulation=2, steps=1))
+    setup = replace(setup, train=replace(setup.train, gradient_accumulation=2, steps=1))
     spoilt(step=0, part=1)
 
     with pytest.raises(TrainingError, match=r"its scenes: training-\d$"):
-        train(course, begin(course, *books), quiet)
+        train(setup, begin(setup, *books), quiet)
 
 
-def test_noise_is_learned_from_if_it_is_asked_for(course, books, quiet, monkeypatch):
+def test_noise_is_learned_from_if_it_is_asked_for(setup, books, quiet, monkeypatch):
     given = []
 
     def batches(recipe, *others):
@@ -66,44 +66,44 @@ def test_noise_is_learned_from_if_it_is_asked_for(course, books, quiet, monkeypa
         return train_batches(recipe, *others)
 
     monkeypatch.setattr("pipeline.stages.train.loop.train_batches", batches)
-    how = replace(course.train, steps=1, motion_noise_neighbours=3)
+    how = replace(setup.train, steps=1, motion_noise_neighbours=3)
 
-    train(replace(course, train=how), begin(course, *books), quiet)
+    train(replace(setup, train=how), begin(setup, *books), quiet)
 
     assert given[0].moves == 3
     assert given[0].table.vocabulary.num_motion_tokens == books[0].num_motion_tokens
 
 
-def test_no_scenes_to_train_on_is_said(course, books, quiet):
-    empty = replace(course, scenes=TokenScenes([]))
+def test_no_scenes_to_train_on_is_said(setup, books, quiet):
+    empty = replace(setup, scenes=TokenScenes([]))
 
     with pytest.raises(TrainingError, match="no scenes of split 'training'"):
-        train(empty, begin(course, *books), quiet)
+        train(empty, begin(setup, *books), quiet)
 
 
-def test_who_does_no_steps_needs_no_scenes_to_train_on(course, books, quiet):
-    idle = replace(course, scenes=TokenScenes([]), train=replace(course.train, steps=0))
+def test_who_does_no_steps_needs_no_scenes_to_train_on(setup, books, quiet):
+    idle = replace(setup, scenes=TokenScenes([]), train=replace(setup.train, steps=0))
 
     found = train(idle, begin(idle, *books), quiet)
 
     assert found.validation
 
 
-def test_without_held_out_scenes_there_is_no_validation(course, books, quiet):
-    found = train(replace(course, validation_split=[]), begin(course, *books), quiet)
+def test_without_held_out_scenes_there_is_no_validation(setup, books, quiet):
+    found = train(replace(setup, validation_split=[]), begin(setup, *books), quiet)
 
     assert found.validation == {}
 
 
-def test_the_loss_goes_down(course, books, quiet):
-    how = replace(course.train, steps=30, learning_rate=1e-2, label_smoothing=0.0)
+def test_the_loss_goes_down(setup, books, quiet):
+    how = replace(setup.train, steps=30, learning_rate=1e-2, label_smoothing=0.0)
     longer = replace(
-        course, train=replace(how, checkpoint_every_steps=0, validate_every_steps=0)
+        setup, train=replace(how, checkpoint_every_steps=0, validate_every_steps=0)
     )
 
     train(longer, begin(longer, *books), quiet)
 
-    lines = read_log(course.folder / "train.jsonl")[:-1]
+    lines = read_log(setup.folder / "train.jsonl")[:-1]
     motion = [line["motion"] for line in lines]
     assert len(motion) == 30
     assert np.mean(motion[-5:]) < 0.7 * np.mean(motion[:5])

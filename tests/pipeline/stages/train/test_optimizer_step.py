@@ -8,8 +8,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from infgen.config import TrainSettings
-from pipeline.stages.train.optimizer_step import Descent, learning_rate, noise_of_part
-from pipeline.stages.train.process_group import Team
+from pipeline.stages.train.optimizer_step import OptimizerStep, learning_rate, noise_of_part
+from pipeline.stages.train.process_group import ProcessGroup
 from pipeline.stages.train.setup import begin
 
 
@@ -59,34 +59,36 @@ def test_torch_takes_the_dropout_of_any_seed(seed, part, step):
 
 
 @pytest.mark.parametrize("seed", [65536, 2**63 - 1])
-def test_a_step_is_done_with_a_large_seed(course, books, seed):
-    how = replace(course.train, seed=seed)
-    large = replace(course, train=how)
-    training, recipe = begin(large, *books), large.recipe(Team())
-    descent = Descent(training, how, Team(), recipe.parts)
+def test_a_step_is_done_with_a_large_seed(setup, books, seed):
+    how = replace(setup.train, seed=seed)
+    large = replace(setup, train=how)
+    training, recipe = begin(large, *books), large.recipe(ProcessGroup())
+    optimizer_step = OptimizerStep(training, how, ProcessGroup(), recipe.parts)
 
-    stepped = descent.step(recipe[0], recipe.own, 0)
+    stepped = optimizer_step.step(recipe[0], recipe.own, 0)
 
     assert stepped.norm > 0
 
 
 @pytest.fixture
-def descend(course, books):
+def descend(setup, books):
     """``descend(accumulate, steps)`` trains on batches of four, cut into so many parts."""
 
     def go_down(accumulate, steps=2):
         how = replace(
-            course.train,
+            setup.train,
             batch_scenes=4,
             gradient_accumulation=accumulate,
             learning_rate=2e-4,
         )
-        model = replace(course.model, dropout=0.0)
-        cut = replace(course, train=how, model=model)
+        model = replace(setup.model, dropout=0.0)
+        cut = replace(setup, train=how, model=model)
         training = begin(cut, *books)
-        recipe = cut.recipe(Team())
-        descent = Descent(training, how, Team(), recipe.parts)
-        found = [descent.step(recipe[step], recipe.own, step) for step in range(steps)]
+        recipe = cut.recipe(ProcessGroup())
+        optimizer_step = OptimizerStep(training, how, ProcessGroup(), recipe.parts)
+        found = [
+            optimizer_step.step(recipe[step], recipe.own, step) for step in range(steps)
+        ]
         return training, found
 
     return go_down
@@ -111,30 +113,33 @@ def test_parts_of_a_batch_give_the_gradient_of_the_whole(descend):
             )
 
 
-def test_means_of_parts_would_not_be_the_same(course, books):
-    # Without newcomers in one part, its mean of their kinds is not half of the batch's.
+def test_means_of_parts_would_not_be_the_same(setup, books):
+    # Without inserted agents in one part, its mean of their kinds is not half of the
+    # batch's.
     recipe = replace(
-        course, train=replace(course.train, batch_scenes=2, gradient_accumulation=2)
-    ).recipe(Team())
+        setup, train=replace(setup.train, batch_scenes=2, gradient_accumulation=2)
+    ).recipe(ProcessGroup())
     one, other = recipe[0]
     counts = [float((part.entries.agent >= 0).sum()) for part in (one, other)]
     few = replace(other.entries, agent=torch.full_like(other.entries.agent, -1))
     hidden = replace(other.details, newcomer=torch.zeros_like(other.details.newcomer))
     parts = [one, replace(other, entries=few, details=hidden)]
 
-    found = Descent(begin(course, *books), course.train, Team(), 2).step(parts, range(2), 0)
+    found = OptimizerStep(begin(setup, *books), setup.train, ProcessGroup(), 2).step(
+        parts, range(2), 0
+    )
 
     assert counts[1] > 0
     assert float(found.terms["agent_type"].count) == counts[0]
     assert float(found.terms["position"].weight) == counts[0]
 
 
-def test_a_parameter_that_no_scene_reaches_has_no_gradient_but_zero(course, books):
-    how = replace(course.train, map_weight=0.0)
-    training = begin(course, *books)
-    recipe = course.recipe(Team())
+def test_a_parameter_that_no_scene_reaches_has_no_gradient_but_zero(setup, books):
+    how = replace(setup.train, map_weight=0.0)
+    training = begin(setup, *books)
+    recipe = setup.recipe(ProcessGroup())
 
-    Descent(training, how, Team(), 1).step(recipe[0], recipe.own, 0)
+    OptimizerStep(training, how, ProcessGroup(), 1).step(recipe[0], recipe.own, 0)
 
     unreached = training.network.roads.next_token[0].weight
     assert not unreached.grad.any()

@@ -15,18 +15,18 @@ from infgen.config import TrainSettings
 from infgen.model.training.losses import figures, losses
 from pipeline.stages.train.loop import train
 from pipeline.stages.train.precision import Pass
-from pipeline.stages.train.process_group import Team
+from pipeline.stages.train.process_group import ProcessGroup
 from pipeline.stages.train.setup import begin
 
 
 @pytest.fixture
-def batch(course):
-    return course.recipe(Team())[0][0]
+def batch(setup):
+    return setup.recipe(ProcessGroup())[0][0]
 
 
 @pytest.fixture
-def network(course, books):
-    sharp = replace(course, model=replace(course.model, dropout=0.0))
+def network(setup, books):
+    sharp = replace(setup, model=replace(setup.model, dropout=0.0))
     return begin(sharp, *books).network
 
 
@@ -35,7 +35,7 @@ def test_bf16_gives_nearly_the_same_losses_in_float32(network, batch):
     for precision in ("float32", "bf16"):
         how = TrainSettings(precision=precision)
         outputs = Pass(network, how)(batch)
-        assert outputs.motion.move_logits.dtype == torch.float32
+        assert outputs.motion.motion_logits.dtype == torch.float32
         terms[precision] = figures(losses(outputs, batch, how))
 
     for name in ("motion", "keep", "add", "position", "agent_type", "heading", "map"):
@@ -44,11 +44,11 @@ def test_bf16_gives_nearly_the_same_losses_in_float32(network, batch):
         assert rough != sharp, name
 
 
-def test_training_in_bf16_goes_on_to_finite_weights(course, books, quiet):
-    how = replace(course.train, precision="bf16", steps=1)
-    training = begin(course, *books)
+def test_training_in_bf16_goes_on_to_finite_weights(setup, books, quiet):
+    how = replace(setup.train, precision="bf16", steps=1)
+    training = begin(setup, *books)
 
-    found = train(replace(course, train=how), training, quiet)
+    found = train(replace(setup, train=how), training, quiet)
 
     assert found.run["bf16"]
     assert all(p.dtype == torch.float32 for p in training.network.parameters())
@@ -69,8 +69,8 @@ import json, sys, warnings
 from pathlib import Path
 import torch
 from infgen.config import *
-from pipeline.stages.train.setup import Course, begin
-from pipeline.stages.train.process_group import Team
+from pipeline.stages.train.setup import TrainingSetup, begin
+from pipeline.stages.train.process_group import ProcessGroup
 from pipeline.stages.train.loader import TokenScenes
 from pipeline.stages.train.precision import Pass
 from pipeline.stages.vocabulary import load_vocabularies
@@ -82,9 +82,9 @@ model = ModelSettings(
     dropout=0.0,
 )
 grid = TokenSettings(grid_radius_m=60.0, grid_cell_m=4.0)
-course = Course(model, TrainSettings(batch_scenes=2), grid, scenes, [], shards)
+course = TrainingSetup(model, TrainSettings(batch_scenes=2), grid, scenes, [], shards)
 network = begin(course, *load_vocabularies(shards / "vocab")).network
-batch = course.recipe(Team())[0][0]
+batch = course.recipe(ProcessGroup())[0][0]
 plain = Pass(network, TrainSettings(compile="false"))(batch)
 forward = Pass(network, TrainSettings(compile="true"))
 with warnings.catch_warnings(record=True) as told:

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from pipeline.stages.train.launch import joined
-from pipeline.stages.train.process_group import PeerError, Team
+from pipeline.stages.train.process_group import PeerError, ProcessGroup
 from pipeline.stages.train.ranks import Rank, own_rank
 from pipeline.stages.train.stage import work
 from pipeline.stages.train.train_log import read_log
@@ -181,12 +181,12 @@ def test_a_first_process_with_nothing_to_train_sends_the_others_home(start, tmp_
 def test_alone_nothing_is_added_up():
     values = torch.tensor([1.0, 2.0])
 
-    Team().add_up(values)
-    Team().check_same(7, "steps")
+    ProcessGroup().add_up(values)
+    ProcessGroup().check_same(7, "steps")
 
     assert values.tolist() == [1.0, 2.0]
-    assert Team().any(True)
-    assert not Team().any(False)
+    assert ProcessGroup().any(True)
+    assert not ProcessGroup().any(False)
 
 
 def test_without_torchrun_there_is_one_process():

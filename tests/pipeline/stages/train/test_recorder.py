@@ -9,11 +9,11 @@ import torch
 
 from infgen.errors import ConfigError
 from infgen.model.training.losses import Term
-from pipeline.stages.train.optimizer_step import Stepped
-from pipeline.stages.train.recorder import Journal
+from pipeline.stages.train.optimizer_step import StepResult
+from pipeline.stages.train.recorder import TrainingRecorder
 from pipeline.stages.train.setup import begin
 from pipeline.stages.train.tensorboard import EventFiles
-from pipeline.stages.train.throughput import Pace
+from pipeline.stages.train.throughput import ThroughputMeter
 from pipeline.storage.checkpoint import POINTER
 
 
@@ -21,60 +21,60 @@ from pipeline.storage.checkpoint import POINTER
 def stepped():
     one = torch.ones(())
     terms = {"motion": Term(*(one * n for n in (6.0, 3.0, 2.0, 1.0, 0.0)))}
-    return Stepped(terms, 0.5, torch.tensor([2 * 1.3862944, 2.0]))
+    return StepResult(terms, 0.5, torch.tensor([2 * 1.3862944, 2.0]))
 
 
 @pytest.fixture
-def journal(course, books, quiet):
+def recorder(setup, books, quiet):
     """``journal(first=0, progress, **settings)`` of a network that stays as it is."""
 
     def open_at(first=0, progress=quiet, **changes):
-        changed = replace(course, train=replace(course.train, **changes))
-        return Journal(changed, begin(changed, *books), first, progress)
+        changed = replace(setup, train=replace(setup.train, **changes))
+        return TrainingRecorder(changed, begin(changed, *books), first, progress)
 
     return open_at
 
 
-def saved(course):
-    pointer = course.folder / POINTER
+def saved(setup):
+    pointer = setup.folder / POINTER
     return json.loads(pointer.read_text())["step"] if pointer.exists() else None
 
 
-def test_checkpoints_come_by_steps(journal, course, stepped):
-    with journal(checkpoint_every_steps=2, checkpoint_minutes=0.0) as kept:
+def test_checkpoints_come_by_steps(recorder, setup, stepped):
+    with recorder(checkpoint_every_steps=2, checkpoint_minutes=0.0) as kept:
         found = []
         for done in (1, 2, 3):
             kept.add(done, stepped)
             kept.keep_up(stepped)
-            found.append(saved(course))
+            found.append(saved(setup))
 
     assert found == [None, 2, 2]
 
 
-def test_checkpoints_come_by_time(journal, course, stepped):
-    with journal(checkpoint_every_steps=0, checkpoint_minutes=1e-9) as kept:
+def test_checkpoints_come_by_time(recorder, setup, stepped):
+    with recorder(checkpoint_every_steps=0, checkpoint_minutes=1e-9) as kept:
         for done in (1, 2):
             kept.add(done, stepped)
             kept.keep_up(stepped)
-            assert saved(course) == done
+            assert saved(setup) == done
 
 
-def test_checkpoints_need_not_come_at_all(journal, course, stepped):
-    with journal(checkpoint_every_steps=0, checkpoint_minutes=0.0) as kept:
+def test_checkpoints_need_not_come_at_all(recorder, setup, stepped):
+    with recorder(checkpoint_every_steps=0, checkpoint_minutes=0.0) as kept:
         kept.add(1, stepped)
         kept.keep_up(stepped)
 
-    assert saved(course) is None
+    assert saved(setup) is None
 
 
-def test_progress_tells_loss_speed_and_memory(journal, stepped, monkeypatch):
+def test_progress_tells_loss_speed_and_memory(recorder, stepped, monkeypatch):
     monkeypatch.setattr("pipeline.stages.train.throughput.TELL_EVERY_S", 0.0)
     told = []
 
     def tell(done, total, note=""):
         told.append((done, total, note))
 
-    with journal(progress=tell) as kept:
+    with recorder(progress=tell) as kept:
         kept.add(1, stepped)
         kept.keep_up(stepped)
 
@@ -91,22 +91,22 @@ def test_perplexity_is_that_of_the_mean_surprise(stepped):
 def test_pace_is_measured_since_it_was_told_last(tmp_path, monkeypatch):
     now = [10.0]
     monkeypatch.setattr("pipeline.stages.train.throughput.time.monotonic", lambda: now[0])
-    pace = Pace(tmp_path / "pace.jsonl", steps=100, first=5, scenes=4)
+    throughput = ThroughputMeter(tmp_path / "pace.jsonl", steps=100, first=5, scenes=4)
     told = []
 
     def tell(done, total, note=""):
         told.append(note)
 
     now[0] = 12.0
-    assert pace.note(10)["scenes_per_s"] == 10.0  # 20 scenes in 2 s
+    assert throughput.note(10)["scenes_per_s"] == 10.0  # 20 scenes in 2 s
     now[0] = 16.0
-    assert pace.due(11)
-    pace.tell(11, 1.5, tell)
+    assert throughput.due(11)
+    throughput.tell(11, 1.5, tell)
     assert told[0].startswith("loss 1.500, 4 scenes/s")  # 24 scenes in 6 s
-    assert not pace.due(12)
-    assert pace.due(100)
+    assert not throughput.due(12)
+    assert throughput.due(100)
     now[0] = 20.0
-    assert pace.overall(30) == 10.0  # 100 scenes in 10 s
+    assert throughput.overall(30) == 10.0  # 100 scenes in 10 s
 
 
 def test_event_files_hold_every_number_once(tmp_path):
@@ -127,12 +127,12 @@ def test_event_files_hold_every_number_once(tmp_path):
     assert found == {"train/motion": (4, 1.5), "run/scenes_per_s": (4, 2.0)}
 
 
-def test_a_run_writes_event_files_where_it_is_asked_to(journal, course, stepped):
+def test_a_run_writes_event_files_where_it_is_asked_to(recorder, setup, stepped):
     pytest.importorskip("tensorboardX")
-    with journal(tensorboard=True) as kept:
+    with recorder(tensorboard=True) as kept:
         kept.add(1, stepped)
 
-    assert len(list((course.folder / "run" / "tensorboard").iterdir())) == 1
+    assert len(list((setup.folder / "run" / "tensorboard").iterdir())) == 1
 
 
 def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.stages.train.sampler import Order
+from pipeline.stages.train.sampler import ScenePermutation
 
 
 def order(sizes, batch=3, pool=1, seed=5):
@@ -13,7 +13,7 @@ def order(sizes, batch=3, pool=1, seed=5):
     sizes = np.asarray(sizes, np.int64)
     if sizes.ndim == 1:
         sizes = np.column_stack([0 * sizes, sizes])
-    return Order(sizes, batch, pool, seed)
+    return ScenePermutation(sizes, batch, pool, seed)
 
 
 @given(

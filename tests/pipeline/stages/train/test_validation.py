@@ -13,9 +13,9 @@ from pipeline.stages.train.validation import validate
 
 
 @pytest.fixture
-def found(course, books):
-    training = begin(course, *books)
-    return validate(course, training, Pass(training.network, course.train))
+def found(setup, books):
+    training = begin(setup, *books)
+    return validate(setup, training, Pass(training.network, setup.train))
 
 
 @pytest.mark.parametrize("name", ["keep", "add"])
@@ -34,8 +34,8 @@ def test_fresh_weights_are_about_as_perplexed_as_there_are_moves(found, metre_mo
     assert 0.5 < found["motion_perplexity"] / metre_moves.num_motion_tokens < 2.5
 
 
-def test_smaller_parts_find_the_same(course, books, found):
-    alone = replace(course, train=replace(course.train, gradient_accumulation=2))
+def test_smaller_parts_find_the_same(setup, books, found):
+    alone = replace(setup, train=replace(setup.train, gradient_accumulation=2))
     training = begin(alone, *books)
 
     again = validate(alone, training, Pass(training.network, alone.train))
@@ -45,19 +45,19 @@ def test_smaller_parts_find_the_same(course, books, found):
             assert again[name] == pytest.approx(value, rel=1e-4), name
 
 
-def test_the_log_holds_all_of_it(course, books, quiet):
-    trained = train(course, begin(course, *books), quiet)
+def test_the_log_holds_all_of_it(setup, books, quiet):
+    trained = train(setup, begin(setup, *books), quiet)
 
-    lines = read_log(course.folder / "train.jsonl")
+    lines = read_log(setup.folder / "train.jsonl")
     assert lines[-1] == {"step": 6, "validation": trained.validation}
 
 
-def test_scenes_are_played_before_they_are_learned_from(course, books, quiet):
-    how = replace(course.train, steps=2, closed_loop_top_k=4, checkpoint_every_steps=0)
-    played = replace(course, train=how)
+def test_scenes_are_played_before_they_are_learned_from(setup, books, quiet):
+    how = replace(setup.train, steps=2, closed_loop_top_k=4, checkpoint_every_steps=0)
+    played = replace(setup, train=how)
 
     train(played, begin(played, *books), quiet)
 
-    lines = read_log(course.folder / "train.jsonl")
+    lines = read_log(setup.folder / "train.jsonl")
     assert lines[0]["motion_count"] > 0
     assert lines[0]["motion"] < 10

@@ -10,7 +10,7 @@ from infgen.scene import AgentType, FeatureType, SignalState
 from infgen.sources.towns.recording.scenes import NOW, Place, record
 from infgen.sources.towns.recording.signals import SEEN_M, draw_signals
 from infgen.sources.towns.recording.viewpoints import View, draw_views
-from infgen.sources.towns.streets.road_edges import draw_kerbs
+from infgen.sources.towns.streets.road_edges import draw_road_edges
 from infgen.sources.towns.streets.road_map import Furniture, draw_map
 from infgen.sources.towns.streets.surroundings import Surroundings
 from infgen.sources.towns.town import Town, stream
@@ -30,7 +30,7 @@ def town(crossing):
     pose[1, :, :2] = (-20.0, 4.5)
     velocity_mps = np.zeros((2, STEPS, 2))
     velocity_mps[0, :, 0] = 60.0 / (0.1 * (STEPS - 1))
-    furniture = Furniture([], list(draw_kerbs(crossing)), [], [], [], [])
+    furniture = Furniture([], list(draw_road_edges(crossing)), [], [], [], [])
     road_map, lane_ids = draw_map(crossing, furniture)
     return Town(
         network=crossing,

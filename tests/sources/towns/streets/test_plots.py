@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from infgen.geometry import box_corners
 from infgen.sources.towns.streets.boxes import clear_way, meet
-from infgen.sources.towns.streets.plots import Plenty, Plot, Site, build_on
+from infgen.sources.towns.streets.plots import Plot, Site, SurroundingsDensity, build_on
 from infgen.sources.towns.streets.street_types import Rank, Street
 from infgen.sources.towns.streets.surroundings import surround
 
@@ -17,9 +17,15 @@ STREETS = {
     for link in (1, 3)
     for way in "fb"
 }
-ALL_LOTS = Plenty(lots=1.0, houses=0.0, blocks=0.0, taken=1.0, people_per_km=0.0)
-ALL_HOUSES = Plenty(lots=0.0, houses=1.0, blocks=0.0, taken=1.0, people_per_km=0.0)
-ALL_BLOCKS = Plenty(lots=0.0, houses=0.0, blocks=1.0, taken=1.0, people_per_km=0.0)
+ALL_LOTS = SurroundingsDensity(
+    lots=1.0, houses=0.0, blocks=0.0, taken=1.0, people_per_km=0.0
+)
+ALL_HOUSES = SurroundingsDensity(
+    lots=0.0, houses=1.0, blocks=0.0, taken=1.0, people_per_km=0.0
+)
+ALL_BLOCKS = SurroundingsDensity(
+    lots=0.0, houses=0.0, blocks=1.0, taken=1.0, people_per_km=0.0
+)
 
 
 def box(x_m, y_m, heading_rad=0.0, length_m=4.0, width_m=2.0):
@@ -112,7 +118,9 @@ def test_around_a_crossing_nothing_overlaps_and_nobody_parks_near_the_junction(c
 
 
 def test_people_stand_on_pavements(crossing):
-    busy = Plenty(lots=0.0, houses=0.0, blocks=0.0, taken=0.0, people_per_km=200.0)
+    busy = SurroundingsDensity(
+        lots=0.0, houses=0.0, blocks=0.0, taken=0.0, people_per_km=200.0
+    )
 
     people = surround(crossing, STREETS, busy, np.random.default_rng(0)).people
 

@@ -1,4 +1,4 @@
-"""Kerbs, lines and signs of a crossing of known measures, and its map."""
+"""Road edges, lines and signs of a crossing of known measures, and its map."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from infgen.sources.towns.streets.markings import (
     draw_signs,
 )
 from infgen.sources.towns.streets.network import Use
-from infgen.sources.towns.streets.road_edges import draw_kerbs, reverse_of
+from infgen.sources.towns.streets.road_edges import draw_road_edges, reverse_of
 from infgen.sources.towns.streets.road_map import Furniture, draw_map, keep_features
 from infgen.sources.towns.streets.street_types import Rank, Street
 
@@ -32,7 +32,7 @@ def streets():
 def town_map(crossing, streets):
     furniture = Furniture(
         lines=list(draw_lines(crossing, streets)),
-        kerbs=list(draw_kerbs(crossing)),
+        road_edges=list(draw_road_edges(crossing)),
         crosswalks=draw_crosswalks(crossing, np.random.default_rng(0)),
         driveways=[],
         bumps=draw_bumps(crossing, streets, np.random.default_rng(0)),
@@ -49,10 +49,12 @@ def on_left(line_m, point_m):
 
 
 def test_kerbs_have_the_road_on_their_left(crossing):
-    kerbs = [kerb for kerb in draw_kerbs(crossing) if kerb.kind is RoadEdgeType.BOUNDARY]
+    road_edges = [
+        kerb for kerb in draw_road_edges(crossing) if kerb.kind is RoadEdgeType.BOUNDARY
+    ]
 
-    assert len(kerbs) == 8  # Along every arm inwards, and along every arm outwards.
-    for kerb in kerbs:
+    assert len(road_edges) == 8  # Along every arm inwards, and along every arm outwards.
+    for kerb in road_edges:
         nearest = min(
             (
                 lane.xy_m[0] + 0.5 * (lane.xy_m[-1] - lane.xy_m[0])
@@ -64,18 +66,18 @@ def test_kerbs_have_the_road_on_their_left(crossing):
 
 
 def test_a_kerb_comes_in_rounds_the_corner_and_goes_on_in_the_next_arm(crossing):
-    kerbs = [kerb.xy_m for kerb in draw_kerbs(crossing)]
-    coming = next(xy_m for xy_m in kerbs if np.allclose(xy_m[0], (5.2, -100.0)))
+    road_edges = [kerb.xy_m for kerb in draw_road_edges(crossing)]
+    coming = next(xy_m for xy_m in road_edges if np.allclose(xy_m[0], (5.2, -100.0)))
 
     np.testing.assert_allclose(coming[-1], (9.5, -8.3), atol=0.01)
-    assert any(np.allclose(xy_m[0], coming[-1], atol=0.01) for xy_m in kerbs)
+    assert any(np.allclose(xy_m[0], coming[-1], atol=0.01) for xy_m in road_edges)
     turned_rad = np.abs(np.diff(np.unwrap(np.arctan2(*np.diff(coming, axis=0).T[::-1]))))
     assert turned_rad.max() < 0.5
 
 
 def test_an_island_is_closed_and_lies_between_the_directions(crossing):
     islands = [
-        kerb.xy_m for kerb in draw_kerbs(crossing) if kerb.kind is RoadEdgeType.MEDIAN
+        kerb.xy_m for kerb in draw_road_edges(crossing) if kerb.kind is RoadEdgeType.MEDIAN
     ]
 
     assert len(islands) == 2

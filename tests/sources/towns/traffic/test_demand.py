@@ -8,7 +8,7 @@ import pytest
 
 from infgen.scene import AgentType
 from infgen.sources.towns.road_users import (
-    Body,
+    BodyType,
     draw_hesitation,
     draw_motorist,
     draw_size,
@@ -87,7 +87,7 @@ def test_all_kinds_set_out_by_their_time(town_trips):
 
 def test_nobody_begins_where_no_way_leads_on(town_trips):
     for trip in town_trips:
-        if trip.person.body is not Body.WALKER:
+        if trip.person.body is not BodyType.WALKER:
             assert len(trip.route) >= 2
 
 
@@ -134,7 +134,7 @@ def test_towns_are_from_nearly_empty_to_dense():
 
 
 def test_boxes_are_of_a_size_that_sumo_reads_back():
-    for body in Body:
+    for body in BodyType:
         size_m = np.array([draw_size(body, np.random.default_rng(s)) for s in range(50)])
         np.testing.assert_array_equal(size_m, np.round(size_m, 3))
         assert size_m.min() > 0.5
@@ -143,7 +143,7 @@ def test_boxes_are_of_a_size_that_sumo_reads_back():
 def test_most_motorists_drive_cars():
     bodies = [draw_motorist(np.random.default_rng(seed)).body for seed in range(300)]
 
-    assert 0.8 < bodies.count(Body.CAR) / 300 < 0.95
+    assert 0.8 < bodies.count(BodyType.CAR) / 300 < 0.95
 
 
 def test_half_of_drivers_take_more_than_a_moment_to_set_off():

@@ -15,7 +15,7 @@ FAN_SPACING_M, ARC_SPACING_M = (0.1, 0.025, 0.05), 0.05
 """By kind: fine enough to fill a vocabulary."""
 
 
-def made_codebooks() -> tuple[MotionVocabulary, MapVocabulary]:
+def made_vocabularies() -> tuple[MotionVocabulary, MapVocabulary]:
     """Make vocabularies of the default sizes."""
     settings = VocabSettings()
     moves, roads = settings.num_motion_tokens, settings.num_map_tokens

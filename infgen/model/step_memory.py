@@ -1,0 +1,95 @@
+"""State of the stepper between token steps, and within one."""
+
+from dataclasses import dataclass, replace
+
+from jaxtyping import Int64
+from torch import Tensor
+
+from infgen.model.layers import AttentionSources
+from infgen.model.neighbours import RoadFeatures
+from infgen.model.token_step import TokenStep
+
+
+@dataclass(slots=True)
+class StepMemory:
+    """What the past leaves behind. ``motion_step`` writes into it.
+
+    The ring holds the last ``window`` columns; column c is at place c modulo window.
+
+    Attributes:
+        roads: Encoded maps, one per scene.
+        scene: Map of each rollout [rollout].
+        columns: Columns given so far.
+        pose: Poses of past columns [rollout, row, place, 3].
+        visible: Who could be seen in them, as the same agent [rollout, row, place].
+        features: Normed features of them before each block [block, rollout, row, place, D].
+    """
+
+    roads: RoadFeatures
+    scene: Tensor
+    columns: int
+    pose: Tensor
+    visible: Tensor
+    features: Tensor
+
+    @property
+    def window(self) -> int:
+        """Past columns that are kept."""
+        return self.visible.shape[2]
+
+    def last(self) -> tuple[Tensor, Tensor]:
+        """Pose and visibility of every row in the last column."""
+        place = (self.columns - 1) % self.window
+        return self.pose[:, :, place], self.visible[:, :, place]
+
+
+@dataclass(frozen=True, slots=True)
+class Insertions:
+    """One token step as the entry stage sees it.
+
+    Attributes:
+        token: The token step.
+        rollout: Rollouts that still ask for inserted agents, by their place in the batch.
+        map: Encoded maps.
+        scene: Map of each of those rollouts.
+        before: Poses [rollout, row, 3] one token step earlier ...
+        known: ... and who was seen then [rollout, row].
+        token_step: The agents so far.
+        raw: Normed embeddings of all rows, zero where nobody is [rollout, row, D].
+        relation: How all rows stand to the ego [rollout, row, D].
+        within: Which of them the ego's query sees [rollout, row].
+        roads: Map tokens around the ego.
+        cell_features: Features of the cells around it, if they are told from them
+            [rollout, cell, C].
+    """
+
+    token: int
+    rollout: Tensor
+    map: RoadFeatures
+    scene: Tensor
+    before: Tensor
+    known: Tensor
+    token_step: TokenStep
+    raw: Tensor
+    relation: Tensor
+    within: Tensor
+    roads: AttentionSources
+    cell_features: Tensor | None
+
+    def take(self, places: Int64[Tensor, " kept"]) -> "Insertions":
+        """Go on with some of the rollouts only: nothing more is computed for the others."""
+        return replace(
+            self,
+            rollout=self.rollout[places],
+            scene=self.scene[places],
+            before=self.before[places],
+            known=self.known[places],
+            token_step=self.token_step.take(places),
+            raw=self.raw[places],
+            relation=self.relation[places],
+            within=self.within[places],
+            roads=self.roads.take(places),
+            cell_features=None
+            if self.cell_features is None
+            else self.cell_features[places],
+        )
