@@ -1,4 +1,4 @@
-"""Inserted agents of one token step: the network is asked for one after the other."""
+"""Insertion of agents in one token step, one agent per query of the network."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,21 +19,21 @@ from infgen.tokens.grid import Grid, decode_cell, decode_heading, encode_cell
 from infgen.tokens.scene_tokens import NO_CELL
 
 INSIDE = 0.999
-"""Share of the grid's radius that inserted agents keep within, whatever their offsets."""
+"""Inserted agents stay within this share of the grid radius, whatever their offsets."""
 
 UniformNumbers = Callable[[Purpose], Tensor]
 
 
 @dataclass(frozen=True, slots=True)
 class InsertionRequest:
-    """Who asks whom for inserted agents.
+    """What insertion needs besides the agents: network, random numbers and limits.
 
     Attributes:
         simulator: The network.
         streams: Random numbers of the rollouts.
-        insertion_mask: Where inserted agents may stand; None for anywhere.
-        most: Agents that each rollout may have at any one time.
-        wanted: How many others are to be around each ego; None for as many as enter.
+        insertion_mask: Rejects positions; None allows all.
+        most: Most agents of each rollout at any one time.
+        wanted: Number of other agents wanted around each ego; None for no control.
     """
 
     simulator: Simulator
@@ -43,23 +43,21 @@ class InsertionRequest:
     wanted: Float64[np.ndarray, " rollout"] | None = None
 
     @property
-    def tries(self) -> int:
-        """How often an inserted agent may be asked for."""
-        return (
-            1
-            if self.insertion_mask is None
-            else self.simulator.settings.max_insertion_attempts
-        )
+    def attempts(self) -> int:
+        """Number of positions sampled for one insertion before it is given up."""
+        if self.insertion_mask is None:
+            return 1
+        return self.simulator.settings.max_insertion_attempts
 
     def uniforms(self, token: int, turn: int, attempt: int = 0) -> UniformNumbers:
-        """Random numbers of an inserted agent of each rollout."""
-        # A longer draw starts with the shorter one: the first try is always the same.
+        """Return the uniform numbers of one insertion of each rollout."""
+        # A longer draw starts with the shorter one: the first attempt is always the same.
         return lambda purpose: self.simulator.draw_uniforms(
             self.streams, token, purpose, attempt + 1, turn
         )[:, attempt]
 
     def take(self, places: Int64[np.ndarray, " kept"]) -> "InsertionRequest":
-        """Go on with some rollouts only."""
+        """Keep some rollouts only."""
         insertion_mask = (
             None if self.insertion_mask is None else self.insertion_mask.take(places)
         )
@@ -72,25 +70,25 @@ class InsertionRequest:
         )
 
     def add_bias(self, population: Population) -> Float64[np.ndarray, " rollout"]:
-        """What is added to the log-odds that one more enters."""
+        """Return what is added to the logit of ADD, with density control."""
         settings = self.simulator.settings
         bias = np.full(len(self.streams), settings.add_bias)
         if self.wanted is not None:
             there = population.count_others(self.simulator.grid.radius_m)
-            # One is asked for after another: how many come is proportional to the odds.
+            # Insertions are sampled one by one: their number is proportional to the odds.
             bias += settings.density_control * np.log((self.wanted + 1) / (there + 1))
         return bias
 
 
 @dataclass(frozen=True, slots=True)
 class _ActiveRollouts:
-    """Rollouts that still ask for inserted agents; the others cost nothing more.
+    """Rollouts whose insertion turns go on; nothing is computed for the others.
 
     Attributes:
-        request: Whom they ask.
+        request: What insertion needs.
         entries: The token step, as the network sees it.
-        population: Everyone in them, inserted agents so far among them.
-        rollout: Their places in the batch.
+        population: All agents, those inserted so far included.
+        rollout: Indices of the rollouts in the batch.
     """
 
     request: InsertionRequest
@@ -102,7 +100,7 @@ class _ActiveRollouts:
         return len(self.rollout)
 
     def take(self, which: Bool[np.ndarray, " rollout"]) -> "_ActiveRollouts":
-        """Go on with some of them."""
+        """Keep some of them."""
         if which.all():
             return self
         places = np.flatnonzero(which)
@@ -114,11 +112,9 @@ class _ActiveRollouts:
         )
 
     def add_inserted(self, inserted: InsertedAgents) -> "_ActiveRollouts":
-        """Let the inserted agents in, where the others and the network see them."""
-        simulator, (population, _) = (
-            self.request.simulator,
-            add_inserted(self.population, inserted),
-        )
+        """Add the inserted agents to the population and to the input of the network."""
+        simulator = self.request.simulator
+        population, _ = add_inserted(self.population, inserted)
         entries = simulator.stepper.entry_add(
             self.entries, simulator.token_step(population)
         )
@@ -128,7 +124,7 @@ class _ActiveRollouts:
 def insert_agents(
     request: InsertionRequest, memory: StepMemory, population: Population, token: int
 ) -> Population:
-    """Let inserted agents enter every rollout until the network says that motion begins."""
+    """Insert agents into every rollout until the network samples BEGIN MOTION."""
     simulator, everyone = request.simulator, np.arange(len(request.streams))
     entries = simulator.stepper.entry_begin(memory, simulator.token_step(population))
     active = _ActiveRollouts(request, entries, population, everyone)
@@ -144,16 +140,16 @@ def insert_agents(
 def _insert_next(
     active: _ActiveRollouts, token: int, turn: int
 ) -> tuple[_ActiveRollouts, InsertedAgents | None]:
-    """Ask every rollout of a party for its next inserted agent, if it has room for one.
+    """Sample the next insertion of every active rollout that has a free row.
 
     Returns:
-        Those who have one, and the inserted agents; None if there are none.
+        The rollouts that insert an agent, and these agents; None if there are none.
     """
     simulator, uniforms = active.request.simulator, active.request.uniforms(token, turn)
     query = simulator.stepper.entry_query(active.entries)
     bias = simulator.tensor(active.request.add_bias(active.population))
     add = sample_event(query.add_logit, uniforms(Purpose.ADD), bias)
-    # Free rows alone do not count: a batch has as many as its most crowded scene needs.
+    # A batch has as many rows as its most crowded scene needs: free rows are no limit.
     wanted = add.cpu().numpy() & (active.population.num_agents < active.request.most)
     active, query = (
         active.take(wanted),
@@ -168,15 +164,15 @@ def _insert_next(
 def _sample_positions(
     active: _ActiveRollouts, query: PositionOutputs, token: int, turn: int
 ) -> InsertedAgents:
-    """Sample an inserted agent of every rollout, and whether there is a place for it.
+    """Sample an inserted agent of every rollout, and whether its position is allowed.
 
-    Who may not stand where it is to enter is asked for again, in another cell: the choice
-    is that of the network, given that it is allowed. After some tries there is none.
+    A rejected position is sampled again in another cell, up to ``max_insertion_attempts``
+    times: the network chooses among the allowed positions.
     """
     simulator, found = active.request.simulator, None
     taken = _taken(active.population.cells(simulator.grid), simulator.grid.num_cells)
     left = np.ones(len(active), dtype=bool)
-    for attempt in range(active.request.tries):
+    for attempt in range(active.request.attempts):
         asked, places = active.take(left), np.flatnonzero(left)
         inserted, cell = _sample_details(
             asked,
@@ -204,7 +200,7 @@ def _sample_details(
     taken: Bool[np.ndarray, "rollout cell"],
     uniforms: UniformNumbers,
 ) -> tuple[InsertedAgents, np.ndarray]:
-    """Sample who enters every rollout, and its cell [rollout]."""
+    """Sample position, type, size and heading; return them and the cells [rollout]."""
     simulator = active.request.simulator
     cell, position_m = _sample_position(simulator, query, taken, uniforms)
     asked_at = None if query.position_logits is not None else simulator.tensor(position_m)
@@ -213,14 +209,14 @@ def _sample_details(
     )
     kind = choose(details.agent_type_logits, uniforms(Purpose.KIND))
     if details.offset_m is not None:
-        offset_m = _of_kind(details.offset_m, kind).cpu().numpy()
+        offset_m = _of_type(details.offset_m, kind).cpu().numpy()
         position_m = _within(position_m + offset_m, simulator.grid)
     found = InsertedAgents(
         who=np.ones(len(cell), dtype=bool),
         position_m=position_m,
         turned_rad=_sample_heading(simulator, details, kind, uniforms),
         kind=kind.cpu().numpy().astype(np.int8),
-        size_lwh_m=_of_kind(details.size_lwh_m, kind).cpu().numpy(),
+        size_lwh_m=_of_type(details.size_lwh_m, kind).cpu().numpy(),
     )
     return found, cell
 
@@ -249,7 +245,7 @@ def _sample_position(
 
 
 def _within(position_m: np.ndarray, grid: Grid) -> np.ndarray:
-    """Bring places of the grid frame that are outside the grid to its rim."""
+    """Move positions of the grid frame that are outside the grid to its rim."""
     far = np.hypot(position_m[:, 0], position_m[:, 1]) / np.float32(INSIDE * grid.radius_m)
     return position_m / np.maximum(far, np.float32(1))[:, None]
 
@@ -257,25 +253,25 @@ def _within(position_m: np.ndarray, grid: Grid) -> np.ndarray:
 def _sample_heading(
     simulator: Simulator, details: InsertionDetails, kind: Tensor, uniforms: UniformNumbers
 ) -> np.ndarray:
-    """Heading of every rollout's inserted agent relative to the ego."""
+    """Sample the heading of every inserted agent relative to the ego."""
     if details.heading_logits is None:
         assert details.turned_rad is not None
-        return _of_kind(details.turned_rad, kind).cpu().numpy()
+        return _of_type(details.turned_rad, kind).cpu().numpy()
     drawn = choose(
-        _of_kind(details.heading_logits, kind),
+        _of_type(details.heading_logits, kind),
         uniforms(Purpose.HEADING),
         temperature=simulator.settings.heading_temperature,
     )
     return decode_heading(drawn.cpu().numpy().astype(np.int16), simulator.grid)
 
 
-def _of_kind(values: Tensor, kind: Tensor) -> Tensor:
-    """Take [rollout, ...] of the kind that each rollout's inserted agent has."""
+def _of_type(values: Tensor, kind: Tensor) -> Tensor:
+    """Take the values [rollout, ...] of the sampled agent types."""
     return values[torch.arange(len(kind), device=kind.device), kind]
 
 
 def _taken(cells: np.ndarray, count: int) -> Bool[np.ndarray, "rollout cell"]:
-    """Mark cells that hold an agent: nobody enters on top of another."""
+    """Mark the cells that hold an agent: no other is inserted there."""
     taken = np.zeros((len(cells), count + 1), dtype=bool)
     # Agents outside the grid fall into an extra last column.
     np.put_along_axis(taken, np.where(cells == NO_CELL, -1, cells), True, axis=1)

@@ -1,7 +1,7 @@
-"""Where an inserted agent may stand: in nobody's way, and a vehicle near a lane.
+"""The insertion mask: positions free of other agents, and near a lane for vehicles.
 
-In somebody's way is whoever stands where its box is, or will be in one token step if it
-goes on as in the last one. Pedestrians may stand on pedestrians: groups walk closer than
+A position is free if the box overlaps no other box, neither now nor after one more token
+step of constant motion. Pedestrians may overlap pedestrians: groups walk closer than their
 boxes.
 """
 
@@ -19,19 +19,19 @@ from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 NOWHERE_M = np.float32(1e9)
-"""Where padding of the lanes lies."""
+"""Coordinate of padded lane segments."""
 
 
 @dataclass(frozen=True, slots=True)
 class InsertionMask:
-    """Lanes of the maps that a batch of rollouts plays on, as straight pieces.
+    """Lane segments of the maps of a batch, and what decides whether a position is allowed.
 
     Attributes:
-        start_m: First point of each piece.
-        along_m: From there to its last point.
+        start_m: First point of each segment.
+        along_m: Vector from there to its last point.
         scene: Map of each rollout.
-        lane_m: Farthest from a lane that a vehicle may enter, on a map that has lanes.
-        end_pose: Where each kind's moves end.
+        lane_m: Greatest distance of a vehicle to a lane, on a map that has lanes.
+        end_pose: End pose of each motion token by agent type.
     """
 
     start_m: Float32[np.ndarray, "scene lane 2"]
@@ -41,33 +41,33 @@ class InsertionMask:
     end_pose: Float32[np.ndarray, "3 move 3"]
 
     def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "InsertionMask":
-        """Go on with some rollouts only."""
+        """Keep some rollouts only."""
         return replace(self, scene=self.scene[rollouts])
 
     def allows(
         self, population: Population, inserted: InsertedAgents
     ) -> Bool[np.ndarray, " rollout"]:
-        """Tell which inserted agents may stand where they are to enter."""
+        """Tell which inserted agents have an allowed position."""
         pose = insertion_pose(population.pose[:, EGO_ROW], inserted)
-        on_foot = inserted.kind == AgentType.PEDESTRIAN
-        passed = on_foot[:, None] & (population.kind == AgentType.PEDESTRIAN)
-        in_the_way = np.zeros(len(pose), dtype=bool)
+        pedestrian = inserted.kind == AgentType.PEDESTRIAN
+        passed = pedestrian[:, None] & (population.kind == AgentType.PEDESTRIAN)
+        overlaps = np.zeros(len(pose), dtype=bool)
         for everyone in (population.pose, self._soon(population)):
-            on_somebody = boxes_overlap(
+            meets = boxes_overlap(
                 pose[:, None],
                 inserted.size_lwh_m[:, None, :2],
                 everyone,
                 population.size_lwh_m[..., :2],
             )
-            on_somebody &= (population.presence != Presence.ABSENT) & ~passed
-            in_the_way |= on_somebody.any(axis=1)
-        laneless = (self.start_m == NOWHERE_M).all(axis=(1, 2))[self.scene]
-        by_a_lane = self.lane_distance_m(pose[:, :2]) <= self.lane_m
-        by_a_lane |= laneless | (inserted.kind != AgentType.VEHICLE)
-        return by_a_lane & ~in_the_way
+            meets &= (population.presence != Presence.ABSENT) & ~passed
+            overlaps |= meets.any(axis=1)
+        no_lanes = (self.start_m == NOWHERE_M).all(axis=(1, 2))[self.scene]
+        near_lane = self.lane_distance_m(pose[:, :2]) <= self.lane_m
+        near_lane |= no_lanes | (inserted.kind != AgentType.VEHICLE)
+        return near_lane & ~overlaps
 
     def _soon(self, population: Population) -> Float32[np.ndarray, "rollout row 3"]:
-        """Where everybody is in one token step who moves as in the last; others stand."""
+        """Poses one token step ahead if every agent repeats its motion token."""
         moves = population.move >= 0
         move = np.where(moves, population.move, 0)
         step = self.end_pose[population.kind, move] * moves[..., None]
@@ -76,7 +76,7 @@ class InsertionMask:
     def lane_distance_m(
         self, xy_m: Float32[np.ndarray, "rollout 2"]
     ) -> Float32[np.ndarray, " rollout"]:
-        """Distance of a point of every rollout to the nearest lane of its map."""
+        """Distance of one point per rollout to the nearest lane of its map."""
         start_m, along_m = self.start_m[self.scene], self.along_m[self.scene]
         away_m = xy_m[:, None] - start_m  # [rollout, lane, 2]
         length2 = np.maximum((along_m**2).sum(axis=-1), np.float32(1e-6))
@@ -91,7 +91,7 @@ def make_insertion_mask(
     scene: Int64[np.ndarray, " rollout"],
     lane_m: float,
 ) -> InsertionMask:
-    """Lay out the lanes of some maps; ``scene`` is the map of each rollout."""
+    """Make the insertion mask of some maps; ``scene`` is the map of each rollout."""
     moves, roads = books
     lanes = [_lanes(tokens, roads) for tokens in maps]
     shape = (len(maps), max(len(start_m) for start_m, _ in lanes), 2)
@@ -104,7 +104,7 @@ def make_insertion_mask(
 
 
 def _lanes(tokens: SceneTokens, roads: MapVocabulary) -> tuple[np.ndarray, np.ndarray]:
-    """First points of a map's lane tokens, and the way to their last points."""
+    """First points of the lane tokens of a map, and vectors to their last points."""
     rows = tokens.map_polyline_type == PolylineType.LANE
     end_m = roads.curve_m[tokens.map_token[rows], -1]
     end = np.pad(end_m, ((0, 0), (0, 1)))

@@ -1,7 +1,7 @@
-"""Everyone in a batch of rollouts: they enter, move and leave.
+"""All agents of a batch of rollouts: insertion, motion and removal.
 
-Rows are places. An agent keeps its row for its life; after it has left, the row is free for
-the next inserted agent. Row 0 is always the ego. Plain arrays; the network sees them as a
+An agent keeps its row while it is present; after its removal the row is free for the next
+inserted agent. Row 0 is always the ego. Plain arrays; the network sees them as a
 ``TokenStep``.
 """
 
@@ -32,14 +32,14 @@ class Population:
 
     Attributes:
         agent_number: Number of the agent in its rollout, or ``NOBODY`` in a free row.
-        num_agents_so_far: Lives so far in each rollout.
+        num_agents_so_far: Agent numbers given so far in each rollout.
         kind: ``AgentType``.
         size_lwh_m: Boxes.
         pose: x, y, heading in the scene's frame.
-        move: Move that led here, ``FIRST_MOTION_TOKEN`` where entering, else
+        move: Motion token of this token step, ``FIRST_MOTION_TOKEN`` where inserted, else
             ``NO_MOTION_TOKEN``.
         presence: ``Presence``; ``ABSENT`` in a free row.
-        observed: False where absent, entering, or (in the history) not seen by the log.
+        observed: False where absent, just inserted, or (in the history) not in the log.
     """
 
     agent_number: Int32[np.ndarray, "rollout row"]
@@ -63,13 +63,13 @@ class Population:
         return np.where(self.presence == Presence.ABSENT, np.int16(NO_CELL), cell)
 
     def count_others(self, radius_m: float) -> Int64[np.ndarray, " rollout"]:
-        """Count who is within a radius of each rollout's ego, the ego left out."""
+        """Count the agents within a radius of each ego, without the ego."""
         near = (_ego_distance_m(self) < radius_m) & (self.presence != Presence.ABSENT)
         near[:, EGO_ROW] = False
         return near.sum(axis=1)
 
     def without_free_rows(self) -> "Population":
-        """Cut off the rows that are free in every rollout, but those between others."""
+        """Drop the last rows that are free in every rollout."""
         used = (self.agent_number != NOBODY).any(axis=0)
         rows = len(used) - int(used[::-1].argmax())
         cut = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -87,7 +87,7 @@ class Population:
     def put(
         self, rollouts: Int64[np.ndarray, " kept"], others: "Population"
     ) -> "Population":
-        """Put others in the place of some rollouts. Inverse of ``take``."""
+        """Replace some rollouts by others. Inverse of ``take``."""
         return _put(self, rollouts, others)
 
 
@@ -96,8 +96,8 @@ class InsertedAgents:
     """At most one inserted agent per rollout.
 
     Attributes:
-        who: Rollouts that have one; the other entries mean nothing.
-        position_m: Where in the ego's grid frame.
+        who: Rollouts that have one; the values of others are undefined.
+        position_m: Position in the grid frame of the ego.
         turned_rad: Heading relative to the ego.
         kind: ``AgentType``.
         size_lwh_m: Box.
@@ -116,7 +116,7 @@ class InsertedAgents:
     def put(
         self, rollouts: Int64[np.ndarray, " kept"], others: "InsertedAgents"
     ) -> "InsertedAgents":
-        """Put others in the place of those of some rollouts. Inverse of ``take``."""
+        """Replace those of some rollouts by others. Inverse of ``take``."""
         return _put(self, rollouts, others)
 
 
@@ -140,8 +140,8 @@ def place_logged_agents(starts: Sequence[RolloutStart], min_rows: int) -> list[P
     """Give every agent of the histories a row, the ego first, then near to far.
 
     Returns:
-        The population at every token of the history. At the last one poses are the log's
-        own, so that a rollout continues the log without a jump.
+        The population at every token step of the history. At the last one the poses are
+        those of the log, so that a rollout continues the log without a jump.
 
     Raises:
         ValueError: if the histories end at different tokens.
@@ -201,17 +201,17 @@ def advance_agents(
     remove: Bool[np.ndarray, "rollout row"],
     vocabulary: MotionVocabulary,
 ) -> tuple[Population, Float32[np.ndarray, "rollout row 5 3"]]:
-    """Move everyone by one token step; whoever was leaving is gone, its row free.
+    """Move every agent by one token step; rows of removed agents become free.
 
     Args:
-        population: At the end of a half second.
-        move: Next move of each row.
-        remove: Rows whose agent will be there for the last time. The ego never is.
-        vocabulary: The moves.
+        population: At the end of a token step.
+        move: Next motion token of each row.
+        remove: Rows whose agent is present for the last time; never the ego.
+        vocabulary: Motion tokens.
 
     Returns:
-        The population at the end of the next half second, and the poses
-        [rollout, row, 5, 3] on the way there.
+        The population at the end of the next token step, and the poses
+        [rollout, row, 5, 3] at its five steps.
     """
     gone = population.presence == Presence.REMOVED
     there = (population.presence != Presence.ABSENT) & ~gone
@@ -232,9 +232,9 @@ def advance_agents(
 
 
 def remove_beyond(before: Population, moved: Population, radius_m: float) -> Population:
-    """Let whoever crosses a circle around the ego outwards be there for the last time.
+    """Remove agents that cross a circle around the ego outwards.
 
-    Who was outside all the time stays: the ego may come nearer.
+    Agents that were outside before stay: the ego may come nearer.
 
     Args:
         before: One token step earlier.
@@ -259,7 +259,7 @@ def add_inserted(
 
     Returns:
         The population with them, and the row that each rollout's inserted agent got (-1
-        where there is none). An inserted agent of a full rollout is turned away.
+        where there is none). A full rollout drops its inserted agent.
     """
     free = population.agent_number == NOBODY
     fits = inserted.who & free.any(axis=1)

@@ -1,7 +1,7 @@
-"""Frames as they are simulated, and the rollouts they add up to.
+"""Recording: the frames of a simulation, and the rollouts they add up to.
 
-A batch plays several rollouts at once. Rows of a batch are used again after their agent has
-left, so each agent has a *life*: its number within its rollout, logged agents first.
+Rows of a batch are used again after the removal of their agent, so each agent has a number
+within its rollout, logged agents first.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.signals import LoggedSignals
 
 NOBODY = -1
-"""Life of a free row."""
+"""Agent number of a free row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,12 +27,11 @@ class Frame:
 
     Attributes:
         token: The token step: steps ``5 token + 1`` to ``5 token + 5``.
-        agent_number: Who is in each row during it, or ``NOBODY``.
+        agent_number: Number of the agent in each row, or ``NOBODY``.
         path: x, y, heading of every row at its five steps.
-        shown: At which of them a detector would see it; always, but for weights that have
-            learned validity patterns.
-        removed: Rows whose agent is there for the last time.
-        inserted_number: Life of an agent placed at the end of this token step, else
+        shown: At which of them it is observed: all, but for weights with validity patterns.
+        removed: Rows whose agent is present for the last time.
+        inserted_number: Number of the agent inserted at the end of this token step, else
             ``NOBODY``; its row is free in ``agent_number``.
         kind: ``AgentType`` of every row after this token step.
         size_lwh_m: Box of every row after this token step.
@@ -57,8 +56,8 @@ class RolloutStart:
         history: Its tokens up to now, nothing later in them.
         index: Which of the scene's rollouts this is.
         seed: Seed of its random streams.
-        lights: What traffic lights show in every token step from the history's first on,
-            for weights that see it; None to leave them as they were last.
+        lights: Signal states at every token step from the first of the history on, for
+            weights that use them; None keeps the last known states.
     """
 
     scene: Scene
@@ -78,7 +77,7 @@ class RolloutStart:
 def number_maps(
     starts: Sequence[RolloutStart],
 ) -> tuple[list[RolloutStart], Int64[np.ndarray, " rollout"]]:
-    """One start on each map, however many rollouts it has, and the map of each rollout."""
+    """Return one start per map, and the map of each rollout."""
     maps = {start.scene.scenario_id: start for start in starts}
     number = {name: at for at, name in enumerate(maps)}
     scene = [number[start.scene.scenario_id] for start in starts]
@@ -91,14 +90,14 @@ def collect(
     weights: str,
     places: Sequence[int] | None = None,
 ) -> list[Rollout]:
-    """Put the frames of a batch together to one rollout per start.
+    """Collect the frames of a batch into one rollout per start.
 
     Args:
         starts: What each rollout of the batch continues.
         frames: All frames, in order.
-        weights: Fingerprint of the weights that played them.
-        places: Which rollouts of the batch; all of them if None. A rollout holds every
-            agent at every step, so long ones are better put together a few at a time.
+        weights: Fingerprint of the weights.
+        places: Rollouts of the batch to collect; None for all. A rollout holds every agent
+            at every step: collect a few at a time to bound memory.
     """
     places = range(len(starts)) if places is None else places
     return [_rollout(starts[at], _record(starts[at], frames, at), weights) for at in places]
@@ -106,18 +105,18 @@ def collect(
 
 @dataclass(frozen=True, slots=True)
 class _RecordedAgents:
-    """One row per life of a rollout, filled frame by frame.
+    """One row per agent of a rollout, filled frame by frame.
 
-    Who is ``there`` has a pose; who is ``valid`` is seen as well.
+    An agent that is ``there`` has a pose; one that is ``valid`` is observed as well.
     """
 
-    pose: Float32[np.ndarray, "life step 3"]
-    there: Bool[np.ndarray, "life step"]
-    valid: Bool[np.ndarray, "life step"]
-    kind: Int8[np.ndarray, " life"]
-    size_lwh_m: Float32[np.ndarray, "life 3"]
-    entry_step: Int16[np.ndarray, " life"]
-    exit_step: Int16[np.ndarray, " life"]
+    pose: Float32[np.ndarray, "agent step 3"]
+    there: Bool[np.ndarray, "agent step"]
+    valid: Bool[np.ndarray, "agent step"]
+    kind: Int8[np.ndarray, " agent"]
+    size_lwh_m: Float32[np.ndarray, "agent 3"]
+    entry_step: Int16[np.ndarray, " agent"]
+    exit_step: Int16[np.ndarray, " agent"]
 
 
 def _record(start: RolloutStart, frames: Sequence[Frame], at: int) -> _RecordedAgents:
@@ -195,11 +194,11 @@ def _rollout(start: RolloutStart, recorded: _RecordedAgents, weights: str) -> Ro
 
 def _heights(
     start: RolloutStart, recorded: _RecordedAgents
-) -> Float32[np.ndarray, "life step"]:
+) -> Float32[np.ndarray, "agent step"]:
     """Heights of box centres: the log's in the history, then road plus clearance.
 
     The clearance of a logged agent is what it had over the road at now, that of an inserted
-    one half its height. Roads are looked up once per half second and interpolated.
+    one half its height. Roads are looked up once per token step and interpolated.
     """
     tracks, rows, now = start.scene.tracks, start.logged_row, start.scene.now
     logged, stride = len(rows), CLOCK.steps_per_token

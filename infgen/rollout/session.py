@@ -2,12 +2,12 @@
 
 ::
 
-    session = Session(player, start)
+    session = Session(simulator, start)
     while planning:
         frame = session.step(ego_pose)      # or session.step(): the network drives
 
-The order within a half second is SPEC 12.2's: everyone moves, whoever leaves is marked,
-then inserted agents enter one by one until the network says that motion begins.
+The order within a token step is that of SPEC 12.2: every agent moves, removed agents are
+marked, and agents are inserted one by one until the network samples BEGIN MOTION.
 """
 
 import math
@@ -47,21 +47,21 @@ from infgen.tokens.scene_tokens import Presence
 
 
 class Session:
-    """A batch of rollouts under way, whose egos may be driven from outside.
+    """A batch of running rollouts; a caller may drive their egos.
 
-    What a rollout does depends on its own scene, index, seed and driver only, never on the
-    others of the batch (but for rounding in the network's sums).
+    A rollout depends on its own scene, index, seed and ego poses only, never on the other
+    rollouts of the batch (up to rounding in the sums of the network).
 
     Attributes:
-        population: Everyone at the end of the last half second.
-        token: That token step.
+        population: All agents at the end of the last token step.
+        token: Index of that token step.
     """
 
     @torch.inference_mode()
     def __init__(
         self, simulator: Simulator, starts: RolloutStart | Sequence[RolloutStart]
     ) -> None:
-        """Play the history.
+        """Feed the history to the network.
 
         Args:
             simulator: Network and settings.
@@ -90,21 +90,21 @@ class Session:
 
     @property
     def ego_pose(self) -> Float32[np.ndarray, "rollout 3"]:
-        """Where each rollout's ego is: x, y, heading in the scene's frame."""
+        """Pose of the ego of each rollout: x, y, heading in the frame of the scene."""
         if self._driven_to is not None:
             return self._driven_to
         return self.population.pose[:, EGO_ROW]
 
     @torch.inference_mode()
     def step(self, ego_pose: Float32[np.ndarray, "*steps 3"] | None = None) -> Frame:
-        """Play the next half second; all others react to the ego in the one after it.
+        """Simulate the next token step; other agents react to the ego one token step later.
 
         Args:
-            ego_pose: Where the ego drives, in the scene's frame: its pose [3] at the end of
-                the token step, or at each of its five steps [5, 3]. For a batch with the
-                rollouts as first dimension. The network sees it as moves of its vocabulary,
-                each of which makes up for what the last one left out. None lets the network
-                drive.
+            ego_pose: Pose of the ego in the frame of the scene: at the end of the token
+                step [3], or at each of its five steps [5, 3]; with a first dimension of
+                rollouts for a batch. The network sees the motion tokens that follow these
+                poses most closely; each corrects the error of the one before. None lets
+                the network drive the ego.
         """
         simulator, token = self._simulator, self.token + 1
         path = None if ego_pose is None else self._ego_path(ego_pose)
@@ -132,14 +132,14 @@ class Session:
         )
 
     def _query_network(self, moved: Population) -> InsertionRequest:
-        """Who asks for inserted agents around the egos where they are now."""
+        """Return the insertion request, with the density wanted around the egos."""
         if self._density is None:
             return self._asking
         wanted = self._density.wanted(moved.pose[:, EGO_ROW, :2])
         return replace(self._asking, wanted=wanted)
 
     def _ego_path(self, ego_pose: np.ndarray) -> Float32[np.ndarray, "rollout step 3"]:
-        """Poses of the egos at the five steps; on a straight way if only the end is given.
+        """Return the ego poses at the five steps, interpolated if only the end is given.
 
         Raises:
             ValueError: if there is not one pose, or five, for each rollout.
@@ -164,7 +164,7 @@ class Session:
         return path
 
     def _drive_ego(self, path: np.ndarray | None) -> Population:
-        """Everyone as the network sees them; it takes over from where the ego really is."""
+        """Return the agents as the network sees them, egos at their driven poses."""
         if self._driven_to is None or path is not None:
             return self.population
         pose = self.population.pose.copy()
@@ -174,7 +174,7 @@ class Session:
     def _move(
         self, before: Population, said: MotionStep, ego_path: np.ndarray | None, token: int
     ) -> tuple[Population, np.ndarray]:
-        """Sample everyone's move, and who leaves; drive the egos that are driven."""
+        """Sample motion tokens and removals; replace those of egos that a caller drives."""
         simulator, settings = self._simulator, self._simulator.settings
         move = self._moves(before, said, token)
         move = self._release_stalled(before, said, token, move)
@@ -190,7 +190,7 @@ class Session:
         if settings.removes and settings.removal_radius_m:
             moved = remove_beyond(before, moved, settings.removal_radius_m)
         if ego_path is not None:
-            path = path.copy()  # The population goes on from where the moves led.
+            path = path.copy()  # The population goes on from the quantised pose.
             path[:, EGO_ROW] = ego_path
         return moved, path
 
@@ -202,19 +202,19 @@ class Session:
         move: Int64[np.ndarray, "rollout row"],
         driven: Bool[np.ndarray, "rollout row"],
     ) -> Int64[np.ndarray, "rollout row"]:
-        """Draw moves again that lead into somebody or off the road."""
+        """Sample motion tokens again that lead to a collision or off the road."""
         tries, again = self._simulator.settings.max_motion_samples, ~driven
         slowest, changed = move.copy(), again
         for attempt in range(1, tries):
-            # Whom the road and the others leave no way out is to spare the others.
+            # Where no token satisfies both checks, only collisions are checked.
             road = attempt <= tries // 2
             hits, departs = self._motion_check.rejects(before, move, changed, road=road)
             again, steers = (hits | departs) & ~driven, departs & ~hits
             slower = self._motion_check.is_slower(before, move, slowest)
             slowest = np.where(slower & steers, move, slowest)
-            changed = again  # Whose move will be another; those who brake among them.
+            changed = again  # Rows with another token than before, braking ones included.
             if attempt == tries // 2:
-                # Who is too fast for every way that it drew takes the slowest of them.
+                # A vehicle too fast for all of its samples takes the slowest one.
                 brakes = steers & again & self._motion_check.is_fast(before, move)
                 move, again = np.where(brakes, slowest, move), again & ~brakes
             if not again.any():
@@ -227,7 +227,7 @@ class Session:
     def _moves(
         self, before: Population, said: MotionStep, token: int
     ) -> Int64[np.ndarray, "rollout row"]:
-        """Sample everyone's move."""
+        """Sample the motion token of every agent."""
         packed = said.packed
         kind = packed.rows.pack(self._simulator.tensor(before.kind).long())
         uniforms = self._uniforms(packed.rows, token, Purpose.MOVE)
@@ -244,7 +244,17 @@ class Session:
         again: Bool[np.ndarray, "rollout row"],
         steers: Bool[np.ndarray, "rollout row"],
     ) -> Int64[np.ndarray, "rollout row"]:
-        """Sample the moves of some rows anew; who only has to steer does not stop."""
+        """Sample the motion tokens of some rows again.
+
+        Args:
+            before: All agents at the beginning of the token step.
+            said: Logits of the network.
+            token: Index of the token step.
+            attempt: Number of the sample.
+            move: Motion tokens so far.
+            again: Rows to sample again.
+            steers: Rows that must not take a token that stands still.
+        """
         simulator, rows = self._simulator, said.packed.rows
         which = rows.pack(simulator.tensor(again))
         uniforms = self._uniforms(rows, token, Purpose.MOVE, attempt)[which]
@@ -262,20 +272,22 @@ class Session:
         token: int,
         move: Int64[np.ndarray, "rollout row"],
     ) -> Int64[np.ndarray, "rollout row"]:
-        """Let those set off who have stood in a lane for too long."""
+        """Sample a moving token for vehicles that have stalled in a lane."""
         if self._stall_rule is None:
             return move
         stalled = self._stall_rule.stalled(before, token - 1)
         stalled &= self._simulator.vocabulary.stationary[before.kind, move]
         if not stalled.any():
             return move
-        attempt = (
-            self._simulator.settings.max_motion_samples
-        )  # A number that no other draw has.
+        # No other sample of this token step has this number.
+        attempt = self._simulator.settings.max_motion_samples
         return self._resample_rejected(before, said, token, attempt, move, stalled, stalled)
 
     def _sample(self, logits: Tensor, kind: Tensor, uniforms: Tensor) -> Tensor:
-        """Sample a move. Who seldom sets off still does: standing has its own nucleus."""
+        """Sample motion tokens; tokens that stand still have a nucleus of their own.
+
+        A vehicle that seldom sets off then still does.
+        """
         settings = self._simulator.settings
         return choose(
             logits,
@@ -299,7 +311,7 @@ class Session:
     def _uniforms(
         self, rows: Rows, token: int, purpose: Purpose, attempt: int = 0
     ) -> Tensor:
-        """Draw a number for each of some rows; it does not depend on the others."""
+        """Draw a uniform number per row; it does not depend on the other rows."""
         each = self.population.agent_number.shape[1]
         return rows.pack(
             self._simulator.draw_uniforms(self._streams, token, purpose, each, attempt)
@@ -308,11 +320,10 @@ class Session:
     def _sample_validity(
         self, before: Population, moved: Population, said: MotionStep, token: int
     ) -> Bool[np.ndarray, "rollout row 5"]:
-        """When a detector would see everyone.
+        """Sample at which of the five steps each agent is observed.
 
-        The ego always, an inserted agent as soon as it is in, whoever leaves to the end: so
-            an
-        entry and an exit are where they are said to be.
+        The ego is observed at all of them, an inserted agent at its first and a removed
+        agent at its last, so that recorded entries and exits are exact.
         """
         steps = CLOCK.steps_per_token
         shown = np.ones((*moved.agent_number.shape, steps), dtype=bool)
@@ -330,7 +341,7 @@ class Session:
 
 
 def _collate_maps(starts: Sequence[RolloutStart]) -> Roads:
-    """Put the maps of rollouts side by side, each once."""
+    """Collate the maps of the rollouts; each map once."""
     maps, _ = number_maps(starts)
     histories = [start.history for start in maps]
     return collate_roads(
@@ -343,7 +354,7 @@ def _collate_maps(starts: Sequence[RolloutStart]) -> Roads:
 def _make_stall_rule(
     simulator: Simulator, roads: Roads, starts: Sequence[RolloutStart]
 ) -> StallRule | None:
-    """Remember who stands, if nobody is to stand for ever."""
+    """Return the stall rule, or None if it is off."""
     tokens = math.ceil(simulator.settings.max_stall_s / CLOCK.token_s)
     if not tokens:
         return None
@@ -354,7 +365,7 @@ def _make_stall_rule(
 def _make_density_control(
     simulator: Simulator, starts: Sequence[RolloutStart], now: Population
 ) -> DensityControl | None:
-    """Remember how full the street is at now, if it is to stay so."""
+    """Return the density control, or None if it is off."""
     if not (simulator.inserts and simulator.settings.density_control):
         return None
     return DensityControl.of(starts, now, simulator.grid.radius_m)

@@ -1,4 +1,4 @@
-"""Who would run into somebody soon, if everybody goes on as in this token step."""
+"""Collision check: boxes that overlap soon if every agent repeats its motion token."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
@@ -8,10 +8,10 @@ from infgen.rollout.population import Population
 from infgen.scene import AgentType
 from infgen.tokens.vocabulary import MotionVocabulary
 
-LOOKED_AT = (3, 5)
-"""Steps of a half second at which boxes are compared: its middle and its end."""
-ON_THE_WAY_M = 3.0
-"""Boxes this far apart at the end may have met before."""
+COMPARED_STEPS = (3, 5)
+"""Steps of a token step at which boxes are compared: its middle and its end."""
+MARGIN_M = 3.0
+"""Boxes this far apart at the end of a token step may have overlapped before."""
 
 
 def repeat(
@@ -19,9 +19,11 @@ def repeat(
     move: Int64[np.ndarray, "rollout row"],
     vocabulary: MotionVocabulary,
     times: int,
-) -> Float32[np.ndarray, "rollout row looked 3"]:
-    """Where everyone is to be if its move is made several times, at ``LOOKED_AT``."""
-    steps = vocabulary.path[before.kind, move][:, :, LOOKED_AT]  # [rollout, row, looked, 3]
+) -> Float32[np.ndarray, "rollout row time 3"]:
+    """Poses at ``COMPARED_STEPS`` if every agent repeats its motion token."""
+    steps = vocabulary.path[before.kind, move][
+        :, :, COMPARED_STEPS
+    ]  # [rollout, row, time, 3]
     pose, found = before.pose, []
     for _ in range(times):
         found.append(to_world(steps, pose[:, :, None]))
@@ -32,28 +34,28 @@ def repeat(
 def find_collisions(
     before: Population,
     there: Bool[np.ndarray, "rollout row"],
-    ways: Float32[np.ndarray, "rollout row looked 3"],
+    poses: Float32[np.ndarray, "rollout row time 3"],
 ) -> Bool[np.ndarray, "rollout row"]:
-    """Tell who runs into somebody that was ahead of it and that it did not touch yet.
+    """Tell which agents collide with an agent ahead that they did not overlap before.
 
-    Pedestrians may walk through each other: groups are closer together than their boxes.
+    Pairs of pedestrians are not checked: groups walk closer than their boxes.
 
     Args:
-        before: Everyone at the beginning of the token step.
-        there: Who is still there in it.
-        ways: Where everyone is to be, one moment after the other.
+        before: All agents at the beginning of the token step.
+        there: Agents that are present in it.
+        poses: Predicted poses.
     """
     hits = np.zeros(there.shape, dtype=bool)
-    rollout, one, two = _near(before, there, ways)
+    rollout, one, two = _near(before, there, poses)
     if not len(rollout):
         return hits
     size_lw_m = before.size_lwh_m[..., :2]
     sizes_m = size_lw_m[rollout, one], size_lw_m[rollout, two]
     starts = before.pose[rollout, one], before.pose[rollout, two]
     meet = boxes_overlap(
-        ways[rollout, one],
+        poses[rollout, one],
         sizes_m[0][:, None],
-        ways[rollout, two],
+        poses[rollout, two],
         sizes_m[1][:, None],
     ).any(axis=1)
     meet &= ~boxes_overlap(starts[0], sizes_m[0], starts[1], sizes_m[1])
@@ -64,17 +66,17 @@ def find_collisions(
 
 
 def _near(
-    before: Population, there: np.ndarray, ways: np.ndarray
+    before: Population, there: np.ndarray, poses: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs whose boxes may meet: rollout and both rows."""
+    """Pairs whose boxes may overlap: rollout and both rows."""
     reach_m = np.linalg.norm(before.size_lwh_m[..., :2], axis=-1) / 2  # [rollout, row]
     near = np.zeros((*there.shape, there.shape[1]), dtype=bool)
-    for xy_m in np.moveaxis(ways[..., 1::2, :2], 2, 0):  # at the ends of token steps
+    for xy_m in np.moveaxis(poses[..., 1::2, :2], 2, 0):  # at the ends of token steps
         gap_m = np.linalg.norm(xy_m[:, :, None] - xy_m[:, None], axis=-1)
-        near |= gap_m < reach_m[:, :, None] + reach_m[:, None] + ON_THE_WAY_M
+        near |= gap_m < reach_m[:, :, None] + reach_m[:, None] + MARGIN_M
     near &= there[:, :, None] & there[:, None]
-    on_foot = before.kind == AgentType.PEDESTRIAN
-    near &= ~(on_foot[:, :, None] & on_foot[:, None])
+    pedestrian = before.kind == AgentType.PEDESTRIAN
+    near &= ~(pedestrian[:, :, None] & pedestrian[:, None])
     rows = there.shape[1]
     near &= np.triu(np.ones((rows, rows), dtype=bool), 1)
     rollout, one, two = np.nonzero(near)

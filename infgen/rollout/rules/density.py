@@ -1,7 +1,7 @@
-"""How full the street around an ego is to be: as full as it was at now.
+"""Density control: the number of agents around the ego is held to that at ``now``.
 
-A network that looks back for a few seconds forgets how many there were. Where a map ends
-there are not to be as many: they would all stand on what is left of it, or beyond.
+A network with a memory of a few seconds forgets the density. Near the end of a map the
+target falls with the length of lanes in reach: the agents would crowd on what is left.
 """
 
 from collections.abc import Sequence
@@ -15,28 +15,28 @@ from infgen.rollout.recording import RolloutStart, number_maps
 from infgen.rollout.rules.off_road import lane_segments
 from infgen.scene import Scene
 
-Pieces = tuple[Float32[np.ndarray, "_ 2"], Float64[np.ndarray, " _"]]
+Segments = tuple[Float32[np.ndarray, "_ 2"], Float64[np.ndarray, " _"]]
 
 FEWEST_LANES_SHARE = 0.5
-"""With this share of the lanes that were around at now, a street is as full as then: counts
-in towns' logs hardly depend on how much road there is, as long as there is some."""
+"""The target falls below this share of the lane length at ``now``: in logs of towns the
+count hardly depends on lane length above it."""
 
 
 @dataclass(frozen=True, slots=True)
 class DensityControl:
-    """How many others there were around each ego of a batch of rollouts.
+    """Number of other agents around each ego of a batch at ``now``.
 
     Attributes:
-        at_now: How many.
-        lanes_m: Length of the lanes there.
-        pieces: Of the lanes of each map: where each begins, and its length.
+        at_now: The numbers.
+        lanes_m: Length of the lanes in reach at ``now``.
+        segments: Lane segments of each map: first points and lengths.
         scene: Map of each rollout.
-        radius_m: Whoever is nearer to the ego is around it.
+        radius_m: Agents nearer to the ego are counted.
     """
 
     at_now: Int64[np.ndarray, " rollout"]
     lanes_m: Float64[np.ndarray, " rollout"]
-    pieces: Sequence[Pieces]
+    segments: Sequence[Segments]
     scene: Int64[np.ndarray, " rollout"]
     radius_m: float
 
@@ -44,40 +44,40 @@ class DensityControl:
     def of(
         cls, starts: Sequence[RolloutStart], population: Population, radius_m: float
     ) -> "DensityControl":
-        """Look around the egos at now."""
+        """Count agents and lanes around the egos at ``now``."""
         maps, scene = number_maps(starts)
-        pieces = [pieces_of(start.scene) for start in maps]
+        segments = [segments_of(start.scene) for start in maps]
         ego_m = population.pose[:, EGO_ROW, :2]
-        lanes_m = _around_m(pieces, scene, ego_m, radius_m)
+        lanes_m = _around_m(segments, scene, ego_m, radius_m)
         at_now = population.count_others(radius_m)
-        return cls(at_now, lanes_m, pieces, scene, radius_m)
+        return cls(at_now, lanes_m, segments, scene, radius_m)
 
     def wanted(
         self, ego_m: Float32[np.ndarray, "rollout 2"]
     ) -> Float64[np.ndarray, " rollout"]:
-        """How many others are to be around the egos where they are."""
-        lanes_m = _around_m(self.pieces, self.scene, ego_m, self.radius_m)
+        """Return the wanted number of other agents around the egos at their positions."""
+        lanes_m = _around_m(self.segments, self.scene, ego_m, self.radius_m)
         enough_m = FEWEST_LANES_SHARE * self.lanes_m
-        # A map without lanes is everywhere as it was.
+        # On a map without lanes the target does not change.
         share = np.divide(lanes_m, enough_m, np.ones_like(enough_m), where=enough_m > 0)
         return self.at_now * np.minimum(share, 1)
 
 
-def pieces_of(scene: Scene) -> Pieces:
-    """Take the pieces of a map's lanes."""
+def segments_of(scene: Scene) -> Segments:
+    """Return the lane segments of a map."""
     start_m, along_m = lane_segments(scene)
     return start_m[:, :2], np.linalg.norm(along_m, axis=1).astype(np.float64)
 
 
 def _around_m(
-    pieces: Sequence[Pieces],
+    segments: Sequence[Segments],
     scene: Int64[np.ndarray, " rollout"],
     ego_m: Float32[np.ndarray, "rollout 2"],
     radius_m: float,
 ) -> Float64[np.ndarray, " rollout"]:
-    """Length of the pieces of lanes that begin within a radius of each ego."""
+    """Length of the lane segments that begin within a radius of each ego."""
     found = np.zeros(len(scene))
-    for at, (start_m, length_m) in enumerate(pieces):
+    for at, (start_m, length_m) in enumerate(segments):
         own = np.flatnonzero(scene == at)
         away_m = start_m - ego_m[own, None]
         near = (away_m**2).sum(axis=-1) < radius_m**2

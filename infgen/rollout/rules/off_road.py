@@ -1,4 +1,4 @@
-"""Who would drive off the road soon, if everybody goes on as in this token step."""
+"""Off-road check: vehicles that leave the road if they repeat their motion token."""
 
 from collections.abc import Sequence
 
@@ -17,35 +17,35 @@ from infgen.spatial.road_edges import (
 )
 
 POINT_M = 0.5
-"""Distances are worked out at points this far apart, and interpolated."""
+"""Distances are computed at points this far apart, and interpolated."""
 TILE = 32
-"""Points along a side of a tile; its distances are worked out when somebody gets there."""
+"""Points along a side of a tile; its distances are computed when a vehicle gets there."""
 LANE_M = 1.2
-"""This near to a lane's middle is road, whatever edge is near: that of a bridge, maybe."""
+"""Points this near to a lane centre are on the road, whatever edge is near (bridges)."""
 OFF_M = 1.0
-"""Who is farther off the road than this is meant to be there, and may go where it likes."""
+"""Vehicles farther off the road than this are not checked (driveways, parking lots)."""
 SLACK_M = 0.05
-"""Farther off the road by no more than this is as far as before."""
+"""Changes of the distance below this are ignored."""
 
 
-Lanes = tuple[Float32[np.ndarray, "piece 3"], Float32[np.ndarray, "piece 3"]]
-"""Pieces of lanes, flat: first points, and the ways to their last points."""
+Lanes = tuple[Float32[np.ndarray, "segment 3"], Float32[np.ndarray, "segment 3"]]
+"""Lane segments in the plane: first points, and vectors to their last points."""
 
 
 class RoadEdgeTiles:
-    """How far off the road the places of one map are, all of it flat."""
+    """Distance to the road edge on one map, tile by tile, in the plane."""
 
     def __init__(self, scene: Scene) -> None:
-        """Look at nothing yet."""
+        """Prepare; tiles are computed on demand."""
         self._edges = scene_road_edges(scene, flat=True)
         self._lanes = lane_segments(scene)
         self._row: dict[int, int] = {}
         self._off_m = np.zeros((0, TILE + 1, TILE + 1), dtype=np.float32)
 
     def off_m(self, xy_m: Float32[np.ndarray, "point 2"]) -> Float32[np.ndarray, " point"]:
-        """Distance of points to the edge of the road; positive off it.
+        """Signed distance of points to the road edge; positive off the road.
 
-        Points by a lane are on the road, and so is everything on a map without edges.
+        Points near a lane are on the road, and so is every point of a map without edges.
         """
         if self._edges is None or not len(xy_m):
             return np.full(len(xy_m), -np.inf, dtype=np.float32)
@@ -64,7 +64,7 @@ class RoadEdgeTiles:
         corner: Int64[np.ndarray, "point 2"],
         edges: RoadEdges,
     ) -> Int64[np.ndarray, " point"]:
-        """Row of the tile that each point is in; ``corner`` is the tile's first point."""
+        """Row of the tile of each point; ``corner`` is the first point of the tile."""
         number, first, which = np.unique(
             grid_squares(xy_m, POINT_M * TILE), return_index=True, return_inverse=True
         )
@@ -72,14 +72,14 @@ class RoadEdgeTiles:
         new = [at for at, tile in enumerate(tiles) if tile not in self._row]
         if new:
             self._row |= {tiles[at]: len(self._row) + i for i, at in enumerate(new)}
-            looked_at = self._survey(corner[first[new]], edges)
-            self._off_m = np.concatenate([self._off_m, looked_at])
+            measured = self._measure(corner[first[new]], edges)
+            self._off_m = np.concatenate([self._off_m, measured])
         return np.array([self._row[tile] for tile in tiles], dtype=np.int64)[which]
 
-    def _survey(
+    def _measure(
         self, corner: Int64[np.ndarray, "tile 2"], edges: RoadEdges
     ) -> Float32[np.ndarray, "tile side side"]:
-        """Work out the distances of tiles, to the first points of the next."""
+        """Compute the distances of tiles, up to the first points of the next tiles."""
         steps = np.arange(TILE + 1)
         place = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1)
         at = corner[:, None, None] + place
@@ -93,7 +93,7 @@ class RoadEdgeTiles:
 
 
 def lane_segments(scene: Scene) -> Lanes:
-    """Take all pieces of lanes of a map."""
+    """Return all lane segments of a map."""
     road_map = scene.road_map
     flat_m = road_map.xyz_m * np.array([1, 1, 0], dtype=np.float32)
     feature = np.repeat(np.arange(road_map.num_features), np.diff(road_map.point_offsets))
@@ -104,10 +104,10 @@ def lane_segments(scene: Scene) -> Lanes:
 
 def lanes_distance_m(
     points_m: Float32[np.ndarray, "point 3"],
-    start_m: Float32[np.ndarray, "piece 3"],
-    along_m: Float32[np.ndarray, "piece 3"],
+    start_m: Float32[np.ndarray, "segment 3"],
+    along_m: Float32[np.ndarray, "segment 3"],
 ) -> Float32[np.ndarray, " point"]:
-    """Distance of points to the nearest piece; infinite if there is none."""
+    """Distance of points to the nearest segment; infinite if there is none."""
     if not len(start_m):
         return np.full(len(points_m), np.inf, dtype=np.float32)
     nearest = nearest_by_cells(points_m, start_m, along_m)
@@ -119,30 +119,30 @@ def lanes_distance_m(
 def find_off_road(
     before: Population,
     which: Bool[np.ndarray, "rollout row"],
-    ways: Float32[np.ndarray, "rollout row looked 3"],
+    poses: Float32[np.ndarray, "rollout row time 3"],
     moments: Int64[np.ndarray, "rollout row"],
     road_edge_tiles: Sequence[RoadEdgeTiles],
     scene: Int64[np.ndarray, " rollout"],
 ) -> Bool[np.ndarray, "rollout row"]:
-    """Tell which vehicles leave the road, or go farther off it.
+    """Tell which vehicles leave the road, or get farther off it.
 
     Args:
-        before: Everyone at the beginning of the token step.
-        which: Who is asked about.
-        ways: Where everyone is to be, one moment after the other.
-        moments: How many of these count for each.
+        before: All agents at the beginning of the token step.
+        which: Agents to check.
+        poses: Predicted poses.
+        moments: Number of these that count for each agent.
         road_edge_tiles: Of each map.
         scene: Map of each rollout.
     """
     departs = np.zeros(which.shape, dtype=bool)
     vehicle = which & (before.kind == AgentType.VEHICLE)
-    poses = np.concatenate([before.pose[:, :, None], ways], axis=2)
+    path = np.concatenate([before.pose[:, :, None], poses], axis=2)
     for at, edge in enumerate(road_edge_tiles):
         rollout, row = np.nonzero(vehicle & (scene == at)[:, None])
-        counts = np.arange(poses.shape[2]) <= moments[rollout, row, None]  # now, and then
+        counts = np.arange(path.shape[2]) <= moments[rollout, row, None]  # now, and then
         who, moment = np.nonzero(counts)
         size_lw_m = before.size_lwh_m[rollout[who], row[who], :2]
-        corners_m = box_corners(poses[rollout[who], row[who], moment], size_lw_m)
+        corners_m = box_corners(path[rollout[who], row[who], moment], size_lw_m)
         off_m = np.full((*counts.shape, 4), -np.inf, dtype=np.float32)
         off_m[counts] = edge.off_m(corners_m.reshape(-1, 2)).reshape(-1, 4)
         now_m, then_m = off_m[:, 0].max(axis=1), off_m[:, 1:].max(axis=(1, 2))

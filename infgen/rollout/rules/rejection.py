@@ -1,4 +1,4 @@
-"""Whose move leads where it should not: into somebody, or off the road."""
+"""Rejection of motion tokens that lead to a collision or off the road."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,27 +9,27 @@ from jaxtyping import Bool, Float32, Int64
 from infgen.clock import CLOCK
 from infgen.rollout.population import Population
 from infgen.rollout.recording import RolloutStart, number_maps
-from infgen.rollout.rules.collision import LOOKED_AT, find_collisions, repeat
+from infgen.rollout.rules.collision import COMPARED_STEPS, find_collisions, repeat
 from infgen.rollout.rules.off_road import RoadEdgeTiles, find_off_road
 from infgen.tokens.scene_tokens import Presence
 from infgen.tokens.vocabulary import MotionVocabulary
 
 CLEAR_AHEAD = 3
-"""Token steps that everybody is taken to go on alike where it is asked who meets whom."""
+"""Token steps of constant motion that the collision check looks ahead."""
 ROAD_AHEAD = (2, 5)
-"""The same where it is asked who leaves the road: at least, as cars that turn do not turn
-for long, and at most. Between these it is as far as a car needs to stop ..."""
+"""The same for the off-road check: least (turns do not last) and most. In between it is the
+stopping time of the vehicle ..."""
 BRAKES_MPS2 = 4.0
-"""... if it brakes so."""
+"""... at this deceleration."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotionCheck:
-    """Looks ahead for a batch of rollouts.
+    """Checks motion tokens of a batch of rollouts.
 
     Attributes:
-        vocabulary: Moves.
-        road_edge_tiles: Of each map; none if nobody is kept on the road.
+        vocabulary: Motion tokens.
+        road_edge_tiles: Of each map; empty if the off-road check is off.
         scene: Map of each rollout.
     """
 
@@ -45,20 +45,25 @@ class MotionCheck:
         *,
         road: bool,
     ) -> tuple[Bool[np.ndarray, "rollout row"], Bool[np.ndarray, "rollout row"]]:
-        """Tell whose move leads into somebody, and whose off the road. Who stands may.
+        """Tell which motion tokens lead to a collision, and which off the road.
+
+        Tokens that stand still are never rejected.
 
         Args:
-            before: Everyone at the beginning of the token step.
-            move: Everyone's move.
-            drawn: Whose was drawn since it was last asked: nobody else leaves the road,
-                and nobody runs into anybody in rollouts that have none.
-            road: Whether to ask who leaves the road.
+            before: All agents at the beginning of the token step.
+            move: Motion token of every agent.
+            drawn: Rows sampled since the last check: only these are checked for
+                off-road, and only rollouts that have some for collisions.
+            road: Whether to check for off-road.
+
+        Returns:
+            Rows that collide, and rows that leave the road.
         """
         hits, departs = np.zeros_like(drawn), np.zeros_like(drawn)
         some = np.flatnonzero(drawn.any(axis=1))
         if not len(some):
             return hits, departs
-        # A few rollouts draw for long, and most rows are free: pairs of rows are dear.
+        # Few rollouts sample for long, and most rows are free: pairs of rows are expensive.
         few = before.take(some).without_free_rows()
         rows = few.agent_number.shape[1]
         hits[some, :rows], departs[some, :rows] = self._rejects(
@@ -79,15 +84,15 @@ class MotionCheck:
         moving = there & ~self.vocabulary.stationary[before.kind, move]
         road = road and bool(self.road_edge_tiles)
         times = max(CLEAR_AHEAD, *ROAD_AHEAD) if road else CLEAR_AHEAD
-        ways = repeat(before, move, self.vocabulary, times)
-        soon = ways[:, :, : CLEAR_AHEAD * len(LOOKED_AT)]
+        poses = repeat(before, move, self.vocabulary, times)
+        soon = poses[:, :, : CLEAR_AHEAD * len(COMPARED_STEPS)]
         hits = find_collisions(before, there, soon) & moving
         if not road:
             return hits, np.zeros_like(hits)
-        moments = len(LOOKED_AT) * self._look_ahead_tokens(before, move)
+        moments = len(COMPARED_STEPS) * self._look_ahead_tokens(before, move)
         asked = moving & drawn
         return hits, find_off_road(
-            before, asked, ways, moments, self.road_edge_tiles, scene
+            before, asked, poses, moments, self.road_edge_tiles, scene
         )
 
     def is_slower(
@@ -96,33 +101,33 @@ class MotionCheck:
         move: Int64[np.ndarray, "rollout row"],
         other: Int64[np.ndarray, "rollout row"],
     ) -> Bool[np.ndarray, "rollout row"]:
-        """Tell whose move is shorter than another."""
-        return self._way_m(before, move) < self._way_m(before, other)
+        """Tell which motion tokens are shorter than others."""
+        return self._length_m(before, move) < self._length_m(before, other)
 
     def is_fast(
         self, before: Population, move: Int64[np.ndarray, "rollout row"]
     ) -> Bool[np.ndarray, "rollout row"]:
-        """Tell who cannot stop in the time that everybody looks ahead for the road."""
+        """Tell which vehicles cannot stop within the least look-ahead."""
         return self._look_ahead_tokens(before, move) > ROAD_AHEAD[0]
 
-    def _way_m(
+    def _length_m(
         self, before: Population, move: Int64[np.ndarray, "rollout row"]
     ) -> Float32[np.ndarray, "rollout row"]:
-        way_m: np.ndarray = self.vocabulary.end_pose[before.kind, move, :2]
-        return np.linalg.norm(way_m, axis=-1)
+        step_m: np.ndarray = self.vocabulary.end_pose[before.kind, move, :2]
+        return np.linalg.norm(step_m, axis=-1)
 
     def _look_ahead_tokens(
         self, before: Population, move: Int64[np.ndarray, "rollout row"]
     ) -> Int64[np.ndarray, "rollout row"]:
-        """Token steps of each one's move that it takes as far as it needs to stop."""
-        stops_s = self._way_m(before, move) / CLOCK.token_s / (2 * BRAKES_MPS2)
+        """Token steps that each vehicle needs to stop, within ``ROAD_AHEAD``."""
+        stops_s = self._length_m(before, move) / CLOCK.token_s / (2 * BRAKES_MPS2)
         return np.ceil(stops_s / CLOCK.token_s).clip(*ROAD_AHEAD).astype(np.int64)
 
 
 def make_motion_check(
     starts: Sequence[RolloutStart], vocabulary: MotionVocabulary, *, reject_off_road: bool
 ) -> MotionCheck:
-    """Look out for rollouts; those of one scene share its map."""
+    """Make the motion check of some rollouts; those of one scene share its map."""
     maps, scene = number_maps(starts)
     road_edge_tiles = (
         [RoadEdgeTiles(start.scene) for start in maps] if reject_off_road else []

@@ -1,8 +1,7 @@
-"""Who has stood in a lane for longer than anybody does whom nothing keeps there.
+"""Stall rule: vehicles that stand in a lane without a reason are released.
 
-The network looks back a few seconds. Who has stood all of them might be parked, for all it
-can tell, and hardly sets off again; in logs nobody stops for nothing, so it never learned
-better. One car that does so in a rollout stands for good, and everybody behind it.
+The network looks back a few seconds. It takes a vehicle that has stood for all of them for
+parked and hardly lets it set off again. In a rollout one such vehicle blocks all behind it.
 """
 
 import math
@@ -21,18 +20,18 @@ from infgen.scene import AgentType, Scene
 from infgen.tokens.scene_tokens import Presence, SignalClass
 
 AWAY_M = 1.0
-"""Who has got no farther has stood, however it trembled."""
+"""A vehicle that got no farther has stood."""
 IN_LANE_M = 2.0
-"""Nobody parks so near to the middle of a lane ..."""
+"""A vehicle this near to a lane centre is in the lane ..."""
 ALONG_RAD = math.radians(30)
-"""... that leads where the car does."""
+"""... if their headings differ by less."""
 WAITS_M = 15.0
-"""A light is waited for from so far away."""
+"""A vehicle waits for a signal at most this far ahead."""
 RED = (SignalClass.STOP, SignalClass.CAUTION)
 
 
 class StallRule:
-    """Remembers since when everybody in a batch of rollouts has stood where it is."""
+    """Tracks for how long every agent of a batch has stood."""
 
     def __init__(
         self,
@@ -41,29 +40,29 @@ class StallRule:
         lines: StopLines,
         tokens: int,
     ) -> None:
-        """Nobody has stood yet.
+        """Start without history.
 
         Args:
-            maps: Scenes whose maps are simulated on.
-            scene: Which of them each rollout plays.
+            maps: Scenes with the maps of the batch.
+            scene: Map of each rollout.
             lines: Stop lines of those maps.
-            tokens: Token steps that are long enough.
+            tokens: Token steps after which a vehicle has stalled.
         """
         self._scene, self._lines, self._tokens = scene, lines, tokens
         self._lanes = [lane_segments(one) for one in maps]
-        self._life = np.zeros((len(scene), 0), dtype=np.int32)
-        self._from_m = np.zeros((*self._life.shape, 2), dtype=np.float32)
-        self._since = np.zeros(self._life.shape, dtype=np.int64)
-        self._in_lane = np.zeros(self._life.shape, dtype=bool)
+        self._agent_number = np.zeros((len(scene), 0), dtype=np.int32)
+        self._from_m = np.zeros((*self._agent_number.shape, 2), dtype=np.float32)
+        self._since = np.zeros(self._agent_number.shape, dtype=np.int64)
+        self._in_lane = np.zeros(self._agent_number.shape, dtype=bool)
 
     def stalled(self, everyone: Population, token: int) -> Bool[np.ndarray, "rollout row"]:
-        """Tell which vehicles have stood in a lane for too long; to be asked every token.
+        """Tell which vehicles have stalled in a lane; call it at every token step.
 
-        Who waits for a light has not.
+        Vehicles that wait for a signal have not stalled.
 
         Args:
-            everyone: At the end of half second ``token``.
-            token: That token step.
+            everyone: All agents at the end of the token step.
+            token: Index of the token step.
         """
         self._remember(everyone, token)
         stood = token - self._since
@@ -78,16 +77,18 @@ class StallRule:
         return stalled
 
     def _remember(self, everyone: Population, token: int) -> None:
-        """Begin anew with those who have moved on, or are others than before."""
+        """Update since when each agent stands; rows with a new agent start anew."""
         xy_m = everyone.pose[..., :2]
-        if self._life.shape != everyone.agent_number.shape:
-            self._life = np.full_like(everyone.agent_number, NOBODY)
+        if self._agent_number.shape != everyone.agent_number.shape:
+            self._agent_number = np.full_like(everyone.agent_number, NOBODY)
             self._from_m = np.zeros_like(xy_m)
             self._since = np.zeros(everyone.agent_number.shape, dtype=np.int64)
             self._in_lane = np.zeros(everyone.agent_number.shape, dtype=bool)
-        stays = (everyone.agent_number == self._life) & (everyone.agent_number != NOBODY)
+        stays = (everyone.agent_number == self._agent_number) & (
+            everyone.agent_number != NOBODY
+        )
         stays &= np.linalg.norm(xy_m - self._from_m, axis=-1) < AWAY_M
-        self._life = everyone.agent_number.copy()
+        self._agent_number = everyone.agent_number.copy()
         self._from_m = np.where(stays[..., None], self._from_m, xy_m)
         self._since = np.where(stays, self._since, token)
         self._in_lane &= stays
@@ -95,7 +96,7 @@ class StallRule:
     def _are_in_lane(
         self, pose: Float32[np.ndarray, "agent 3"], rollout: Int64[np.ndarray, " agent"]
     ) -> Bool[np.ndarray, " agent"]:
-        """Tell who stands in a lane that leads its way."""
+        """Tell which vehicles stand in a lane of their heading."""
         found = np.zeros(len(pose), dtype=bool)
         for at, (start_m, along_m) in enumerate(self._lanes):
             way_rad = np.arctan2(along_m[:, 1], along_m[:, 0])
@@ -115,7 +116,7 @@ class StallRule:
         rollout: Int64[np.ndarray, " agent"],
         token: int,
     ) -> Bool[np.ndarray, " agent"]:
-        """Tell whose light is not green, or was not when it was last seen."""
+        """Tell which vehicles have a red or yellow signal ahead."""
         device = self._lines.pose.device
         scene = torch.from_numpy(self._scene[rollout]).to(device)
         shown = self._lines.shown_ahead(

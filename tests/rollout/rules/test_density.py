@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from infgen.rollout.rules.density import DensityControl, pieces_of
+from infgen.rollout.rules.density import DensityControl, segments_of
 from infgen.scene import FeatureType
 from tests.conftest import LANE_ID
 from tests.rollout.rules.test_collision import everyone
@@ -17,7 +17,7 @@ def wanted(ego_x_m, scene):
     density = DensityControl(
         at_now=np.array([10]),
         lanes_m=np.array([149.0 if scene is not EMPTY else 0.0]),
-        pieces=[pieces_of(scene)],
+        segments=[segments_of(scene)],
         scene=np.zeros(1, dtype=np.int64),
         radius_m=75.0,
     )
