@@ -38,7 +38,7 @@ from infgen.tokens.vocabulary import MotionVocabulary
 NUM_PATTERNS = 1 << CLOCK.steps_per_token
 KINDS = (AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST)
 MAX_SPEED_MPS = 50.0
-"""Faster past displacements are not told apart."""
+"""Past displacements are clipped at this speed."""
 
 ENTERING_M = -1.0
 """Stands for the last displacement of an agent that is just entering ..."""
@@ -167,7 +167,7 @@ class AgentContext:
         past_present: ... and which of it there is [N, K].
         roads: Map tokens around them.
         agents: Rows of the agents around them.
-        light: What they are told of the traffic lights ahead [N, D], if they are.
+        light: Features of the signals ahead [N, D], if they are used.
     """
 
     past_relation: Shared
@@ -267,7 +267,7 @@ class MotionStack(nn.Module):
         return x_ND
 
     def motion_features(self) -> Tensor | None:
-        """Evaluate the moves' features for one pass, if moves are told from them."""
+        """Evaluate the features of the motion tokens for one pass, if they are used."""
         return None if self.shaped is None else self.shaped.table()
 
     def foretell(
@@ -293,6 +293,6 @@ class MotionStack(nn.Module):
             shaped: Tensor = self.shaped(x_ND, kind, shapes)
             return shaped
         if self.move is None:
-            raise ValueError("moves are told from their shapes; pass motion_features()")
+            raise ValueError("the motion head needs features; pass motion_features()")
         alone: Tensor = self.move(x_ND)
         return alone

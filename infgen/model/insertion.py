@@ -1,4 +1,4 @@
-"""Inserted agents: whether one enters, in which cell, and who it is.
+"""Insertion: whether an agent is inserted, in which cell, and its details.
 
 Shape letters as in ``layers``; S are the turns of inserted agents within one token step.
 """
@@ -106,7 +106,7 @@ class CellStack(nn.Module):
         Args:
             rows: What the features are of.
             x: The features [N, S, D].
-            cell_features: Features of the cells, if they are told from them [N, cell, C].
+            cell_features: Features of the cells, if they are used [N, cell, C].
                 The more cells somebody might come from, the likelier somebody comes: it
                 adds what they sum up to.
         """
@@ -139,9 +139,9 @@ class CellStack(nn.Module):
 
 
 class DetailStack(nn.Module):
-    """Ask, from the centre of a cell, who enters there and how it stands (SPEC 4.7).
+    """Detail query from the centre of a cell: type, size, heading and offset (SPEC 4.7).
 
-    Where places are regressed, it is asked from the place itself.
+    Where positions are regressed, the query stands at the position itself.
     """
 
     centre_m: Tensor
@@ -200,20 +200,20 @@ class DetailStack(nn.Module):
         return x
 
     def query_pose(self, cell: Tensor, offset_m: Tensor) -> Tensor:
-        """Where in the ego's grid frame a known inserted agent is asked for [N, 2]."""
+        """Position of the query of a known inserted agent in the grid frame [N, 2]."""
         centre_m = self.centre_m[cell]
         return centre_m if self.offset is not None else centre_m + offset_m
 
     def answer(
         self, rows: Rows, x: Tensor, kind: Tensor, pose: Tensor, roads: CellSources
     ) -> DetailOutputs:
-        """Say who enters, and how it stands once its kind is known.
+        """Return logits of the type, and size, heading and offset per type.
 
         Args:
             rows: What the features are of.
             x: Updated features [N, ..., D].
             kind: ``AgentType`` of each.
-            pose: Where it was asked [N, 3] ...
+            pose: Pose of the query [N, 3] ...
             roads: ... and the map tokens seen from there.
         """
         given = x + self.given_kind(kind)

@@ -29,7 +29,7 @@ class InsertionOutputs:
     """Whether one more agent enters, and where.
 
     Attributes:
-        rows: The tokens that were asked among [scene, token].
+        rows: The tokens with a query among [scene, token].
         add_logit: Log-odds of ADD against BEGIN MOTION [row, slot].
         position_logits: [row, slot, cell] ...
         position_m: ... or the place itself, in the ego's grid frame [row, slot, 2].
@@ -45,7 +45,7 @@ class InsertionOutputs:
 
 @dataclass(frozen=True, slots=True)
 class DetailOutputs:
-    """Who enters at a cell, and how it stands.
+    """Logits and values of an inserted agent at a cell.
 
     Attributes:
         rows: The agents described among [scene, detail].
@@ -80,8 +80,8 @@ class Outputs:
     Attributes:
         motion: What agents do next.
         entries: Whether and where inserted agents enter; None without a life cycle.
-        details: Who they are; None without a life cycle.
-        roads: Hidden map tokens, if asked for.
+        details: Details of inserted agents; None for motion-only networks.
+        roads: Hidden map tokens, if they were to be predicted.
     """
 
     motion: MotionOutputs

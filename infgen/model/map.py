@@ -20,14 +20,14 @@ from infgen.tokens.vocabulary import MapVocabulary
 
 @dataclass(frozen=True, slots=True)
 class MapContext:
-    """Who sees whom on the maps: the rows, and the neighbours of each."""
+    """Neighbours of map tokens: the rows, and the neighbours of each."""
 
     rows: Rows
     neighbours: NeighbourRows
     grid: RoadGrid
 
     def covered(self, roads: Roads) -> "MapContext":
-        """Let nobody see a hidden token, not even its place: it would be given away."""
+        """Exclude hidden tokens as sources: their positions would reveal them."""
         kept = ~self.rows.pack(roads.picked)
         present = self.neighbours.present & kept[self.neighbours.index]
         return replace(self, neighbours=replace(self.neighbours, present=present))
@@ -60,7 +60,7 @@ class RoadEncoder(nn.Module):
         self.next_token = mlp(width, width, vocabulary.num_map_tokens)
 
     def look(self, roads: Roads) -> MapContext:
-        """Find who sees whom on the maps."""
+        """Find the neighbours of all map tokens."""
         rows, grid = Rows.where(roads.real), RoadGrid.of(roads.pose, roads.real)
         reach = NeighbourSpec.of(self.radius_m, self.neighbours, self.relation)
         pose, count = rows.pack(roads.pose), roads.real.shape[1]

@@ -18,7 +18,7 @@ from infgen.model.relations import BLOCK_PAIRS, Neighbours, nearest_listed
 SIDE_M = 10.0
 """Of a square."""
 MARGIN_M = 0.1
-"""AttentionResult farther than asked, so that rounding loses nothing at the rim."""
+"""Search a little farther than the radius, so that rounding loses nothing at the rim."""
 
 
 @dataclass(frozen=True, slots=True)

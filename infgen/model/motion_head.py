@@ -1,9 +1,9 @@
-"""Which move an agent makes next, told from where each move leads.
+"""Motion head: logits of the next motion token from features of where each token leads.
 
 The paper gives each of two thousand moves a logit of its own (SPEC 4.5), each learned
 alone: what is seen of one says nothing about the next one, ten centimetres to its left.
 Here every move has a feature that follows from the pose where it ends, so moves that lead
-to nearly the same place are told alike, and few scenes teach all of them.
+to nearly the same place share features, so that few scenes teach all of them.
 """
 
 import math
@@ -23,7 +23,7 @@ WAVES = 9
 TURN_WAVES = 6
 """Waves of the heading, of which each turns twice as fast as the one before it."""
 UNIT_M = 10.0
-"""Metres are told in tens, to be of the size of the waves."""
+"""Lengths are scaled to tens of metres, to match the size of the waves."""
 
 
 class MotionHead(nn.Module):

@@ -34,7 +34,7 @@ class Shared:
         ticket: Stands for it in the graph: it depends on every layer that reads the values
             through it, so their gradients are complete when its own arrives.
         pulled: Where layers add their gradients to.
-        copies: The values in other precisions, made when first asked for.
+        copies: The values in other precisions, made on first use.
     """
 
     values: Tensor
@@ -84,7 +84,7 @@ class AttentionResult(NamedTuple):
     Attributes:
         features: Neighbours' features summed by weight [N, Q, D].
         relation: Their relations summed by weight [N, Q, D].
-        weight: Sum of the weights [N, Q]: 1, but for dropout, or 0 where nobody is seen.
+        weight: Sum of the weights [N, Q]: 1, but for dropout, or 0 without neighbours.
     """
 
     features: Tensor
@@ -138,7 +138,7 @@ class _Cover:
         return cls(score, blind if needed else None)
 
     def weigh(self, score: Tensor, part: slice) -> Tensor:
-        """Turn scores into weights: who sees nobody has no weights at all."""
+        """Turn scores into weights; a query without neighbours has none."""
         weight = score.softmax(dim=-1)
         return weight if self.blind is None else weight.masked_fill_(self.blind[part], 0.0)
 

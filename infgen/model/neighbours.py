@@ -105,7 +105,7 @@ class RoadFeatures:
         grid: The same tokens by where they are.
         signal_states: What those with a traffic light look like, if that is seen as it
             changes.
-        lines: Where lights stop traffic, if agents are told of those ahead.
+        lines: Stop lines of signals, if agents get the signal ahead as a feature.
     """
 
     rows: Rows

@@ -73,7 +73,7 @@ class Network(nn.Module):
 
     @property
     def grid(self) -> Grid:
-        """Cells and heading bins that entries are told in."""
+        """Grid of cells and heading bins."""
         return make_grid(self.grid_settings)
 
     def motion_vocabulary(self) -> MotionVocabulary:

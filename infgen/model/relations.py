@@ -1,4 +1,4 @@
-"""Who sees whom, and how they stand to each other.
+"""Neighbours within a radius, and relative position features.
 
 Neighbour lists are padded rows of the nearest sources within a radius: no edge lists, no
 order that depends on the device. Nothing here is learned and nothing is differentiated.
@@ -133,7 +133,7 @@ def nearest_listed(
 
 
 def _told(key: Tensor) -> Neighbours:
-    """Say whom keys [group, target, neighbour] stand for."""
+    """Decode keys [group, target, neighbour] to neighbour rows."""
     present = key < _NOBODY
     # The rest would be padding for everyone.
     most = int(present.sum(dim=-1).max()) if key.numel() else 0
@@ -226,7 +226,7 @@ def relation_embedding(
     """Make the embedding of one family of relations.
 
     Args:
-        radius_m: Largest distance that its table tells apart.
+        radius_m: Largest distance that its table resolves.
         bands: Frequencies per scalar.
         width: Of the features.
         past_tokens: If not 0, relations end in a time difference of -1 to so many tokens.

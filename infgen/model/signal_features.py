@@ -1,7 +1,8 @@
 """The light ahead: what it shows an agent on its own lane, and since when.
 
 Among all the map tokens that an agent sees, those of its own lane's light are few, and
-when it last changed stands nowhere. So each agent is told both of the stop lines ahead.
+when it last changed stands nowhere. So each agent gets both for the stop lines ahead as
+features.
 """
 
 import math
@@ -71,7 +72,7 @@ class StopLines:
         Args:
             pose: Poses.
             scene: Map of each.
-            token: Half second of each: lights are told as of then.
+            token: Token step of each: signals are those of that step.
             reach_m: How far ahead.
 
         Returns:
@@ -111,7 +112,7 @@ class StopLines:
 
 
 def features() -> int:
-    """Width of what ``StopLines.ahead`` tells."""
+    """Number of features of ``StopLines.ahead``."""
     return CLASSES * (2 + LONG_SINCE)
 
 
@@ -134,7 +135,7 @@ class SignalAhead(nn.Module):
 def _since(shown: Int64[Tensor, "scene light token"]) -> Int64[Tensor, "scene light token"]:
     """Token steps that lights have shown the same, looked at or not.
 
-    Before the first one they did so for long, as nobody can tell.
+    The time before the first one is unknown and counts as long.
     """
     token = torch.arange(shown.shape[2], device=shown.device)
     colour = shown % REMEMBERED

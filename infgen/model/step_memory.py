@@ -21,7 +21,7 @@ class StepMemory:
         scene: Map of each rollout [rollout].
         columns: Columns given so far.
         pose: Poses of past columns [rollout, row, place, 3].
-        visible: Who could be seen in them, as the same agent [rollout, row, place].
+        visible: Rows visible in them, with the same agent as now [rollout, row, place].
         features: Normed features of them before each block [block, rollout, row, place, D].
     """
 
@@ -49,17 +49,17 @@ class Insertions:
 
     Attributes:
         token: The token step.
-        rollout: Rollouts that still ask for inserted agents, by their place in the batch.
+        rollout: Rollouts whose insertion turns go on, by their index in the batch.
         map: Encoded maps.
         scene: Map of each of those rollouts.
         before: Poses [rollout, row, 3] one token step earlier ...
-        known: ... and who was seen then [rollout, row].
+        known: ... and rows observed then [rollout, row].
         token_step: The agents so far.
-        raw: Normed embeddings of all rows, zero where nobody is [rollout, row, D].
+        raw: Normed embeddings of all rows, zero in free rows [rollout, row, D].
         relation: How all rows stand to the ego [rollout, row, D].
         within: Which of them the ego's query sees [rollout, row].
         roads: Map tokens around the ego.
-        cell_features: Features of the cells around it, if they are told from them
+        cell_features: Features of the cells around it, if they are used
             [rollout, cell, C].
     """
 

@@ -47,7 +47,7 @@ from infgen.tokens.scene_tokens import Presence
 
 @dataclass(frozen=True, slots=True)
 class _InsertionBlocks:
-    """What asks for inserted agents, and how it sees."""
+    """Query blocks of insertion with their neighbour specifications."""
 
     cells: CellStack
     details: DetailStack
@@ -69,7 +69,7 @@ class _InsertionBlocks:
 
 
 class Stepper:
-    """A network ready to be played: in evaluation mode, its tables made once.
+    """A network in evaluation mode with its tables made once, evaluated step by step.
 
     A network without a life cycle has no ``entry_`` methods: they raise ``ValueError``.
     """
@@ -93,7 +93,7 @@ class Stepper:
 
     @property
     def leaves(self) -> bool:
-        """Whether the network says who leaves."""
+        """Whether the network has removal logits."""
         return self.network.motion.leave is not None
 
     @torch.no_grad()
@@ -104,7 +104,7 @@ class Stepper:
 
         Args:
             roads: Map of each scene (``batch.collate_roads(records, max_map_tokens)``).
-            scene: Which of those scenes each rollout plays.
+            scene: Scene of each rollout.
             rows: Places for agents.
         """
         settings = self.network.settings
@@ -227,7 +227,7 @@ class Stepper:
         cell: Int64[Tensor, " rollout"],
         position_m: Float32[Tensor, "rollout 2"] | None = None,
     ) -> InsertionDetails:
-        """Ask who enters at a cell of every rollout.
+        """Query the details of an inserted agent at a cell of every rollout.
 
         Args:
             entries: The token step.
@@ -283,14 +283,14 @@ class Stepper:
         if self._asking is None:
             raise ValueError(
                 "these weights know motion only (model.insertion_and_removal is false): "
-                "nobody can enter"
+                "it cannot insert agents"
             )
         return self._asking
 
     def _embed(
         self, before: Tensor, known: Tensor, token_step: TokenStep, rows: Rows
     ) -> Tensor:
-        """Embed some rows of a column, given where who was known to be before it."""
+        """Embed some rows of a token step, given the poses known before it."""
         agents = AgentRows(
             kind=rows.pack(token_step.kind),
             size_lwh_m=rows.pack(token_step.size_lwh_m),

@@ -1,4 +1,4 @@
-"""One token step of many rollouts: what the network is shown, and what it says of it.
+"""One token step of many rollouts: input and output of the network.
 
 Dims as in ``steps``. What a network has no head for is None in its answers.
 """
@@ -37,7 +37,7 @@ class TokenStep:
 
     @property
     def visible(self) -> Bool[Tensor, "rollout row"]:
-        """Who can be seen: who is observed, or just entering."""
+        """Rows that others see: observed, or just inserted."""
         return self.observed | (self.presence == Presence.INSERTED)
 
     def take(self, rollouts: Int64[Tensor, " kept"]) -> "TokenStep":
@@ -100,7 +100,7 @@ class PositionOutputs:
 
 @dataclass(frozen=True, slots=True)
 class InsertionDetails:
-    """Who enters at a place: sample a kind, then take that kind's row of the others.
+    """Details of an inserted agent: sample a type, then take its row of the others.
 
     Attributes:
         agent_type_logits: ``AgentType`` given the cell.

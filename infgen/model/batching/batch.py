@@ -47,12 +47,13 @@ PICKED_SHARE = 0.15
 """Share of map tokens that are hidden to be predicted: few, as everyone else does without
 them in the same pass."""
 FORGOTTEN_SHARE = 0.5
-"""Share of scenes in which nobody looks at traffic lights after the history."""
+"""Share of scenes without signals after the history."""
 BARE_RIM_SHARE = 0.5
 """Share of scenes in which nobody from beyond the rim is there from the beginning, as in a
 rollout after its first seconds."""
 LEFT_TOKENS = 2
-"""Who is not seen for so many token steps has left: at a log's end one cannot tell."""
+"""An agent unseen for so many token steps is removed; near the end of a log it is
+unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +74,8 @@ class Agents:
         pattern: Bit i: whether the log itself shows it at step i + 1 of the token.
         cell: Cell of the ego's grid, or ``NO_CELL``.
         turn: Of an agent that enters at this token, its turn among those that do; -1 for
-            all others, ``OUTSIDE`` for who enters outside the grid.
-        told: Whether the log goes on for long enough to tell who leaves at this token.
+            all others, ``OUTSIDE`` for insertions outside the grid.
+        told: Whether the log goes on long enough to know the removals at this token.
     """
 
     kind: Int64[Tensor, "scene agent"]
@@ -128,15 +129,15 @@ class Roads:
 
 @dataclass(frozen=True, slots=True)
 class Insertions:
-    """Who enters when.
+    """Insertion targets: which agent is inserted at which token and turn.
 
     Attributes:
-        asked: Whether inserted agents are asked for at this token (never at the first, nor
+        asked: Whether there is an insertion query at this token (never at the first, nor
             at the last of a log).
         count: Inserted agents within the grid at this token, also those beyond the last
             slot.
         agent: The inserted agent of each turn, or ``NOBODY``.
-        cell: Its cell; 0 where there is nobody.
+        cell: Its cell; 0 in unused slots.
     """
 
     asked: Bool[Tensor, "scene token"]
@@ -151,8 +152,8 @@ class Details:
 
     Attributes:
         present: False for padding.
-        inserted agent: Whether the agent does enter; else it is there already and plays the
-            part.
+        newcomer: Whether the agent is truly inserted; else it is present already and plays
+            the part.
         agent: Row of the agent, hidden from its own query.
         token: When.
         turn: Inserted agents of this turn and later are hidden as well.
@@ -230,7 +231,7 @@ def collate(
         records: The scenes.
         limits: How much of each is taken.
         draw: Which of the many views of a scene to take: it decides the part of a long log,
-            the hidden map tokens, who plays inserted agent, and what noise does. Equal
+            the hidden map tokens, the pseudo-insertions and the perturbation. Equal
             draws, equal batches.
         noise: How tokens are disturbed, to learn from; None for scenes as they are.
     """

@@ -121,11 +121,11 @@ def hide_until_near(
 ) -> SceneWindow:
     """Hide agents that begin beyond ``insertion_distance_m`` until they come within.
 
-    It then enters, as who comes later does already; who never comes never is.
+    They are inserted then; agents that never come within are dropped.
 
     Args:
         window: What is known.
-        settings: The distance (0: nobody is hidden), and the order of inserted agents.
+        settings: The distance (0 hides no agent), and the insertion order.
         known: Token steps of the history.
     """
     if not settings.insertion_distance_m or known < 1:
@@ -135,7 +135,7 @@ def hide_until_near(
     inside = np.hypot(away_m[..., 0], away_m[..., 1]) < settings.insertion_distance_m
     inside &= visible
     born = visible.argmax(axis=1)
-    # Who is there as the history ends is seen from the token step after it on at latest.
+    # Agents present when the history ends are seen from the next token step at latest.
     far = (born <= known) & ~inside[np.arange(len(inside)), born]
     far[0] = False
 
@@ -156,7 +156,7 @@ def hide_until_near(
 
 
 def hide_signals(window: SceneWindow, known: int) -> SceneWindow:
-    """Let nobody look at traffic lights after the first ``known`` token steps."""
+    """Hide signals after the first ``known`` token steps."""
     tokens = window.shown.shape[1]
     return replace(
         window, shown=hold_last_signals(window.shown, min(known, tokens), tokens)

@@ -11,7 +11,7 @@ from infgen.tokens.scene_tokens import NO_CELL, Presence
 OUTSIDE = 1 << 15
 """Turn of an inserted agent that is in no cell: no query may see it yet."""
 PSEUDO_PER_TOKEN = 2
-"""Agents per half second that play inserted agents, to learn headings and offsets from."""
+"""Pseudo-insertions per token step: present agents that train heading and offset."""
 
 
 def describe(
@@ -38,7 +38,7 @@ def insertion_turns(window: SceneWindow) -> np.ndarray:
 
 
 def insertion_arrays(window: SceneWindow, turn: np.ndarray, limit: int) -> Arrays:
-    """Who enters when, for each token that is asked.
+    """Return the insertions of each token step with a query.
 
     Not the first: who is there then has not come. Not the last of a log: to have come, one
     must be seen in the token step after it.
@@ -59,7 +59,7 @@ def insertion_arrays(window: SceneWindow, turn: np.ndarray, limit: int) -> Array
 def detail_arrays(
     window: SceneWindow, entries: Arrays, grid: Grid, random: np.random.Generator
 ) -> Arrays:
-    """Inserted agents in order, then agents that are there already and play the part."""
+    """Return inserted agents in order, then pseudo-insertions."""
     token, turn = np.nonzero(entries["agent"] >= 0)
     row = entries["agent"][token, turn]
     there = (window.presence == Presence.PRESENT) & window.observed

@@ -46,7 +46,7 @@ DRIFT_M, DRIFT_SHARE = 0.9, 0.15
 DRIFT_MOST = 2.0
 """... and never more than so many times as far."""
 DRIFT_LEAST_WAY_M = 0.75
-"""Who goes less does not drift."""
+"""Agents that go less do not drift."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -153,7 +153,7 @@ def perturb_motion(
             wanted[back], before[back], kind[rows[back]], noise.table
         )
 
-        # Who is where it should be and takes the move it took stays so to the last bit.
+        # Agents at their logged poses with logged tokens keep these bit for bit.
         off = strays.off[rows, token - 1] | (taken != move[rows, token])
         strays.label[rows, token], strays.move[rows, token] = nearest, taken
         strays.pose[rows, token] = np.where(off[:, None], ends, wanted)

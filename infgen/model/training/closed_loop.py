@@ -1,4 +1,4 @@
-"""Scenes as the network itself plays them, to learn from: closed-loop fine-tuning.
+"""Closed-loop fine-tuning: scenes simulated by the network itself, to learn from (CatK).
 
 CatK (SPEC 7.1): at every token step each agent takes, of the moves that the network finds
 most likely, the one that ends nearest to where the log says the agent is. So the scene
@@ -31,15 +31,15 @@ from infgen.tokens.scene_tokens import NO_CELL, Presence
 
 @torch.no_grad()
 def close_loop(network: Network, batch: Batch, top: int) -> Batch:
-    """Play a batch from its first half second on, close to the log.
+    """Simulate a batch from its first token step on, close to the log.
 
-    Who enters, leaves or is unseen when and where is the log's: inserted agents enter at
-    their true poses, and who was unseen goes on from its true pose. Cells, headings and
-    offsets that are told relative to the ego are told anew, as it is simulated like all
+    Insertions, removals and gaps are those of the log: inserted agents start at their true
+    poses, and agents seen again after a gap go on from theirs. Cells, headings and
+    offsets relative to the ego are computed anew, as it is simulated like all
     others.
 
     Args:
-        network: What plays; its mode (training or not) is kept.
+        network: The network; its mode (training or not) is kept.
         batch: Scenes as logged, without noise, on the network's device.
         top: Most likely moves that each is chosen from.
 
@@ -67,7 +67,7 @@ def close_loop(network: Network, batch: Batch, top: int) -> Batch:
 
 
 def _play(network: Network, batch: Batch, top: int) -> tuple[Agents, Tensor]:
-    """Play all agents; also tell where [scene, token, agent] one is not as logged."""
+    """Simulate all agents; also mark where [scene, token, agent] they are not as logged."""
     logged, stepper, grid = batch.agents, Stepper(network), network.grid
     device = logged.pose.device
     vocabulary = network.motion_vocabulary()
@@ -101,7 +101,7 @@ def _move(
     top: int,
     ends: MotionTokenEnds,
 ) -> None:
-    """Write the next move of all who are seen now and then, and where it leads."""
+    """Write the next motion token of all agents seen at both steps, and its end pose."""
     who = logged.observed[:, token] & logged.visible[:, token - 1]  # [scene, agent]
     before, true = played.pose[:, token - 1][who], logged.pose[:, token][who]
     kind = logged.kind[who]
@@ -109,7 +109,7 @@ def _move(
     likely = logits[who].topk(top).indices.sort().values
     taken = nearest_of(wanted, kind, likely, ends)
 
-    # Who is as logged and moves as logged stays so to the last bit.
+    # Agents at their logged poses with logged tokens keep these bit for bit.
     strays = off[:, token - 1][who] | (taken != logged.move[:, token][who])
     led = to_world(ends.pose[kind, taken], before)
     off[:, token][who] = strays
@@ -131,7 +131,7 @@ def _column(agents: Agents, token: int) -> TokenStep:
 
 
 def _cells(played: Agents, logged: Agents, off: Tensor, token: int, grid: Grid) -> Tensor:
-    """Cells [scene, agent] of the played ego's grid; a inserted agent's is never lost."""
+    """Cells [scene, agent] in the grid of the simulated ego; insertions keep theirs."""
     pose, old = played.pose[:, token].numpy(force=True), logged.cell[:, token]
     found = encode_cell(to_grid(pose[..., :2], pose[:, EGO, None]), grid)
     new = torch.from_numpy(found).to(old)

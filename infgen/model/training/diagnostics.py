@@ -1,4 +1,4 @@
-"""What is told of a network besides its losses: perplexity, and how far to trust it."""
+"""Diagnostics besides the losses: perplexity, and calibration of control tokens."""
 
 import torch
 from jaxtyping import Bool, Float32, Float64

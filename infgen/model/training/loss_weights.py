@@ -44,7 +44,7 @@ def supervised(batch: Batch, settings: TrainSettings) -> Tensor:
 
 
 def _motion(batch: Batch, settings: TrainSettings) -> Tensor:
-    """Moves, a inserted agent's first one counting more; at token 0 nobody comes in."""
+    """Weights of motion tokens; the first one of an inserted agent counts more."""
     mask = motion_mask(batch.agents)
     first = batch.agents.presence == Presence.INSERTED
     first[:, 0] = False

@@ -69,7 +69,7 @@ class Term:
 
 Terms = dict[str, Term]
 CONTROLS = ("keep", "add")
-"""Terms whose token is a yes or no."""
+"""Terms of binary control tokens."""
 MEASURED = ("size", "offset", "position_regression", "heading_regression")
 """Terms that are distances: nothing is right or wrong."""
 
