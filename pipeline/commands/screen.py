@@ -187,8 +187,8 @@ _LINES = {
     "stage-done": "{stage}: made; {figures}",
     "stage-failed": "{stage}: failed; the log tells more, and the next run tries again",
     "stage-skipped": "{stage}: skipped, as what it needs is not made",
-    "leg-started": "{leg} (run {number} of {legs})",
-    "leg-failed": "{leg}: {why}",
+    "arm-run-started": "{arm_run} (run {number} of {arm_runs})",
+    "arm-run-failed": "{arm_run}: {why}",
 }
 
 

@@ -84,14 +84,14 @@ def execute_arm_runs(
     ran: list[ExecutedRun] = []
     for arm_run in arm_runs:
         events.emit(
-            "leg-started",
+            "arm-run-started",
             arm_run=arm_run.words,
             number=len(ran) + 1,
             arm_runs=len(arm_runs),
         )
         ran.append(runs.run(arm_run))
         if ran[-1].why:
-            events.emit("leg-failed", arm_run=arm_run.words, why=ran[-1].why)
+            events.emit("arm-run-failed", arm_run=arm_run.words, why=ran[-1].why)
     return ran
 
 

@@ -56,8 +56,8 @@ def scored(method, seed, means, *, mode="long", numbers=None, curves=None) -> Sc
 
 def compared(runs, logs=None, *, missing=(), count_error="truth") -> ComparisonResult:
     """A comparison of scored runs; ``missing`` are runs that failed."""
-    arms = {one.ran.leg.arm.name: one.ran.leg.arm for one in runs}
-    arms |= {each.leg.arm.name: each.leg.arm for each in missing}
+    arms = {one.ran.arm_run.arm.name: one.ran.arm_run.arm for one in runs}
+    arms |= {each.arm_run.arm.name: each.arm_run.arm for each in missing}
     preset = Preset("mini", (), 1, count_error, {}, arms)
     ran = [*[one.ran for one in runs], *missing]
     return ComparisonResult(preset, ran, list(runs), logs or Tally())

@@ -83,7 +83,7 @@ def test_whoever_is_stopped_leaves_nothing(view_model, tmp_path, monkeypatch):
     def stop():
         raise Stopped(15)
 
-    monkeypatch.setattr(view_files.signals, "check", stop)
+    monkeypatch.setattr(view_files.signals, "raise_if_stopped", stop)
 
     with pytest.raises(Stopped):
         write_video(view_model, tmp_path / "film.mp4", FORM, workers=0)

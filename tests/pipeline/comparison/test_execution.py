@@ -201,7 +201,7 @@ def test_a_failing_play_leaves_the_others_of_its_arm(shop):
     states = [one.state for one in shop.run(arms=["plain"])]
 
     assert states == ["failed", "made"]
-    assert [t["event"] for t in shop.told].count("leg-failed") == 1
+    assert [t["event"] for t in shop.told].count("arm-run-failed") == 1
 
 
 def test_wrong_settings_are_told_with_their_line_before_anything_is_made(shop):

@@ -129,7 +129,7 @@ def test_a_request_to_stop_is_met_after_a_file(tmp_path, quick, monkeypatch):
     def check():
         raise signals.Stopped(15)
 
-    monkeypatch.setattr(towns.signals, "check", check)
+    monkeypatch.setattr(towns.signals, "raise_if_stopped", check)
 
     with pytest.raises(signals.Stopped):
         write_towns(order(tmp_path, scenes=3))

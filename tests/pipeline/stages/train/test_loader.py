@@ -149,9 +149,10 @@ def main():
     scenes = TokenScenes([shards] * count)
     grid = TokenSettings(grid_radius_m=60.0, grid_cell_m=4.0)
     how = TrainSettings(batch_scenes=3 * count)
-    recipe = TrainingSetup(ModelSettings(), how, grid, scenes, [],
-    shards).recipe(ProcessGroup()) ids = [parts[0].scenario_ids for parts in
-    train_batches(recipe, range(2), workers)] maps = Path("/proc/self/maps").read_text()
+    setup = TrainingSetup(ModelSettings(), how, grid, scenes, [], shards)
+    recipe = setup.recipe(ProcessGroup())
+    ids = [parts[0].scenario_ids for parts in train_batches(recipe, range(2), workers)]
+    maps = Path("/proc/self/maps").read_text()
     print(json.dumps([ids, len(os.listdir("/proc/self/fd")), str(shards) in maps]))
 
 if __name__ == "__main__":

@@ -90,7 +90,7 @@ forward = Pass(network, TrainSettings(compile="true"))
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
     found = forward(batch)
-same = torch.equal(found.motion.move_logits, plain.motion.move_logits)
+same = torch.equal(found.motion.motion_logits, plain.motion.motion_logits)
 told = [str(each.message) for each in told if each.category is UserWarning]
 print(json.dumps([forward.compiled, same, told]))
 """
