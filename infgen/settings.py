@@ -69,7 +69,7 @@ def _word(value: Any) -> Any:
 Int = Annotated[int, BeforeValidator(_whole)]
 Float = Annotated[float, BeforeValidator(_refuse_bool)]
 Bool = Annotated[bool, BeforeValidator(_switch)]
-SequenceToken = BeforeValidator(_word)
+Text = BeforeValidator(_word)
 Count = Annotated[Int, Field(ge=0)]
 AtLeastOne = Annotated[Int, Field(ge=1)]
 NonNegative = Annotated[Float, Field(ge=0)]
@@ -107,7 +107,7 @@ def _config_error(
     unknown = [each for each in error.errors() if each["type"] == _UNKNOWN]
     first = (unknown or error.errors())[0]
     missing = [] if unknown else _missing(error)
-    said = first["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
+    said = _said(first["msg"])
     key = str(first["loc"][0]) if first["loc"] else ""
     place = where if isinstance(where, str) else _place(key, said, where)
     if not key:
@@ -117,6 +117,14 @@ def _config_error(
     if unknown:
         return ConfigError(f"{place}: no setting {key!r}; {_nearest(key, kind)}")
     return ConfigError(f"{place}.{key} is {values[key]!r}; {said}")
+
+
+def _said(message: str) -> str:
+    """Shorten a message of pydantic to what was expected."""
+    said = message.removeprefix("Value error, ").replace("Input should be", "expected")
+    for long, short in (("a valid integer", "int"), ("a valid number", "float")):
+        said = said.replace(long, short)
+    return said.split(", unable to parse")[0]
 
 
 def _missing(error: ValidationError) -> list[str]:

@@ -15,7 +15,7 @@ from infgen.settings import (
     Int,
     NonNegative,
     Seed,
-    SequenceToken,
+    Text,
     Share,
 )
 
@@ -101,7 +101,7 @@ class TrainSettings:
     precision: Literal["auto", "float32", "bf16"] = "auto"
     """`float32`; `bf16` for matrix products of half the bits (geometry and losses stay
     float32); `auto` is bf16 on a GPU that has it."""
-    compile: Annotated[Literal["auto", "true", "false"], SequenceToken] = "auto"
+    compile: Annotated[Literal["auto", "true", "false"], Text] = "auto"
     """Whether to compile the network; `auto` on a GPU."""
     initial_weights: Annotated[str, NOT_IN_KEY] = ""  # Its fingerprint is a source.
     """Weights to start from: a folder, a key of stage `train`, or `builtin` for those of

@@ -32,7 +32,7 @@ class Block:
     Attributes:
         page: File it stands in.
         line: Number of its first line.
-        language: SequenceToken after the fence; empty without one.
+        language: Word after the fence; empty without one.
         text: What it holds, without the indent of the fence.
         notes: Notes right above it, by kind.
     """

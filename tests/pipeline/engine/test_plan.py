@@ -104,8 +104,8 @@ def test_after_gives_all_that_reads_a_stage(workshop):
     ("word", "message"),
     [
         ("total.tims=2", "-s total: no setting 'tims'; did you mean 'times'"),
-        ("total.times=many", r"-s total\.times is 'many'; expected a valid number"),
-        ("count.longest=1.5", r"-s count\.longest is '1.5'; expected a valid integer"),
+        ("total.times=many", r"-s total\.times is 'many'; expected float"),
+        ("count.longest=1.5", r"-s count\.longest is '1.5'; expected int"),
     ],
 )
 def test_settings_that_cannot_be_are_named(workshop, word, message):
