@@ -6,15 +6,20 @@ RUNS := $(VENV)/runs
 INSTALLED := $(VENV)/installed
 CODE := cli.py infgen pipeline benchmarks examples docs/hooks tests
 
-.PHONY: demo test check format bench docs clean
+.PHONY: demo test test-slow test-all check format bench docs clean
 
 demo: $(RUNS)
 	$(BIN)/infgen demo
 
-# Two workers share the cores; more threads would only wait for each other.
-test: export OMP_NUM_THREADS = 1
+# Tests run in random order; pytest prints the seed, `--randomly-seed=N` repeats it.
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 -m "not slow"
+
+# The tests that take more than ten seconds each.
+test-slow: $(INSTALLED)
+	$(BIN)/python -m pytest -n 2 -m slow
+
+test-all: test test-slow
 
 check: $(INSTALLED)
 	$(BIN)/ruff check $(CODE)

@@ -1,9 +1,11 @@
 """Small scenes that every room's tests are built on. Each fixture is a function to call."""
 
+import os
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import settings
 
 from infgen.scene import (
@@ -21,6 +23,28 @@ from infgen.tokens.vocabulary import BOX_LW_M, MapVocabulary, MotionVocabulary
 
 settings.register_profile("infgen", deadline=None)
 settings.load_profile("infgen")  # How long an example takes is a matter of the machine.
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def pytest_configure() -> None:
+    """Give this process, and those that tests start, one thread each.
+
+    Results of training depend on the number of threads; two test processes share the cores.
+    """
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def _same_threads_after_each_test():
+    """Undo what a test, or a command it runs in this process, does to threads."""
+    before = {name: os.environ.get(name) for name in THREADS}, torch.get_num_threads()
+    yield
+    environment, threads = before
+    os.environ.update({name: value for name, value in environment.items() if value})
+    torch.set_num_threads(threads)
+
 
 STEP_S = 0.1
 BOX_LWH_M = {
