@@ -108,7 +108,7 @@ def run(
 
     Example: infgen run report --root R --preset towns-benchmark --arms infgen,smart
 
-    A preset trains, plays and scores several methods alike and sets them side by side.
+    A preset trains, simulates and scores several methods alike and compares them.
     """
     if comparing.preset is not None:
         compare_arms(request_options, comparing, stages or [], running, as_json=json_)
@@ -150,22 +150,22 @@ def _stage_verb(stage: str, what: str, *examples: str) -> None:
     app.command(stage, help="\n\n".join([what, *lines, before]))(verb)
 
 
-_stage_verb("build-vocab", "Cluster the vocabularies of moves and road pieces.")
+_stage_verb("build-vocab", "Cluster the vocabularies of motion tokens and map tokens.")
 _stage_verb("tokenize", "Write scenes as tokens.")
 _stage_verb("train", "Train the network; goes on where a killed run stopped.")
 _stage_verb(
     "calibrate",
-    "Find what rollouts add to their odds, so that as many come and go as in logs.",
+    "Find the biases with which insertions and removals match the logs.",
     "--profile small -s calibrate.method=simulate --dask local:2",
 )
 _stage_verb(
     "rollout",
-    "Play futures of the held-out scenes; settings are those of rollout.* in stages.yaml.",
+    "Simulate futures of the held-out scenes; settings are rollout.* of stages.yaml.",
     "--profile small --dask local:8 -s rollout.mode=wosac -s rollout.count=32",
 )
-_stage_verb("reference", "Count what the logs of the scored split do.")
-_stage_verb("score", "Score the futures against the logs.")
-_stage_verb("report", "Gather tables and figures in one page.")
+_stage_verb("reference", "Measure the logs of the scored split.")
+_stage_verb("score", "Score the rollouts against the logs.")
+_stage_verb("report", "Write tables and figures to one page.")
 
 
 @app.command()
@@ -358,7 +358,7 @@ app.add_typer(tools.app)
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command; a known error is one line and an exit code."""
-    for name in THREADS:  # One thread each: results then do not depend on who does a unit.
+    for name in THREADS:  # One thread each: results then do not depend on the worker.
         os.environ.setdefault(name, "1")
     words = sys.argv[1:] if arguments is None else arguments
     try:
@@ -366,7 +366,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except (ValueError, OSError, signals.Stopped) as error:
         code = exit_code(error)
         typer.echo(f"infgen: {error}", err=True)
-        if "--json" in words:  # Whoever gathers lines finds this one, too.
+        if "--json" in words:  # For programs that collect the lines.
             print_json({"error": str(error), "exit_code": code})
         sys.exit(code)
 

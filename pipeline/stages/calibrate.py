@@ -68,7 +68,7 @@ def plan(inputs: Inputs, settings: Settings) -> list[Unit]:
         for part, pieces in enumerate(_parts(inputs, how)):
             units.append(
                 Unit(
-                    name=f"play-{point}-{part:03d}",
+                    name=f"biases-{point}-{part:03d}",
                     inputs={
                         "weights": identity,
                         **{f"scenes/{done.name}": done.key for done, *_ in pieces},
@@ -103,7 +103,7 @@ def _parts(
     """
     files = files_of_split(
         inputs.units("ingest"), how.split,
-        to="play and calibrate by", setting="calibrate.split or calibrate.method",
+        to="simulate for calibration", setting="calibrate.split or calibrate.method",
     )  # fmt: skip
     chosen = zip(files, spread_evenly(files, how.max_scenes), strict=True)
     scenes = [(done, row) for done, rows in chosen for row in rows]
@@ -116,7 +116,7 @@ def _parts(
 
 
 def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Report:
-    """Play some scenes with one pair of biases; count them, and their logs."""
+    """Simulate some scenes with one pair of biases; count them, and their logs."""
     from infgen.metrics.flow import add_up, count_flow  # noqa: PLC0415
     from infgen.metrics.traffic import from_log, from_rollout, on_map  # noqa: PLC0415
     from infgen.rollout.rules.off_road import lane_segments  # noqa: PLC0415
@@ -143,7 +143,7 @@ def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Re
         progress(done, len(starts), "rollouts")
 
     rollouts = chain.from_iterable(simulate_all(simulator, starts, weights, tell))
-    # Beyond the end of a map nobody enters: biases are not to make up for that.
+    # Beyond the end of a map no agent enters: biases must not compensate for that.
     plays = [
         count_flow(on_map(from_rollout(rollout), lanes), how.count_radius_m, length)
         for rollout, (length, lanes) in zip(rollouts, played_on, strict=True)
@@ -169,11 +169,11 @@ def finish(
     settings: Settings,
     progress: Progress,
 ) -> Report:
-    """Find the biases, and write them and what was played for them."""
+    """Find the biases, and write them with the counts behind them."""
     target.mkdir(parents=True, exist_ok=True)
     how: CalibrateSettings = settings["calibrate"]
     odds = Biases() if how.method == "none" else read_biases(inputs.folder("train"))
-    found, about = odds, {"by": how.method}
+    found, about = odds, {"method": how.method}
     if units:
         found, about = _find(inputs, units, target, how)
     write_found(target, found)
@@ -183,7 +183,7 @@ def finish(
 def _find(
     inputs: Inputs, units: Sequence[FinishedUnit], target: Path, how: CalibrateSettings
 ) -> tuple[Biases, Report]:
-    """Find the biases in what was played, and say how sure that is."""
+    """Find the biases from the simulations, and say how sure they are."""
     from pipeline.engine.atomic import write_json  # noqa: PLC0415
     from pipeline.stages.flow_response import DESIGN, find_best  # noqa: PLC0415
 
@@ -200,10 +200,10 @@ def _find(
     about: Report = {"scenes": scenes, "refused": refused}
     best = find_best(plays, logs, reach)
     if best is None:
-        # Nobody enters, or too few did to tell.
-        return reach.around, {"by": "odds", **about}
+        # No insertions, or too few to decide.
+        return reach.around, {**about, "method": "odds"}
     return best.biases, {
-        "by": "play",
+        "method": "simulate",
         "came_expected": best.came,
         "went_expected": best.went,
         "agents_expected": best.agents,

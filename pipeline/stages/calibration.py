@@ -2,7 +2,7 @@
 
 The last validation of a training run has its decisions sorted by their probability. A
 network that was shown few scenes often is too sure of them; shifting its log-odds until the
-held-out rates are right keeps what it tells apart and mends how many there are (SPEC 3.6).
+held-out rates are right keeps its ranking and corrects the totals (SPEC 3.6).
 """
 
 import json

@@ -1,9 +1,9 @@
 """How many come and go with which biases, and the biases with which it is right.
 
-A few plays of the same scenes with different biases are met by surfaces: the logarithms of
-who comes, who goes and who is there, quadratic in the bias of entering (where more enter,
-more can leave), linear in that of leaving. Where all three are those of the logs, a scene
-lives on as it began.
+Surfaces are fitted to simulations of the same scenes with different biases: logarithms of
+entries, exits and the number of agents, quadratic in the bias of insertion (where more
+enter, more can leave), linear in that of leaving. Where all three are those of the logs, a
+scene lives on as it began.
 """
 
 from collections.abc import Sequence
@@ -16,20 +16,20 @@ from infgen.metrics.flow import FlowCounts
 from pipeline.stages.calibration import Biases
 
 DESIGN = ((0.0, 0.0), (0.5, -1.0), (0.5, 0.0), (0.5, 1.0), (1.0, 0.0))
-"""Plays: biases of entering and leaving over the odds' own, in reaches."""
+"""Biases of insertion and removal of each simulation, relative to the start, in ranges."""
 BEYOND = 0.5
-"""The best biases may lie this many reaches outside of what was played."""
+"""The best biases may lie this many ranges outside of those simulated."""
 FINE = 0.01
 """What is found is a multiple of this (in reaches) away from the odds' own."""
 FEWEST = 20
-"""Fewer who come or go, in the logs or in any play, decide nothing."""
+"""Fewer entries or exits, in the logs or in any simulation, decide nothing."""
 EASE = 1e-3
 """Squared reaches away from the odds that weigh as much as a squared error of the logs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """Where plays are: around which biases, and how far from them."""
+    """The biases of the simulations: their centre and range."""
 
     around: Biases
     add: float
@@ -49,9 +49,9 @@ class Best:
 
     Attributes:
         biases: Add to the log-odds.
-        came: Who is expected to come with them, as a multiple of the logs'.
-        went: The same for who goes; None where too few did to tell.
-        agents: The same for who is there.
+        came: Expected entries, as a multiple of those of the logs.
+        went: The same for exits; None where there were too few.
+        agents: The same for the number of agents.
         at_the_end: Whether they lie at an end of what may be: better ones lie beyond.
     """
 
@@ -63,10 +63,10 @@ class Best:
 
 
 def find_best(plays: Sequence[FlowCounts], logs: FlowCounts, reach: Reach) -> Best | None:
-    """Find the biases with which rollouts are as their logs: who comes, goes and is there.
+    """Find the biases with which entries, exits and agent counts match the logs.
 
     Args:
-        plays: What came, went and was there at each point of ``DESIGN``.
+        plays: Counts of the simulations at each point of ``DESIGN``.
         logs: What did in the logs of the same scenes.
         reach: Where the points lie.
 
@@ -109,7 +109,7 @@ def _off(
 def _surface(
     design: Float64[np.ndarray, "play 2"], rates: Sequence[float]
 ) -> Float64[np.ndarray, "4"]:
-    """Fit the logarithms of rates; plays one more than its terms."""
+    """Fit the logarithms of rates; one simulation more than terms."""
     found, *_ = np.linalg.lstsq(_terms(design), np.log(rates), rcond=None)
     return found
 

@@ -1,4 +1,4 @@
-"""Stage ``rollout``: weights and the first second of every scene to played futures.
+"""Stage ``rollout``: weights and the first second of every scene to rollouts.
 
 One unit is some scenes of one shard with all their rollouts, so a task is long beside its
 overhead. What a rollout does depends on its scene, its index and the seed alone.
@@ -54,7 +54,7 @@ OF_EXITS = ("remove_bias", "removal_radius_m")
 
 
 def normalize(sections: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Set what is about who enters, or leaves, to its default where nobody does."""
+    """Reset settings of insertion and removal where these are off."""
     settings: RolloutSettings = sections["rollout"]
     idle = (() if settings.inserts else OF_ENTRIES) + (() if settings.removes else OF_EXITS)
     usual = RolloutSettings()
@@ -103,7 +103,7 @@ def _edges(scenes: int, most: int) -> list[int]:
 def simulate(
     unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
 ) -> Report:
-    """Play all rollouts of some scenes, a batch at a time, and write them as groups."""
+    """Simulate all rollouts of some scenes in batches, and write them as groups."""
     from infgen.rollout.rollout import Rollout  # noqa: PLC0415
     from pipeline.storage.zarr_store import write_records  # noqa: PLC0415
 
@@ -164,7 +164,7 @@ def finish(
 
 
 def _starts(unit: Unit, simulator: "Simulator") -> "tuple[list[RolloutStart], list[str]]":
-    """Begin all rollouts; scenes that cannot be played are named with the reason."""
+    """Start all rollouts; scenes that cannot be simulated are named with the reason."""
     task = unit.task
     starts, refused = [], []
     for scene in read_some(Path(task["scenes"]), task["rows"]):

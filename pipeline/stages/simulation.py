@@ -1,4 +1,4 @@
-"""Scenes on disk to rollouts in memory, for every stage that plays."""
+"""Simulation: scenes on disk to rollouts in memory, for the stages that roll out."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ def load_simulator(
     """Load weights once per process: it may outlive what was at a path when it began.
 
     Returns:
-        What plays, and the fingerprint of the weights.
+        The simulator, and the fingerprint of the weights.
     """
     import torch  # noqa: PLC0415
 
@@ -61,7 +61,7 @@ def begin(simulator: "Simulator", scene: "Scene") -> "list[RolloutStart]":
     """Tokenize a scene's history, for all of its rollouts.
 
     Raises:
-        ValueError: if it cannot be played, with the reason.
+        ValueError: if it cannot be simulated, with the reason.
     """
     from infgen.rollout.recording import RolloutStart  # noqa: PLC0415
     from infgen.tokens.tokenizer import read_logged_signals, tokenize_scene  # noqa: PLC0415
@@ -85,13 +85,13 @@ def simulate_all(
     weights: str,
     tell: Callable[[float], None],
 ) -> "Iterator[list[Rollout]]":
-    """Play rollouts, a batch at a time, and make them whole a few at a time.
+    """Simulate rollouts in batches, and collect them a few at a time.
 
     Args:
-        simulator: What plays.
+        simulator: Network and settings.
         starts: Where they begin.
         weights: Fingerprint of the weights.
-        tell: Told how many rollouts are simulated, at every token step of a batch.
+        tell: Called with the number of simulated rollouts at every token step of a batch.
     """
     from infgen.rollout.recording import Frame, collect  # noqa: PLC0415
     from infgen.rollout.simulate import simulate  # noqa: PLC0415

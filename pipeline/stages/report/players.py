@@ -1,4 +1,4 @@
-"""Pages that play the rollouts with the lowest scores, for the report to link to."""
+"""Player pages of the rollouts with the lowest scores, linked from the report."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -153,7 +153,7 @@ def divergence_table(summary: Mapping[str, Any]) -> Table:
 
 
 def worst_table(rows: Sequence[tuple[str, int, float]], pages: Sequence[str]) -> Table:
-    """The rollouts with the lowest scores, and the pages that play them."""
+    """The rollouts with the lowest scores, and their player pages."""
     return Table(
         title="Lowest composites (corrected)",
         columns=["scene", "rollout", "composite"],

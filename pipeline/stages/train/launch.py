@@ -1,7 +1,7 @@
 """Several processes of one training run: which one this is, and what the others do.
 
 ``torchrun -m infgen train ...`` starts the same command several times. The first process
-does as it is told; the others know nothing of stages, locks or logs: they wait until the
+runs the command; the others know nothing of stages, locks or logs: they wait until the
 first one trains, take part in that, and leave when it does. Light to import: without
 ``torchrun`` none of this costs anything.
 """
@@ -21,10 +21,10 @@ def run(command: Callable[[], None], environ: Mapping[str, str]) -> None:
 
 @contextmanager
 def joined(environ: Mapping[str, str]) -> Iterator[bool]:
-    """Find this process's place among others, as ``torchrun`` tells it.
+    """Find the rank of this process from the variables that ``torchrun`` sets.
 
     Yields:
-        True for the first process, or the only one: it does what it is told. Any other has
+        True for the first process, or the only one: it runs the command. Any other has
         by then taken part in all there was.
     """
     rank = find_rank(environ)

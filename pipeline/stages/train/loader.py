@@ -1,7 +1,7 @@
 """Token shards to batches: read scene by scene, in any order, prepared ahead of time.
 
 What a step reads follows from (seed, step) alone, so there is no position to save, and it
-does not matter who prepares it: a thread, or any number of processes.
+does not depend on what prepares it: a thread, or any number of processes.
 """
 
 import multiprocessing
@@ -29,7 +29,7 @@ from pipeline.stages.train.sampler import ScenePermutation
 T = TypeVar("T")
 
 AHEAD = 2
-"""Batches prepared before they are asked for."""
+"""Batches prepared ahead."""
 
 
 class TokenScenes(Sequence[SceneTokens]):
@@ -147,7 +147,7 @@ def _leave_signals_to_the_parent(number: int) -> None:
 
 
 def _prefetched(made: Iterator[T]) -> Iterator[T]:
-    """Take values in a thread, some ahead of who asks for them."""
+    """Take values in a thread, some ahead of the consumer."""
     pool = ThreadPoolExecutor(1, thread_name_prefix="loader")
     try:
         waiting = [pool.submit(_take, made) for _ in range(AHEAD)]

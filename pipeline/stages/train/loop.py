@@ -45,7 +45,7 @@ def train(
     Args:
         setup: What on what; only the first process of a team writes to its folder.
         training: The network with its first weights.
-        progress: Told by the first process.
+        progress: Called by the first process.
         group: The processes that train together; None for this one alone.
 
     Raises:

@@ -128,7 +128,7 @@ class OptimizerStep:
         return StepResult(terms, norm, self._surprise.clone())
 
     def _prepared(self, part: Batch) -> Batch:
-        """Put a part where it is computed, and play it if it is to be played."""
+        """Move a part to its device; simulate it for closed-loop fine-tuning."""
         here = to_device(part, self._sums.device)
         top = self._settings.closed_loop_top_k
         return close_loop(self._training.network, here, top) if top else here

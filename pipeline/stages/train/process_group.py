@@ -47,7 +47,7 @@ class ProcessGroup:
 
     @property
     def leads(self) -> bool:
-        """Whether this is the process that writes and tells."""
+        """Whether this is the process that writes and reports."""
         return self.rank == 0
 
     def add_up(self, values: Tensor) -> None:
@@ -171,7 +171,7 @@ def _next_call() -> dict[str, Any] | None:
 def _process_group(timeout_s: float) -> Iterator[ProcessGroup]:
     rank, device = own_rank(), own_device()
     if _MEETING.store is None:
-        raise PeerError("nobody was joined_group")
+        raise PeerError("this process has not joined a group")
     store = _part(_MEETING.store, f"call-{_MEETING.calls}")
     _MEETING.calls += 1
     if device.type == "cuda":

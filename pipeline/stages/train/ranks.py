@@ -9,7 +9,7 @@ class Rank:
     """The place of a process among those that train together.
 
     Attributes:
-        number: 0 is the first, who alone plans, locks, writes and tells.
+        number: 0 is the first; it alone plans, locks, writes and reports.
         count: How many there are.
         local: Number of this one on its machine, and of its GPU.
     """

@@ -54,7 +54,8 @@ class TrainingSetup:
         """Say what this process makes of the batch of each step.
 
         Raises:
-            TrainingError: if there is nothing to learn from, or not for everyone.
+            TrainingError: if there is nothing to learn from, or not enough for every
+                process.
         """
         how = self.train
         if how.steps and not len(self.scenes):

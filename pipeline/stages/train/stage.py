@@ -45,7 +45,7 @@ DONE = "trained.json"
 
 
 def load_network(folder: Path) -> "Network":
-    """Load the network whose weights a stage folder holds, ready to be played.
+    """Load the network whose weights a stage folder holds, in evaluation mode.
 
     Raises:
         StoreError: if there is none, or it is damaged.
@@ -173,7 +173,7 @@ def _prepare(
 
 
 def _say_nothing(done: float, total: float, note: str = "") -> None:
-    """Only the first process tells progress."""
+    """Ignore progress: only the first process reports it."""
 
 
 def finish(

@@ -1,4 +1,4 @@
-"""Curves for TensorBoard, where that is asked for and installed."""
+"""Curves for TensorBoard, if enabled and installed."""
 
 from collections.abc import Mapping
 from pathlib import Path

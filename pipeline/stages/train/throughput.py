@@ -14,7 +14,7 @@ KIB_PER_MIB = 1024
 
 
 class ThroughputMeter:
-    """Measures steps, tells progress (not more often than anyone can read), notes figures.
+    """Measures throughput: progress at a readable rate, and figures for the record.
 
     What it notes goes below the folder ``run``, which no manifest lists.
     """

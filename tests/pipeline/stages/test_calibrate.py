@@ -65,7 +65,7 @@ def told(point, played, logged=None):
         "logged": dataclasses.asdict(logged or FlowCounts(1000, 1000, 9000, 1000)),
         "refused": ["scene 1: too short"],
     }
-    return FinishedUnit(f"play-{point}-000", "key", Path(), report)
+    return FinishedUnit(f"biases-{point}-000", "key", Path(), report)
 
 
 def test_every_pair_of_biases_is_played_on_the_same_scenes(inputs):
@@ -76,7 +76,7 @@ def test_every_pair_of_biases_is_played_on_the_same_scenes(inputs):
     units = stage.plan(inputs, NARROW)
 
     assert [unit.name for unit in units] == [
-        f"play-{point}-00{part}" for point in range(len(DESIGN)) for part in (0, 1)
+        f"biases-{point}-00{part}" for point in range(len(DESIGN)) for part in (0, 1)
     ]
     scenes = {json.dumps(unit.task["pieces"]) for unit in units}
     assert len(scenes) == 2
@@ -194,7 +194,7 @@ def test_the_biases_with_which_plays_are_as_logs_are_left_for_rollouts(
     report = stage.finish(inputs, units, tmp_path / "out", NARROW, quiet)
 
     assert read_found(tmp_path / "out") == Biases(add=0.4, leave=0.0)
-    assert (report["by"], report["scenes"]) == ("play", 2)
+    assert (report["method"], report["scenes"]) == ("simulate", 2)
     assert report["refused"] == ["scene 1: too short"]
     assert report["came_expected"] == pytest.approx(1, abs=0.01)
     about = json.loads((tmp_path / "out" / "plays.json").read_text())
@@ -213,21 +213,21 @@ def test_where_too_few_come_to_tell_the_odds_decide_and_the_report_says_so(
 
     report = stage.finish(inputs, units, tmp_path / "out", NARROW, quiet)
 
-    assert report["by"] == "odds"
+    assert report["method"] == "odds"
     assert read_found(tmp_path / "out") == Biases()
 
 
-@pytest.mark.parametrize(("by", "add"), [("odds", math.log(3)), ("none", 0.0)])
+@pytest.mark.parametrize(("method", "add"), [("odds", math.log(3)), ("none", 0.0)])
 def test_without_plays_the_last_validation_decides_or_nothing(
-    inputs, tmp_path, quiet, by, add
+    inputs, tmp_path, quiet, method, add
 ):
     log_of(
         inputs.weights,
         add_bins={"count": [400], "predicted": [200], "happened": [300]},
     )
-    settings = stage.normalize(with_settings("calibrate", method=by))
+    settings = stage.normalize(with_settings("calibrate", method=method))
 
     report = stage.finish(inputs, [], tmp_path / "out", settings, quiet)
 
     assert read_found(tmp_path / "out").add == pytest.approx(add, abs=1e-4)
-    assert report["by"] == by
+    assert report["method"] == method
