@@ -137,7 +137,7 @@ def test_the_mean_over_seeds_is_that_of_the_runs(told):
     means = [
         run["numbers"]["agents/near"]["mean"]
         for run in told["runs"]
-        if (run["arm"], run["play"]) == ("smart", "long")
+        if (run["arm"], run["rollout_set"]) == ("smart", "long")
     ]
 
     combined = told["arms"]["smart"]["long"]["agents/near"]

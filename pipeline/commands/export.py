@@ -2,7 +2,7 @@
 
 What is being written stands under ``OUT.partial`` and gets its name when all is there. A
 run that was killed goes on from what it had finished (a scene; for a submission a shard),
-if the same is asked for again.
+if the same export is requested again.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,8 +43,8 @@ class Form(NamedTuple):
 
     Attributes:
         name: File of a rollout, by scenario id and index.
-        write: Writes the files of some rollouts of a scene below a folder, told what lights
-            showed while they were simulated.
+        write: Writes the files of some rollouts of a scene below a folder, with the signals
+            that showed while they were simulated.
     """
 
     name: Callable[[str, int], str]

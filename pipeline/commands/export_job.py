@@ -46,7 +46,7 @@ class Order:
         rollouts: Folder of a stage or unit of rollouts.
         logs: The logs that they continue.
         out: File or folder to write.
-        about: Who submits what; of a submission only.
+        about: Description of a submission; None for other formats.
         scenes_per_shard: Of a submission.
     """
 
@@ -90,10 +90,10 @@ class Exported:
         files: How many in the folder, or shards in the submission.
         bytes: Of all files.
         before: Scenes that an earlier, killed run had written.
-        filled: Agents that no model plays and that keep their velocity, by scene; of a
+        filled: Agents without a model, at constant velocity, by scene; of a
             submission only.
         unused: Rollouts beyond those that a submission holds.
-        not_simulated: What the stage of the rollouts could not play, with the reasons.
+        not_simulated: Scenes that could not be simulated, with the reasons.
     """
 
     format: str
@@ -139,7 +139,7 @@ class Part(NamedTuple):
 
 
 class Steps:
-    """Tells how many scenes are done."""
+    """Reports how many scenes are done."""
 
     def __init__(self, tell: Callable[[Event], None], total: int) -> None:
         self._tell, self.total, self.done = tell, total, 0
@@ -179,7 +179,7 @@ def find_units(rollouts: Path) -> list[Unit]:
         if not _SAFE_ID.fullmatch(scenario_id):
             raise ExportError(f"scenario id {scenario_id!r} cannot name a file")
     if not any(unit.scenes for unit in found):
-        raise ConfigError(f"{rollouts} holds no rollouts; `infgen rollout` plays some")
+        raise ConfigError(f"{rollouts} holds no rollouts; `infgen rollout` makes some")
     return found
 
 
@@ -212,7 +212,7 @@ def parts_of(unit: Unit) -> Iterator[Part]:
 
 
 def not_simulated(rollouts: Path) -> list[str]:
-    """Say what the stage of some rollouts could not play."""
+    """List the scenes that could not be simulated."""
     if not (rollouts / MANIFEST).is_file():
         return []
     return list(read_manifest(rollouts).get("report", {}).get("refused", []))
@@ -230,7 +230,7 @@ def begin(order: Order, units: Sequence[Unit]) -> Iterator[None]:
         order.check_free()
         _clear(order, units)
         yield
-        # Who has waited for it finds that ``out`` is there, so nobody needs it any more.
+        # A process that waited for the lock finds ``out``: the lock is no longer needed.
         order.lock.unlink()
 
 

@@ -41,7 +41,7 @@ _ENDINGS = (".tar.gz", ".tgz")
 
 
 def read_description(path: Path, root: Root) -> About:
-    """Read who submits what from a YAML file; the root knows the number of parameters.
+    """Read the description of a submission from YAML; the root knows its parameters.
 
     Raises:
         ConfigError: naming the file and the field that is unknown, wrong or missing.
@@ -56,7 +56,7 @@ def read_description(path: Path, root: Root) -> About:
 
 
 def _needed() -> list[str]:
-    """Fields of a submission that have to be told."""
+    """Required fields of a submission."""
     return [f.name for f in fields(About)][:4]
 
 
@@ -68,7 +68,7 @@ def export_submission(order: Order, units: Sequence[Unit], steps: Steps) -> Expo
     """Check every scene, write the shards and pack them.
 
     Raises:
-        ConfigError: if it is not told who submits what, or ``out`` names no archive.
+        ConfigError: if the description is missing, or ``out`` names no archive.
         RolloutsError: naming the first scene that is not as it must be.
         LockedError: if another process writes there.
     """
@@ -109,7 +109,7 @@ def _shard_name(shard: int, count: int) -> str:
 
 
 def _tally_of(path: Path) -> Path:
-    """File that tells what was filled in a shard."""
+    """File that lists what was filled in a shard."""
     return path.with_name(f"{path.name}.json")
 
 

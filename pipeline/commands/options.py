@@ -153,7 +153,7 @@ class RunFlags:
 
 @dataclass(frozen=True, slots=True)
 class ComparisonOptions:
-    """Which methods are trained, played and scored to be compared."""
+    """Which methods are trained, simulated, scored and compared."""
 
     preset: Annotated[
         str | None,
@@ -190,7 +190,7 @@ class ComparisonOptions:
     def comparison(
         self, request_options: RequestOptions, targets: Sequence[str]
     ) -> Comparison:
-        """Find the preset, and lay over it what else is asked.
+        """Find the preset, and merge the other options into it.
 
         Raises:
             ConfigError: for a preset that does not exist.

@@ -185,7 +185,7 @@ _LINES = {
     "workers-missing": "{stage}: there are no workers; waiting {timeout_min:g} minutes "
     "for one",
     "stage-done": "{stage}: made; {figures}",
-    "stage-failed": "{stage}: failed; the log tells more, and the next run tries again",
+    "stage-failed": "{stage}: failed; the log says more, and the next run tries again",
     "stage-skipped": "{stage}: skipped, as what it needs is not made",
     "arm-run-started": "{arm_run} (run {number} of {arm_runs})",
     "arm-run-failed": "{arm_run}: {why}",

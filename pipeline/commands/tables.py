@@ -215,10 +215,10 @@ def show_exported(found: "Exported") -> None:
         rows.append(("rollouts left out", found.unused))
     if found.filled:
         agents = f"{sum(found.filled.values())} in {len(found.filled)} scenes"
-        rows.append(("agents that no model plays and that keep their velocity", agents))
+        rows.append(("agents without a model, at constant velocity", agents))
     show_table(f"export to {found.format}", ("what", "value"), rows)
     for line in found.not_simulated:
-        _warn(f"not played, so not in it: {line}")
+        _warn(f"not simulated, so not in it: {line}")
 
 
 def show_official(found: "Official", *, per_scene: bool) -> None:

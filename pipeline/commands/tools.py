@@ -44,7 +44,7 @@ class WosacOptions:
     per_scene: Annotated[bool, typer.Option("--per-scene", help="Each scene too.")] = False
 
     def official(self, tell: Callable[[Event], None]) -> "Official":
-        """Score; tells how far it is."""
+        """Score, with progress events."""
         from pipeline.commands.wosac import score_files  # noqa: PLC0415
 
         names = split_names(self.records)
@@ -66,7 +66,7 @@ class TownsOptions:
     jobs: Annotated[int, typer.Option(help="Processes; 0: one per core.")] = 0
 
     def write(self, tell: Callable[[Event], None]) -> "Written":
-        """Write their records; tells how far it is."""
+        """Write their records, with progress events."""
         from pipeline.storage.towns import Order, write_towns  # noqa: PLC0415
 
         return write_towns(Order(**asdict(self)), tell)
@@ -89,12 +89,12 @@ class ExportOptions:
         typer.Option(help="Their logs: TFRecords, or an ingested folder; default: root's."),
     ] = None
     about: Annotated[
-        Path | None, typer.Option(help="YAML file that tells who submits what (wosac).")
+        Path | None, typer.Option(help="YAML file that describes the submission (wosac).")
     ] = None
     scenes_per_shard: Annotated[int, typer.Option(help="Of wosac.", min=1)] = 300
 
     def write(self, tell: Callable[[Event], None]) -> "Exported":
-        """Export; tells how far it is."""
+        """Export, with progress events."""
         from pipeline.commands.export import export  # noqa: PLC0415
         from pipeline.commands.export_job import Order  # noqa: PLC0415
         from pipeline.commands.export_wosac import read_description  # noqa: PLC0415
@@ -145,7 +145,7 @@ class ViewOptions:
     theme: Annotated[str, typer.Option(help="light or dark: video and strip.")] = "light"
 
     def write(self, tell: Callable[[Event], None]) -> "Shown":
-        """Write it; tells how far it is."""
+        """Write it, with progress events."""
         from pipeline.commands.view import Wanted, check_records, is_root, view  # noqa: PLC0415
 
         words = [part for word in self.source or () for part in split_names(word)]
@@ -197,7 +197,7 @@ def towns(json_: Json = False, *, building: TownsOptions) -> None:
 
     Example: infgen towns --out towns --scenes 200 --seconds 31.1 --split validation
 
-    A run that was killed goes on where it stopped, if the same is asked for again.
+    A run that was killed goes on where it stopped, if the same is requested again.
     """
     with signals.handling_signals(), Screen() as screen:
         found = building.write(screen)
@@ -247,7 +247,7 @@ def export(json_: Json = False, *, exporting: ExportOptions) -> None:
 @app.command()
 @gathers(viewing=ViewOptions)
 def view(json_: Json = False, *, viewing: ViewOptions) -> None:
-    """Write a page that plays a scene: its rollouts and its log, side by side.
+    """Write a player page of a scene: its rollouts and its log, side by side.
 
     Example: infgen view R --scene 637f20 --rollouts 0,1,2
 

@@ -34,10 +34,10 @@ from pipeline.engine.status import StageStatus, stage_statuses
 from pipeline.settings.request import Request
 
 FAILED, WRONG, STALE, LOCKED = 1, 2, 3, 75
-"""Exit codes, as ``cli.py`` tells them."""
+"""Exit codes, as in the help of ``cli.py``."""
 IDLE_LOOKS = 2
 MOST_NAMED = 3
-"""Quarantined records that are told of."""
+"""Most quarantined records that are printed."""
 
 
 def run_stages(

@@ -177,7 +177,7 @@ def check_records(word: str) -> None:
 
 
 def write_page(view_model: "ViewModel", path: Path) -> Path:
-    """Write the page that plays a film."""
+    """Write the player page of a view model."""
     from infgen.views.player import player_page  # noqa: PLC0415
 
     path.parent.mkdir(parents=True, exist_ok=True)

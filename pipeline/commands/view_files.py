@@ -172,7 +172,7 @@ def _make_pieces(
     tell: Tell,
     workers: int | None,
 ) -> None:
-    """Make all pieces, here or by several processes; tells how far it is."""
+    """Make all pieces, here or by several processes, with progress events."""
     workers = len(os.sched_getaffinity(0)) if workers is None else workers
     tell(
         {"event": "work-started", "stage": "video", "units": 1, "made": 0, "what": "frames"}

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 MOST_NAMED = 8
 MOST_BAD = 3
-"""Of records that cannot be used so many are told of."""
+"""Most unusable records that a message names."""
 MOST_ROLLOUTS = 3
-"""So many rollouts are shown where none are asked for."""
+"""Rollouts shown by default."""
 
 
 class Seen(NamedTuple):
@@ -45,7 +45,7 @@ def find_in_root(root: Root, prefix: str, rollouts: Sequence[int] | None) -> See
     if played is None:
         if rollouts:
             raise ConfigError(
-                f"{root.path} holds no rollouts; `infgen rollout --root {root.path}` plays "
+                f"{root.path} holds no rollouts; `infgen rollout --root {root.path}` makes "
                 "some, and makes what is missing before (-n: only says what)"
             )
         return Seen(_find_log(root, prefix), ())

@@ -43,7 +43,7 @@ class Row:
         at_work: Units under way.
         quarantined: Records set aside; None in a stage that sets none aside.
         failed: Units that failed, in this run or, when it is over, in the last one.
-        run: Who makes it: process, host, since when, workers; empty if nobody does.
+        run: The run that makes it: process, host, start, workers; empty if there is none.
         note: What the work says of itself, or why the stage stands as it does.
     """
 
@@ -83,10 +83,10 @@ class RootSnapshot:
 
 
 class Watcher:
-    """Looks at a root as often as it is asked to.
+    """Takes snapshots of a root.
 
     Args:
-        ask: Gives the request; anew each time, as another run may change what is asked.
+        ask: Returns the request; read anew each time, as another run may change it.
         environ: For ``stages.yaml``.
     """
 

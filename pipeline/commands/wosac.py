@@ -77,7 +77,7 @@ def score_files(
         rollouts: A submission, a folder of its files, or a folder of our rollouts.
         metric: A name in ``VERSIONS``.
         num_rollouts: How many rollouts each scene of a submission must have; 0 for any.
-        tell: Is told how far it is.
+        tell: Receives progress events.
 
     Raises:
         ConfigError: for another metric, or where there is nothing to score.

@@ -36,7 +36,7 @@ def claims(found: ComparisonResult) -> Sheet:
 
 
 def _claimed(found: ComparisonResult) -> list[tuple[str, str, str]]:
-    """Rows of the claims: what it is, kind of play, and name of the number."""
+    """Rows of the claims: what it is, kind of rollout set, and name of the number."""
     ace = f"{found.preset.count_error}_near"
     rows = [
         ("Mean ACE", LONG, f"ace/{ace}"),

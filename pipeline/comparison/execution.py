@@ -1,6 +1,6 @@
 """Making all runs of a comparison, one after the other; a failed one stops no other.
 
-Each is a normal run of the engine: cached, resumable, locked, told to the same log.
+Each is a normal run of the engine: cached, resumable, locked, in the same log.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ class ExecutedRun:
 
     @property
     def is_whole(self) -> bool:
-        """Whether all that was asked for is there."""
+        """Whether all requested stages are made."""
         return self.state in ("cached", "made")
 
     @property
@@ -54,7 +54,7 @@ class ExecutedRun:
         return {
             "arm": self.arm_run.arm.name,
             "seed": self.arm_run.seed,
-            "play": self.arm_run.play,
+            "rollout_set": self.arm_run.rollout_set,
             "keys": self.keys,
             "missing": self.why if not self.is_whole else "",
         }
@@ -72,7 +72,7 @@ def execute_arm_runs(
         comparison: How they are planned.
         arm_runs: The runs, each after those whose weights it goes on from.
         run_options: How each is run.
-        events: Told of everything.
+        events: Receives all events.
 
     Raises:
         ConfigError: for settings that cannot be, of any of them, before the first.

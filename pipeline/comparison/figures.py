@@ -76,15 +76,17 @@ def _chart(
 
 
 def _lines(found: ComparisonResult, name: str) -> list[Series]:
-    """One line per arm and long play: the mean over its seeds."""
+    """One line per arm and long rollout set: the mean over its seeds."""
     lines = []
     for arm in found.arms:
-        plays = found.runs(arm, LONG)
-        for play, runs in plays.items():
+        rollout_sets = found.runs(arm, LONG)
+        for rollout_set, runs in rollout_sets.items():
             curves = [curve for one in runs if (curve := _curve(one, name)) is not None]
             if curves:
                 mean = mean_curve(curves)
-                label = arm.label if len(plays) == 1 else f"{arm.label}, {play}"
+                label = (
+                    arm.label if len(rollout_sets) == 1 else f"{arm.label}, {rollout_set}"
+                )
                 lines.append(Series(label, middle_s(runs[0].measures, len(mean)), mean))
     return lines
 

@@ -13,7 +13,7 @@ from pipeline.settings.presets import Arm, Preset
 from pipeline.stages.score_summary import Tally
 
 LONG, MOTION_ONLY, OFFICIAL_PLAY = "long", "motion-only", "wosac"
-"""Modes of rollouts: whose play is which of the paper's tables."""
+"""Modes of rollouts: whose rollout set is which of the paper's tables."""
 SUBJECT = "InfGen"
 """The paper's own method; the others are what it is held against."""
 
@@ -36,7 +36,7 @@ class ComparisonResult:
 
     @cached_property
     def numbers(self) -> Numbers:
-        """Every number over its seeds, by arm and play."""
+        """Every number over its seeds, by arm and rollout set."""
         return combine(self.scored)
 
     @property
@@ -67,22 +67,24 @@ class ComparisonResult:
         return [arm for arm in self.preset.arms.values() if arm.name in have]
 
     def runs(self, arm: Arm, mode: str) -> dict[str, list[Scored]]:
-        """Runs of an arm that were simulated in one mode, by play."""
+        """Runs of an arm that were simulated in one mode, by rollout set."""
         found: dict[str, list[Scored]] = {}
         for one in self.scored:
             if one.arm == arm.name and one.mode == mode:
-                found.setdefault(one.play, []).append(one)
+                found.setdefault(one.rollout_set, []).append(one)
         return found
 
     def rows(
         self, arms: Sequence[Arm], mode: str
     ) -> Iterator[tuple[str, Mapping[str, Measured]]]:
-        """Yield the numbers of some arms' plays of one mode, each with its name."""
+        """Yield the numbers of some arms' rollout sets of one mode, each with its name."""
         for arm in arms:
-            plays = self.runs(arm, mode)
-            for play in plays:
-                label = arm.label if len(plays) == 1 else f"{arm.label}, {play}"
-                yield label, self.numbers[arm.name, play]
+            rollout_sets = self.runs(arm, mode)
+            for rollout_set in rollout_sets:
+                label = (
+                    arm.label if len(rollout_sets) == 1 else f"{arm.label}, {rollout_set}"
+                )
+                yield label, self.numbers[arm.name, rollout_set]
 
     def ratio(self, ours: Arm, theirs: Arm, mode: str, name: str) -> Measured:
         """Give one number of an arm as a multiple of another arm's."""
@@ -92,9 +94,9 @@ class ComparisonResult:
     def to_json(self) -> dict[str, Any]:
         """Every number, and where it comes from."""
         combined: dict[str, Any] = {}
-        for (arm, play), numbers in self.numbers.items():
+        for (arm, rollout_set), numbers in self.numbers.items():
             values = {name: one.to_json() for name, one in numbers.items()}
-            combined.setdefault(arm, {})[play] = values
+            combined.setdefault(arm, {})[rollout_set] = values
         return {
             "preset": self.preset.name,
             "seeds": self.seeds,
@@ -138,7 +140,9 @@ def compare(preset: Preset, ran: Sequence[ExecutedRun]) -> ComparisonResult:
     Raises:
         StoreError: if it is damaged.
     """
-    scored = [read_scored(each) for each in ran if each.is_whole and each.arm_run.play]
+    scored = [
+        read_scored(each) for each in ran if each.is_whole and each.arm_run.rollout_set
+    ]
     scenes = dict.fromkeys(scene for one in scored for scene in one.tally.means)
     logs = read_logs(scored[0].ran, list(scenes)) if scored else Tally()
     return ComparisonResult(preset, ran, scored, logs)

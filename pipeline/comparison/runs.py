@@ -1,7 +1,7 @@
-"""The runs that a preset is made of: every arm with every seed, and all its plays.
+"""The runs that a preset is made of: every arm with every seed, and all its rollout sets.
 
 Runs share what they have in common: their stages have keys, so records are read once, and
-weights are trained once for all plays of an arm.
+weights are trained once for all rollout sets of an arm.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,41 +27,45 @@ _NO_SEED = "the seeds of a preset are numbered from 0: --seeds says how many"
 
 @dataclass(frozen=True, slots=True)
 class ArmRun:
-    """One arm with one seed, and one of its plays.
+    """One arm with one seed, and one of its rollout sets.
 
     Attributes:
         preset: Name of the preset.
         arm: The arm.
         seed: Of its training and of its rollouts.
-        play: Name of the play; empty where only what is before it is wanted.
+        rollout_set: Name of the rollout set; empty where only what is before it is wanted.
     """
 
     preset: str
     arm: Arm
     seed: int
-    play: str = ""
+    rollout_set: str = ""
 
     @property
     def name(self) -> str:
         """Its name in the root's memory; fit for a file."""
-        parts = (PRESET, self.preset, self.arm.name, str(self.seed), self.play)
+        parts = (PRESET, self.preset, self.arm.name, str(self.seed), self.rollout_set)
         return ".".join(part for part in parts if part)
 
     @property
     def words(self) -> str:
         """What it is, in words."""
-        parts = (self.arm.name, f"seed {self.seed}", self.play)
+        parts = (self.arm.name, f"seed {self.seed}", self.rollout_set)
         return ", ".join(part for part in parts if part)
 
     @property
     def settings(self) -> Overlay:
-        """What the arm and its play set."""
-        return self.arm.rollout_sets[self.play] if self.play else self.arm.settings
+        """What the arm and its rollout set set."""
+        return (
+            self.arm.rollout_sets[self.rollout_set]
+            if self.rollout_set
+            else self.arm.settings
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What is asked of a preset: how all its runs are planned.
+    """A requested comparison: how all its runs are planned.
 
     Attributes:
         root: Where they are made.
@@ -115,7 +119,7 @@ class Comparison:
         )
 
     def request(self, arm_run: ArmRun, start: str | None = None) -> Request:
-        """Write one run as if it had been asked for by itself."""
+        """Return one run as a request of its own."""
         over = merge_overlays(self._over(arm_run, start))
         return Request(
             root=self.root,
@@ -131,7 +135,7 @@ class Comparison:
         return stages_in_order(self.file.stages, self._last)
 
     def remember(self, keys: Mapping[str, str]) -> None:
-        """Let the root know what was asked, for a command that does not name it."""
+        """Remember the request in the root, for commands without options."""
         name = f"{PRESET}.{self.preset.name}"
         about = {
             "records": self.records,
@@ -148,7 +152,7 @@ class Comparison:
         return [SCORE if target == REPORT else target for target in self.targets]
 
     def _targets(self, arm_run: ArmRun) -> list[str]:
-        weights_only = not arm_run.play and ROLLOUT in self.stages
+        weights_only = not arm_run.rollout_set and ROLLOUT in self.stages
         return [TRAIN] if weights_only else self._last
 
     def _chosen(self, arm_run: ArmRun, start: str | None) -> Overlay:
@@ -191,16 +195,16 @@ def arm_runs_of(comparison: Comparison, arms: Sequence[Arm], seeds: int) -> list
         arms: Arms that are compared; those that they go on from are trained too.
         seeds: How many.
     """
-    plays = ROLLOUT in comparison.stages
+    rollout_sets = ROLLOUT in comparison.stages
     starts = comparison.preset.initial_arms(arms)
     found = []
     for seed in range(seeds):
         for arm in comparison.preset.arms.values():
-            if arm in starts or (arm in arms and not plays):
+            if arm in starts or (arm in arms and not rollout_sets):
                 found.append(ArmRun(comparison.preset.name, arm, seed))
             elif arm in arms:
                 found += [
-                    ArmRun(comparison.preset.name, arm, seed, play)
-                    for play in arm.rollout_sets
+                    ArmRun(comparison.preset.name, arm, seed, rollout_set)
+                    for rollout_set in arm.rollout_sets
                 ]
     return found

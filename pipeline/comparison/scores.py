@@ -65,9 +65,9 @@ class Scored:
         return self.ran.arm_run.seed
 
     @property
-    def play(self) -> str:
-        """Name of its play."""
-        return self.ran.arm_run.play
+    def rollout_set(self) -> str:
+        """Name of its rollout set."""
+        return self.ran.arm_run.rollout_set
 
     def to_json(self) -> dict[str, Any]:
         """Where its numbers come from, and what they are."""

@@ -17,7 +17,7 @@ _T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
 _Z_975 = 1.959964
 
 Numbers = Mapping[tuple[str, str], Mapping[str, Measured]]
-"""Numbers by name, by arm and play."""
+"""Numbers by name, by arm and rollout set."""
 
 
 def student_t(degrees: int) -> float:
@@ -49,10 +49,10 @@ def over_seeds(values: Sequence[Measured]) -> Measured:
 
 
 def combine(scored: Sequence[Scored]) -> Numbers:
-    """Give every arm's and play's numbers over their seeds."""
+    """Give every arm's and rollout set's numbers over their seeds."""
     groups: dict[tuple[str, str], list[Scored]] = {}
     for one in scored:
-        groups.setdefault((one.arm, one.play), []).append(one)
+        groups.setdefault((one.arm, one.rollout_set), []).append(one)
     return {
         key: {
             name: over_seeds([one.numbers[name] for one in some if name in one.numbers])
@@ -68,7 +68,7 @@ def ratio(ours: Sequence[Scored], theirs: Sequence[Scored], name: str) -> Measur
     With one seed the interval is that of drawing scenes again, the same ones for both.
 
     Args:
-        ours: Runs of one play of one arm.
+        ours: Runs of one rollout set of one arm.
         theirs: The same of the other.
         name: Of the number.
     """

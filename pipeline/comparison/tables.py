@@ -102,7 +102,7 @@ def long_term(found: ComparisonResult) -> Sheet:
 
 
 def motion_only(found: ComparisonResult) -> Sheet:
-    """Table 3: the same length, nobody comes or goes."""
+    """Table 3: motion only, the same length."""
     theirs: list[list[SheetCell]] = [
         [f"{each.method}, published", *each.motion_only.values()]
         for each in _published(found)
@@ -145,7 +145,7 @@ def against_logs(found: ComparisonResult) -> Sheet:
         "agents/near": "agents near the ego",
         "corrected/collision_rate": "collision rate",
         "corrected/offroad_rate": "off-road rate",
-        "corrected/newcomer_offroad_rate": "newcomers' off-road rate",
+        "corrected/newcomer_offroad_rate": "inserted agents' off-road rate",
     }
     logged = {name: truth(found.logs, name) for name in (*rates, *shares)}
     columns = ["method"]
@@ -163,7 +163,7 @@ def against_logs(found: ComparisonResult) -> Sheet:
         logs += [_scaled(Measured(logged[name]), CLOCK.token_s).mean, None]
     return Sheet(
         name="against-the-logs",
-        title="Beside what happened: who comes, goes and is there",
+        title="Compared with the logs: entries, exits and agent counts",
         columns=[*columns, *shares.values()],
         rows=[[*logs, *[logged[name] for name in shares]], *rows] if rows else [],
         note="Entries and exits within 75 m of the ego, over the whole rollout and the "
@@ -188,7 +188,7 @@ def runs(found: ComparisonResult) -> Sheet:
         title="Runs",
         columns=["run", "scenes", "rollouts", "weights", "key of the scores", "missing"],
         rows=rows,
-        note="`infgen show KEY` tells how anything was made; all keys and numbers are in "
+        note="`infgen show KEY` shows how anything was made; all keys and numbers are in "
         "comparison.json.",
     )
 

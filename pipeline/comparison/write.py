@@ -51,7 +51,7 @@ def write_comparison(
     """Write what the runs of a preset have scored; return the folder to look into.
 
     Args:
-        comparison: As it was asked for.
+        comparison: The request.
         ran: All its runs; those that are not whole are named.
         again: Write it even if it is there.
 
@@ -136,6 +136,6 @@ def _words(found: ComparisonResult) -> str:
     scenes = " or ".join(map(str, sorted({one.scenes for one in found.scored}))) or "no"
     seeds = ", ".join(map(str, found.seeds)) or "none"
     return (
-        f"{arms}: trained alike on the same records and played on {scenes} held-out "
+        f"{arms}: trained alike on the same records and simulated on {scenes} held-out "
         f"scenes; seeds: {seeds}."
     )

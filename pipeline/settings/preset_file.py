@@ -40,11 +40,11 @@ def read_preset(
     known(entry, (*_PRESET, *sections), name)
     context = _settings(entry, sections)
     rollout_sets = {
-        play: _only_settings(inner(entry, "rollout_sets"), play, sections)
-        for play in inner(entry, "rollout_sets")
+        rollout_set: _only_settings(inner(entry, "rollout_sets"), rollout_set, sections)
+        for rollout_set in inner(entry, "rollout_sets")
     }
-    for play in rollout_sets:
-        _check_name(inner(entry, "rollout_sets"), play, "rollout set")
+    for rollout_set in rollout_sets:
+        _check_name(inner(entry, "rollout_sets"), rollout_set, "rollout set")
     arms = {
         arm: _arm(
             inner(entry, "arms"), arm, _Context(context, rollout_sets, sections, profiles)
@@ -90,8 +90,8 @@ def _arm(arms: LinedMapping, name: str, context: _Context) -> Arm:
         profile=_profile(entry, context.profiles),
         settings=settings,
         rollout_sets={
-            play: merge_overlays([settings, context.rollout_sets[play], over])
-            for play, over in own.items()
+            rollout_set: merge_overlays([settings, context.rollout_sets[rollout_set], over])
+            for rollout_set, over in own.items()
         },
         starts_from=_word(entry, "starts_from", tuple(arms)),
         ablates=_word(entry, "ablates", tuple(arms)),
@@ -107,14 +107,16 @@ def _own_rollout_sets(
     given = entry.get("rollout_sets")
     if isinstance(given, LinedMapping):
         known(given, rollout_sets, "rollout_sets")
-        return {play: _only_settings(given, play, sections) for play in given}
-    for play in words(entry, "rollout_sets"):
-        if play not in rollout_sets:
+        return {
+            rollout_set: _only_settings(given, rollout_set, sections)
+            for rollout_set in given
+        }
+    for rollout_set in words(entry, "rollout_sets"):
+        if rollout_set not in rollout_sets:
             where = entry.where("rollout_sets")
-            raise ConfigError(
-                f"{where}: no rollout set {play!r}{did_you_mean(play, rollout_sets)}"
-            )
-    return {play: Overlay((), {}) for play in words(entry, "rollout_sets")}
+            near = did_you_mean(rollout_set, rollout_sets)
+            raise ConfigError(f"{where}: no rollout set {rollout_set!r}{near}")
+    return {rollout_set: Overlay((), {}) for rollout_set in words(entry, "rollout_sets")}
 
 
 def _only_settings(mapping: LinedMapping, key: str, sections: Sequence[str]) -> Overlay:

@@ -87,7 +87,7 @@ class _Shop:
 
 
 def names(arm_runs):
-    return [(arm_run.arm.name, arm_run.seed, arm_run.play) for arm_run in arm_runs]
+    return [(arm_run.arm.name, arm_run.seed, arm_run.rollout_set) for arm_run in arm_runs]
 
 
 def test_every_arm_is_run_with_every_seed_and_play_starts_first(shop):
@@ -140,7 +140,7 @@ def test_an_arm_goes_on_from_the_weights_of_its_start_and_its_own_seed(shop):
 
 
 def test_a_play_has_the_settings_of_its_arm(shop):
-    ran = {(one.arm_run.arm.name, one.arm_run.play): one for one in shop.run()}
+    ran = {(one.arm_run.arm.name, one.arm_run.rollout_set): one for one in shop.run()}
 
     def told(*arm_run):
         return ran[arm_run].results[-1].report
@@ -184,7 +184,7 @@ def test_who_goes_on_from_failed_weights_is_left_out_and_says_so(shop):
     text = text.replace("plain: {rollout_sets", "plain: {train: {fail: true}, rollout_sets")
     (shop.folder / "stages.yaml").write_text(text)
 
-    ran = {(one.arm_run.arm.name, one.arm_run.play): one for one in shop.run()}
+    ran = {(one.arm_run.arm.name, one.arm_run.rollout_set): one for one in shop.run()}
 
     assert ran["plain", "long"].state == "failed"
     assert ran["plain", "brief"].state == "skipped"  # The same weights are not tried twice.
