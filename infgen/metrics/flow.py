@@ -1,9 +1,8 @@
-"""How many agents are around the ego, come and go: the same for logs and rollouts.
+"""Agent counts, entries and exits around the ego, the same way for logs and rollouts.
 
-Whoever is within a radius for the first time has come, whoever was there for the last time
-has gone, however that came about: an agent that drives in from beyond arrives as one does
-that enters there. So those there now, plus who comes, less who goes, are there at the end;
-a rollout in which both rates are those of its log has as many agents as the log.
+An agent enters when it is within the radius for the first time and exits when it is there
+for the last time, whether it was inserted there or drove in. So the count at the end is the
+count now plus entries minus exits; a rollout with the rates of its log has as many agents.
 """
 
 from collections.abc import Iterable
@@ -16,7 +15,7 @@ from infgen.clock import CLOCK
 from infgen.metrics.traffic import Traffic
 
 UNSEEN_TOKENS = 2
-"""In a log's last second nobody can be told gone from lost for a moment."""
+"""In the last second of a log, an exit cannot be told from a gap in the track."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,9 +23,9 @@ class FlowCounts:
     """Counts of some logs or rollouts.
 
     Attributes:
-        came: Who was not there, and then was.
-        went: Who was there, and never again.
-        agents: Who was there at the end of a half second, added up over all.
+        came: Entries.
+        went: Exits for good.
+        agents: Agents present at the end of a token step, summed over all token steps.
         tokens: Token steps that were looked at.
     """
 
@@ -51,11 +50,11 @@ class FlowCounts:
 def count_flow(
     traffic: Traffic, radius_m: float, temporal_window_tokens: int | None = None
 ) -> FlowCounts:
-    """Count who is around the ego, comes and goes after now, but in the last second.
+    """Count agents around the ego, entries and exits after now, without the last second.
 
     Args:
         traffic: A log or a rollout.
-        radius_m: Whoever is nearer to the ego is around it.
+        radius_m: Agents nearer to the ego are around it.
         temporal_window_tokens: Count as if there were so many token steps after now, and
             as much before as there is, in as many such windows as there is room for.
             Whoever is away for a while has gone for good in a log that ends before, so long
@@ -83,7 +82,7 @@ def _windows(tokens: int, length: int) -> Int64[np.ndarray, " window"]:
 
 
 def _count_window(near: Bool[np.ndarray, "agent step"], now: int) -> FlowCounts:
-    """Count in one window, given who is around the ego at which of its steps."""
+    """Count in one window, from presence around the ego at each of its steps."""
     after = near.shape[1] - 1 - now
     tokens = max(0, after // CLOCK.steps_per_token - UNSEEN_TOKENS)
     ends = now + CLOCK.steps_per_token * np.arange(1, tokens + 1)

@@ -135,7 +135,7 @@ def _followed(
     rows: Int64[np.ndarray, " object"],
     size_lwh_m: Float32[np.ndarray, "agent 3"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """List who drives behind whom: object, agent, step and the gap between the boxes."""
+    """List followers: object, followed agent, step and the gap between the boxes."""
     half_m = size_lwh_m[:, :2] / 2
     reach_m = np.hypot(half_m[:, 0], half_m[:, 1])
     cos, sin = np.cos(-heading_rad[rows]), np.sin(-heading_rad[rows])  # [object, step]

@@ -1,8 +1,8 @@
-"""Entries and exits: who comes and goes in which half second, and how far from the ego.
+"""Entries and exits: their token steps and distances from the ego.
 
 Log and simulation are read the same way. An agent enters in the token step at whose end it
 is first placed, and leaves in the last one it is seen through (SPEC 3.3). The ego and
-whoever is there now have not entered.
+agents present now have not entered.
 """
 
 from dataclasses import dataclass

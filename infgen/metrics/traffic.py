@@ -1,4 +1,4 @@
-"""Traffic in one form, logged or played, so that both are measured by the same code."""
+"""Traffic in one form, logged or simulated, so that the same code measures both."""
 
 from dataclasses import dataclass, replace
 
@@ -46,7 +46,7 @@ class Traffic:
 
     @property
     def there_now(self) -> Bool[np.ndarray, " agent"]:
-        """Who is there at the last step of the history."""
+        """Agents present at the last step of the history."""
         return self.motion.valid[0, :, self.now]
 
 
@@ -90,7 +90,7 @@ def from_log(scene: Scene, settings: TokenSettings) -> Traffic:
 
 
 def from_rollout(rollout: Rollout) -> Traffic:
-    """Read a played future."""
+    """Read a rollout."""
     xyz_m = np.ascontiguousarray(np.moveaxis(rollout.xyz_m, -1, 0))
     return Traffic(
         scenario_id=rollout.scenario_id,
@@ -117,7 +117,7 @@ def on_map(traffic: Traffic, lanes: Lanes) -> Traffic:
 
     Args:
         traffic: With its events, those of what is cut off too.
-        lanes: All of the map's; on a map without any nobody leaves it.
+        lanes: All lanes of the map; without any the ego never leaves the map.
     """
     motion = traffic.motion
     x_m, y_m = motion.x_m[0, traffic.ego], motion.y_m[0, traffic.ego]

@@ -15,8 +15,8 @@ from infgen.settings import (
     Int,
     NonNegative,
     Seed,
-    Text,
     Share,
+    Text,
 )
 
 

@@ -145,7 +145,7 @@ def against_logs(found: ComparisonResult) -> Sheet:
         "agents/near": "agents near the ego",
         "corrected/collision_rate": "collision rate",
         "corrected/offroad_rate": "off-road rate",
-        "corrected/newcomer_offroad_rate": "inserted agents' off-road rate",
+        "corrected/inserted_offroad_rate": "inserted agents' off-road rate",
     }
     logged = {name: truth(found.logs, name) for name in (*rates, *shares)}
     columns = ["method"]

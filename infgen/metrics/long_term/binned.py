@@ -34,7 +34,7 @@ class Binned:
     Attributes:
         scenario_id: Id of the log.
         index: Which rollout; ``traffic.LOGGED`` for the log.
-        there_now: Who is there at the last step of the history.
+        there_now: Agents present at the last step of the history.
         bins: Bin of each of ``STEP_FEATURES``, or ``NO_BIN``, by protocol.
         entry_token: As in ``placement.Events``.
         entry_distance_m: As in ``placement.Events``.
@@ -64,7 +64,7 @@ def bin_traffic(
     Args:
         traffic: A log or a rollout.
         edges: Road edges; without any, the map features have no values.
-        count_radius_m: Who is nearer to the ego counts as near.
+        count_radius_m: Agents nearer to the ego count as near.
         as_logged: Keep true boxes under every protocol; otherwise treat it as simulated.
     """
     own = traffic.motion.size_lwh_m

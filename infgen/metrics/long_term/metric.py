@@ -90,7 +90,7 @@ def bucket_scores(
 ) -> Float64[np.ndarray, "row bucket"]:
     """Weighted mean of each bucket's features.
 
-    A feature without a value is left out, but where nobody enters or leaves, the distance
+    A feature without a value is left out, but without entries or exits, the distance
     at which they do scores 0: otherwise doing nothing would be the best placement.
     """
     buckets = []

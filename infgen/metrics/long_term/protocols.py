@@ -129,7 +129,7 @@ class Protocol:
         event_radius_m: Entries and exits farther from the ego are not counted, logged or
             simulated; infinite for all.
         unseen_tokens: Last token steps of a log left out of the logged counts, because
-            whoever enters or leaves in them cannot be told.
+            entries and exits in them are unknown.
     """
 
     name: str

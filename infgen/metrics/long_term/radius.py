@@ -13,10 +13,10 @@ def present_within_radius(rollout: Rollout, radius_m: float) -> Rollout:
 
     Distances are read at the ends of token steps. An agent enters where it is within the
     radius for the first time and never was before; it leaves where it is beyond it for the
-    first time and always was within before. Who is beyond it is not there.
+    first time and always was within before. Agents beyond it are absent.
 
     Args:
-        rollout: A rollout in which nobody was inserted or removed.
+        rollout: A rollout without insertion and removal.
         radius_m: Tuned on validation to make placement scores best (SPEC 7.1).
     """
     away_m = rollout.xyz_m[..., :2] - rollout.xyz_m[rollout.ego, :, :2]

@@ -51,7 +51,7 @@ def add_up(counts: Iterable[Counts]) -> Counts:
 
 
 def count_log(binned: Binned, windows: Windows) -> Counts:
-    """Count a log: who is there now, over the first window after now (steps 11 to 90)."""
+    """Count a log: agents present now, over the first window after now (steps 11 to 90)."""
     found = no_counts()
     rows = np.flatnonzero(binned.there_now)
     one = Windows(min(windows.num_tokens, windows.length), windows.length, 1)
@@ -116,7 +116,7 @@ def happened(
     """
     yes = windows.sum_steps(bins == 1) > 0
     steps = windows.sum_steps(bins != NO_BIN)
-    # Without a map nobody has an off-road value, and nobody is safe either.
+    # Without a map no agent has an off-road value, nor counts as safe.
     measured = bool((bins != NO_BIN).any())
     absent_counts = protocol.absent_is_safe and measured
     return yes, np.ones_like(yes) if absent_counts else steps >= protocol.min_steps

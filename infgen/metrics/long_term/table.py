@@ -7,7 +7,7 @@ mean of all logs, ``truth`` the same moment of a longer log; within the count ra
 ``agents/near`` (mean number), ``rate/entries`` (per second, at any distance),
 ``corrected/entry_rate`` (per second, where the protocol counts entries),
 ``corrected/collision_rate`` (share of agents and windows with a collision),
-``corrected/newcomer_offroad_rate`` (of those who are not there now).
+``corrected/inserted_offroad_rate`` (of agents not present now).
 """
 
 from collections.abc import Iterator, Mapping
@@ -118,7 +118,7 @@ def _add_rates(
     for name, feature, who in (
         ("collision_rate", "collision_indication", everyone),
         ("offroad_rate", "offroad_indication", everyone),
-        ("newcomer_offroad_rate", "offroad_indication", late),
+        ("inserted_offroad_rate", "offroad_indication", late),
     ):
         bins = binned.bins[at, ROW[feature], :, : windows.num_steps]
         yes, counts = (pairs[who] for pairs in happened(bins, windows, protocol))

@@ -41,11 +41,11 @@ def placement_by_radius(
     Args:
         rollouts: Of a model that neither inserts nor removes; all of a split.
         against: The split's reference.
-        protocol: Whose placement score.
+        protocol: Protocol of the placement score.
         radii_m: To try.
 
     Raises:
-        RadiusError: if somebody was inserted or removed, or there are no rollouts.
+        RadiusError: if agents were inserted or removed, or there are no rollouts.
     """
     at = PROTOCOLS.index(protocol)
     by_scene: dict[str, list[np.ndarray]] = {}  # [radius, feature] of each rollout
@@ -75,7 +75,7 @@ def best_radius_m(placement: Mapping[float, float]) -> float:
 
 
 def _check(rollout: Rollout) -> None:
-    """Refuse rollouts in which somebody came or went."""
+    """Refuse rollouts with insertions or removals."""
     if not rollout.logged.all() or (rollout.exit_step != NEVER).any():
         raise RadiusError(
             f"scene {rollout.scenario_id}, rollout {rollout.index}: agents were inserted "

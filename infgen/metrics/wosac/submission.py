@@ -79,7 +79,7 @@ def read_submission(
     Args:
         path: A binary message, or a tar archive of such, compressed or not.
         num_rollouts: How many rollouts every scene must have; 0 for any.
-        tell_bytes: Is told before each scene how many bytes of the file are read.
+        tell_bytes: Called before each scene with the number of bytes read.
 
     Raises:
         OSError: if the file cannot be read.

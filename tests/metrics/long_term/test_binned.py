@@ -150,7 +150,7 @@ def test_a_row_has_the_rates_of_what_a_protocol_counts(crossing, against):
             assert row.numbers[f"{protocol.name}/{name}"] == 1 / 8
             np.testing.assert_array_equal(row.curves[f"{protocol.name}/{name}"], [1 / 8])
         # The pedestrian, the only inserted agent, walks off the road; others stay on it.
-        assert row.numbers[f"{protocol.name}/newcomer_offroad_rate"] == 1
+        assert row.numbers[f"{protocol.name}/inserted_offroad_rate"] == 1
         assert row.numbers[f"{protocol.name}/offroad_rate"] < 1
 
 

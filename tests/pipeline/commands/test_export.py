@@ -484,7 +484,7 @@ def test_the_command_writes_a_submission_and_prints_what_it_is(
     assert code == 0
     assert "rollouts" in out
     assert "96" in out
-    assert "not played, so not in it: odd: no agent is there" in err
+    assert "not simulated, so not in it: odd: no agent is there" in err
     code, _, err = infgen(*words)
     assert code == 2
     assert "exists; remove it" in err

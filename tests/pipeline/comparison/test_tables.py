@@ -38,7 +38,7 @@ def long_numbers(ace, entries, composite):
         "corrected/entry_rate": entries,
         "corrected/exit_rate": 2 * entries,
         "agents/near": 20.0,
-        "corrected/newcomer_offroad_rate": 0.25,
+        "corrected/inserted_offroad_rate": 0.25,
     }
 
 
@@ -166,7 +166,7 @@ def test_entries_are_counted_per_half_second_and_held_against_the_logs(sheets):
     assert cell(table, "the logs of these scenes", "entries per half second") == 0.4
     assert cell(table, "InfGen", "entries per half second") == Measured(0.5)
     assert cell(table, "InfGen", "entries, % off") == pytest.approx(25.0)
-    assert cell(table, "InfGen", "newcomers' off-road rate") == Measured(0.25)
+    assert cell(table, "InfGen", "inserted agents' off-road rate") == Measured(0.25)
     assert cell(table, "the logs of these scenes", "agents near the ego") == 21.0
     assert table.rows[0][3] is None  # No log says how many left.
 
