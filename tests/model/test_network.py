@@ -165,7 +165,7 @@ def test_a_slot_sees_the_newcomers_before_it_and_not_those_after(network, crowde
 def test_the_details_of_a_newcomer_do_not_show_the_newcomer(network, crowded, limits):
     batch, before = run(network, [crowded], limits)
     details, agents = batch.details, batch.agents
-    newcomers = details.newcomer[0].nonzero()[:, 0]
+    newcomers = details.inserted[0].nonzero()[:, 0]
     row = int(newcomers[1])  # The second inserted agent: one before it, one after.
     moved = agents.pose.clone()
     for other in newcomers[1:]:
@@ -184,7 +184,7 @@ def test_the_details_of_a_newcomer_do_not_show_the_newcomer(network, crowded, li
 def test_pseudo_newcomers_do_not_see_themselves(network, record, limits):
     batch, before = run(network, [record(2, agents=8, tokens=5, spread_m=6.0)], limits)
     details, agents = batch.details, batch.agents
-    row = int((~details.newcomer[0] & details.present[0]).nonzero()[0])
+    row = int((~details.inserted[0] & details.present[0]).nonzero()[0])
     token, agent = int(details.token[0, row]), int(details.agent[0, row])
     pose = agents.pose.clone()
     pose[0, token, agent, 2] += 0.7

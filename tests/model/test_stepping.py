@@ -118,7 +118,7 @@ def test_details_of_newcomers_are_the_same_step_by_step(both):
     pack = found.rows.pack
     scene = found.rows.at // wanted.present.shape[1]
     compared = 0
-    for row in pack(wanted.newcomer).nonzero()[:, 0].tolist():
+    for row in pack(wanted.inserted).nonzero()[:, 0].tolist():
         token, turn = int(pack(wanted.token)[row]), int(pack(wanted.turn)[row])
         step, kind = details[token, turn], int(pack(wanted.kind)[row])
         at = scene[row]

@@ -229,7 +229,7 @@ def _details(network, played):
     present = spread("rollout", torch.bool)
     return Details(
         present=present,
-        newcomer=torch.zeros_like(present),
+        inserted=torch.zeros_like(present),
         agent=torch.full_like(token, NOBODY),
         token=token,
         turn=spread("turn", torch.int64),

@@ -21,7 +21,7 @@ def begun(parked, start):
     return begin, place_logged_agents([begin], min_rows=4)[-1]
 
 
-def newcomer(x_m, y_m, kind=CAR, turned_rad=0.0):
+def inserted(x_m, y_m, kind=CAR, turned_rad=0.0):
     # The grid's +y is the ego's +x, its +x the ego's right.
     return InsertedAgents(
         who=np.array([True]),
@@ -62,7 +62,7 @@ def test_newcomers_stand_on_nobody_and_vehicles_by_a_lane(
     begin, population = begun
     insertion_mask = room_of(begin, books, lane_m=5.0)
 
-    assert insertion_mask.allows(population, newcomer(*newcomer_at)).tolist() == [allowed]
+    assert insertion_mask.allows(population, inserted(*newcomer_at)).tolist() == [allowed]
 
 
 def test_pedestrians_may_walk_close_together(begun, books):
@@ -71,15 +71,15 @@ def test_pedestrians_may_walk_close_together(begun, books):
     population.kind[0, 1] = WALKER
     population.size_lwh_m[0, 1] = SIZE[WALKER]
 
-    assert insertion_mask.allows(population, newcomer(8.3, -2, WALKER)).all()
-    assert not insertion_mask.allows(population, newcomer(8.3, -2, CAR)).any()
+    assert insertion_mask.allows(population, inserted(8.3, -2, WALKER)).all()
+    assert not insertion_mask.allows(population, inserted(8.3, -2, CAR)).any()
 
 
 def test_nobody_enters_where_another_will_be_in_half_a_second(begun, books):
     """The car at (8, -2), 4.8 m long, drives on by 5 m: inserted agents are 4 m long."""
     begin, population = begun
     insertion_mask = room_of(begin, books, lane_m=1e6)
-    ahead = [newcomer(x_m, -2) for x_m in (12.5, 17.3, 17.5)]
+    ahead = [inserted(x_m, -2) for x_m in (12.5, 17.3, 17.5)]
 
     population.move[0, 1] = 0
     stands = [insertion_mask.allows(population, one).item() for one in ahead]
@@ -97,7 +97,7 @@ def test_places_that_nobody_holds_are_free(begun, books):
     insertion_mask = room_of(begin, books, lane_m=1e6)
     population.presence[0, 1] = 0
 
-    assert insertion_mask.allows(population, newcomer(8, -2)).all()
+    assert insertion_mask.allows(population, inserted(8, -2)).all()
 
 
 def test_lanes_are_measured_along_their_whole_length(begun, books):
@@ -117,7 +117,7 @@ def test_each_rollout_is_asked_on_its_own_map(parked, drive, start, books, build
         [here.history, elsewhere.history], books, np.array([1, 0, 0]), lane_m=5.0
     )
     population = place_logged_agents([elsewhere, here, here], min_rows=4)[-1]
-    far = newcomer(30, 20)
+    far = inserted(30, 20)
     three = InsertedAgents(
         **{name: np.repeat(getattr(far, name), 3, axis=0) for name in far.__slots__}
     )
@@ -140,6 +140,6 @@ def test_overlap_is_that_of_the_boxes_in_the_scene(begun, books):
             population.size_lwh_m[0, :2, :2],
         ).any()
 
-        allowed = insertion_mask.allows(population, newcomer(x_m, y_m, CAR, turned_rad))
+        allowed = insertion_mask.allows(population, inserted(x_m, y_m, CAR, turned_rad))
 
         assert allowed.tolist() == [not on_somebody]

@@ -152,7 +152,7 @@ class Details:
 
     Attributes:
         present: False for padding.
-        newcomer: Whether the agent is truly inserted; else it is present already and plays
+        inserted: Whether the agent is truly inserted; else it is present already and plays
             the part.
         agent: Row of the agent, hidden from its own query.
         token: When.
@@ -165,7 +165,7 @@ class Details:
     """
 
     present: Bool[Tensor, "scene detail"]
-    newcomer: Bool[Tensor, "scene detail"]
+    inserted: Bool[Tensor, "scene detail"]
     agent: Int64[Tensor, "scene detail"]
     token: Int64[Tensor, "scene detail"]
     turn: Int64[Tensor, "scene detail"]

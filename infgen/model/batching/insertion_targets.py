@@ -76,7 +76,7 @@ def detail_arrays(
     heading, offset_m = describe(pose, ego_pose, cell, grid)
     return {
         "present": np.ones(len(rows), dtype=bool),
-        "newcomer": np.arange(len(rows)) < len(row),
+        "inserted": np.arange(len(rows)) < len(row),
         "agent": rows,
         "token": tokens,
         "turn": np.concatenate([turn, np.zeros(few, dtype=np.int64)]),

@@ -27,15 +27,15 @@ def supervised(batch: Batch, settings: TrainSettings) -> Tensor:
     Terms that the network has no head for are counted all the same.
     """
     details, entries = batch.details, batch.entries
-    newcomers = (entries.agent >= 0).sum()
+    num_inserted = (entries.agent >= 0).sum()
     described = details.present.sum()
-    real = (details.present & details.newcomer).sum()
+    real = (details.present & details.inserted).sum()
     weight = {
         "motion": _motion(batch, settings),
         "keep": stay_mask(batch.agents).sum(),
         "validity_pattern": pattern_mask(batch.agents).sum(),
         "add": _decided(batch),
-        **dict.fromkeys(("position", "position_regression"), newcomers),
+        **dict.fromkeys(("position", "position_regression"), num_inserted),
         **dict.fromkeys(("agent_type", "size"), real),
         **dict.fromkeys(("heading", "heading_regression", "offset"), described),
         "map": _hidden(batch.roads).sum(),

@@ -213,7 +213,7 @@ def _places(rows: Rows, batch: Batch) -> Tensor:
 def _details(outputs: DetailOutputs, batch: Batch) -> Terms:
     """Terms of agent type and size; heading and offset also of pseudo-insertions."""
     details, pack = batch.details, outputs.rows.pack
-    real = pack(details.newcomer)
+    real = pack(details.inserted)
     size_log_m = pack(details.size_lwh_m).clamp(min=0.05).log()
     terms = {
         "agent_type": _choice(

@@ -41,28 +41,28 @@ _OUTLIERS = 0.02
 """Share of single values, at either end, that may lie beyond the axis."""
 
 LOSSES = {
-    "motion": "Next move",
-    "keep": "Staying or leaving",
-    "add": "Adding or beginning",
-    "position": "Cell of a newcomer",
-    "position_regression": "Place of a newcomer",
-    "heading": "Heading of a newcomer",
+    "motion": "Motion token",
+    "keep": "Keep or remove",
+    "add": "Add or begin motion",
+    "position": "Position token (cell)",
+    "position_regression": "Position (regressed)",
+    "heading": "Heading token",
     "offset": "Offset in the cell",
-    "agent_type": "Kind of a newcomer",
-    "size": "Size of a newcomer",
-    "validity_pattern": "Pattern of detection",
-    "map": "Hidden map piece",
+    "agent_type": "Agent type of an insertion",
+    "size": "Size of an insertion",
+    "validity_pattern": "Validity pattern",
+    "map": "Hidden map token",
 }
 """Terms of the loss, in the order in which they are drawn; others follow."""
 _SQUARED = {"size", "offset", "position_regression"}
 """Terms that are squared errors whatever the network."""
 _OTHERS = {
-    "motion_accuracy": ("Accuracy of moves", "share right"),
-    "motion_perplexity": ("Perplexity of moves", "moves"),
+    "motion_accuracy": ("Accuracy of motion tokens", "share right"),
+    "motion_perplexity": ("Perplexity of motion tokens", "tokens"),
     "gradient_norm": ("Norm of the gradient", "norm"),
     "learning_rate": ("Learning rate", ""),
 }
-_EVENTS = {"keep": "Leaving", "add": "Adding"}
+_EVENTS = {"keep": "Removal", "add": "Insertion"}
 """Decisions with probabilities, and what happens where they say yes."""
 
 

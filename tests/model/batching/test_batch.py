@@ -308,7 +308,7 @@ def test_road_tokens_to_predict_are_never_disturbed(pair):
 def test_those_who_play_newcomers_are_there_already_and_not_the_ego(record, limits):
     batch = collate([record(3, agents=12, tokens=9)], limits, 0)
     details, agents = batch.details, batch.agents
-    players = details.present & ~details.newcomer
+    players = details.present & ~details.inserted
 
     assert players.sum() == 16  # Two per token.
     scene, row = players.nonzero(as_tuple=True)

@@ -182,8 +182,8 @@ def test_the_first_move_of_a_newcomer_counts_three_times(network, record, limits
     logits = outputs.motion.rows.spread(outputs.motion.motion_logits)[0].log_softmax(-1)
     move = batch.agents.move[0]
     ego = sum(-float(logits[k, 0, move[k + 1, 0]]) for k in range(3))
-    newcomer = -float(logits[2, 1, move[3, 1]])
-    assert float(terms["motion"].mean) == pytest.approx((ego + 3 * newcomer) / 6, rel=1e-5)
+    inserted = -float(logits[2, 1, move[3, 1]])
+    assert float(terms["motion"].mean) == pytest.approx((ego + 3 * inserted) / 6, rel=1e-5)
 
 
 def test_label_smoothing_has_its_floor(network, record, limits):

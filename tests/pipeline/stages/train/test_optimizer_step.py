@@ -122,7 +122,7 @@ def test_means_of_parts_would_not_be_the_same(setup, books):
     one, other = recipe[0]
     counts = [float((part.entries.agent >= 0).sum()) for part in (one, other)]
     few = replace(other.entries, agent=torch.full_like(other.entries.agent, -1))
-    hidden = replace(other.details, newcomer=torch.zeros_like(other.details.newcomer))
+    hidden = replace(other.details, inserted=torch.zeros_like(other.details.inserted))
     parts = [one, replace(other, entries=few, details=hidden)]
 
     found = OptimizerStep(begin(setup, *books), setup.train, ProcessGroup(), 2).step(

@@ -2,7 +2,7 @@
 
 Reads the logs and the rollouts of a root, however long they are::
 
-    python benchmarks/liveliness.py ROOT [--span 10] [--radius 75]
+    python benchmarks/traffic_drift.py ROOT [--span 10] [--radius 75]
 
 The first table has the rollouts, span by span, beside the logs as far as they go: agents
 around the ego, its speed and that of vehicles, the share of vehicles that are off the road
@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from insertions import STEPS_PER_S, InsertedSample, apart_bits
 from jaxtyping import Float64
-from newcomers import STEPS_PER_S, Newcomers, apart_bits
 from numpy.lib.stride_tricks import sliding_window_view
 
 from infgen.clock import CLOCK
@@ -73,7 +73,7 @@ class Side:
     """Logs, or rollouts: sums and counts of each figure by span, and inserted agents."""
 
     sums: dict[str, Float64[np.ndarray, "2 span"]]
-    newcomers: Newcomers = field(default_factory=Newcomers)
+    inserted: InsertedSample = field(default_factory=InsertedSample)
     count: int = 0
     left_map_s: list[float] = field(default_factory=list)
     ego_stood_s: list[float] = field(default_factory=list)
@@ -158,7 +158,7 @@ def take(side: Side, whole: Traffic, place: Place, look: Look) -> None:
             side.add(name, at_s[::STEPS_PER_S][step], off[row, step], look.span_s)
     _take_starts(side, traffic, near & vehicle, look)
     _take_events(side, traffic, len(steps), look)
-    side.newcomers.take(traffic, edges, speed_mps, known, near)
+    side.inserted.take(traffic, edges, speed_mps, known, near)
 
 
 def _take_starts(side: Side, traffic: Traffic, others: np.ndarray, look: Look) -> None:
@@ -278,16 +278,16 @@ def report(logs: Side, played: Side, look: Look) -> dict[str, Any]:
         print(f"{who}: the ego stands for at most {stood_s:g} s")
         found[f"left_map_{who}_s"], found[f"ego_stood_{who}_s"] = side.left_map_s, stood_s
     found["drift"] = _tell_drift(logs, played)
-    newcomers = {"logs": logs.newcomers.numbers(), "rollouts": played.newcomers.numbers()}
-    found["newcomers"] = newcomers
-    apart = apart_bits(logs.newcomers, played.newcomers)
+    inserted = {"logs": logs.inserted.numbers(), "rollouts": played.inserted.numbers()}
+    found["inserted"] = inserted
+    apart = apart_bits(logs.inserted, played.inserted)
     found |= {name: _numbers(np.atleast_1d(bits))[0] for name, bits in apart.items()}
     show_table(
-        "newcomers",
-        ("", *newcomers["logs"]),
+        "inserted",
+        ("", *inserted["logs"]),
         [
             (who, *(_cell(value, ".3f") for value in one.values()))
-            for who, one in newcomers.items()
+            for who, one in inserted.items()
         ],
     )
     for name, what in (("first_speed_js", "first speeds"), ("bearing_js", "bearings")):

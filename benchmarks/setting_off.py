@@ -2,7 +2,7 @@
 
 Logs, token step by token step as they are learned from, and what some weights expect::
 
-    python benchmarks/at_the_lights.py ROOT [--weights ROOT/latest/train]
+    python benchmarks/setting_off.py ROOT [--weights ROOT/latest/train]
         [--split validation] [--scenes 80]
 
 Vehicles count that have stood for a second with a stop line close ahead. The table has, by
@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32
-from liveliness import STILL_M
+from traffic_drift import STILL_M
 from loader import shards
 from torch import Tensor
 

@@ -1,6 +1,6 @@
 """Who comes after now, from when it is near: how fast, where from, what it is, on whom.
 
-Part of ``liveliness.py``: logs and rollouts are measured by the same code.
+Part of ``traffic_drift.py``: logs and rollouts are measured by the same code.
 """
 
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ BEARINGS = 8
 
 
 @dataclass(slots=True)
-class Newcomers:
+class InsertedSample:
     """All inserted agents of some logs or rollouts, one entry for each part of it.
 
     Attributes:
@@ -37,11 +37,11 @@ class Newcomers:
         kind: ``AgentType``.
     """
 
-    first_mps: list[Float64[np.ndarray, " newcomer"]] = field(default_factory=list)
-    off_road: list[Bool[np.ndarray, " newcomer"]] = field(default_factory=list)
-    overlaps: list[Bool[np.ndarray, " newcomer"]] = field(default_factory=list)
-    bearing_rad: list[Float32[np.ndarray, " newcomer"]] = field(default_factory=list)
-    kind: list[Int64[np.ndarray, " newcomer"]] = field(default_factory=list)
+    first_mps: list[Float64[np.ndarray, " agent"]] = field(default_factory=list)
+    off_road: list[Bool[np.ndarray, " agent"]] = field(default_factory=list)
+    overlaps: list[Bool[np.ndarray, " agent"]] = field(default_factory=list)
+    bearing_rad: list[Float32[np.ndarray, " agent"]] = field(default_factory=list)
+    kind: list[Int64[np.ndarray, " agent"]] = field(default_factory=list)
 
     def take(
         self,
@@ -109,7 +109,7 @@ class Newcomers:
         return np.bincount(sector, minlength=BEARINGS).astype(np.float64)
 
 
-def apart_bits(logs: Newcomers, played: Newcomers) -> dict[str, float]:
+def apart_bits(logs: InsertedSample, played: InsertedSample) -> dict[str, float]:
     """Jensen-Shannon divergences of first speeds and of bearings, in bits; NaN if none."""
     speeds = divergence_bits(logs.speed_counts(), played.speed_counts())
     bearings = divergence_bits(logs.bearing_counts(), played.bearing_counts())
@@ -121,8 +121,8 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
 
 
 def _bearing_rad(
-    traffic: Traffic, rows: Int64[np.ndarray, " newcomer"], steps: np.ndarray
-) -> Float32[np.ndarray, " newcomer"]:
+    traffic: Traffic, rows: Int64[np.ndarray, " agent"], steps: np.ndarray
+) -> Float32[np.ndarray, " agent"]:
     motion, ego = traffic.motion, traffic.ego
     x_m, y_m = motion.x_m[0], motion.y_m[0]
     towards_rad = np.arctan2(
@@ -132,8 +132,8 @@ def _bearing_rad(
 
 
 def _overlaps_at(
-    traffic: Traffic, rows: Int64[np.ndarray, " newcomer"], steps: np.ndarray
-) -> Bool[np.ndarray, " newcomer"]:
+    traffic: Traffic, rows: Int64[np.ndarray, " agent"], steps: np.ndarray
+) -> Bool[np.ndarray, " agent"]:
     """Whether the box of each overlaps another at a step of its own."""
     found = np.zeros(len(rows), bool)
     for step in np.unique(steps):
@@ -145,10 +145,10 @@ def _overlaps_at(
 
 def _off_at(
     traffic: Traffic,
-    rows: Int64[np.ndarray, " newcomer"],
+    rows: Int64[np.ndarray, " agent"],
     steps: np.ndarray,
     edges: RoadEdges,
-) -> Bool[np.ndarray, " newcomer"]:
+) -> Bool[np.ndarray, " agent"]:
     """Whether each of some vehicles is off the road at a step of its own."""
     found = np.zeros(len(rows), bool)
     for step in np.unique(steps):
