@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32
-from traffic_drift import STILL_M
 from loader import shards
 from torch import Tensor
+from traffic_drift import STILL_M
 
 from infgen.model.batching.batch import Agents, Limits, collate
 from infgen.model.network import Network

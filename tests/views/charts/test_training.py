@@ -145,11 +145,11 @@ def test_all_that_was_logged_is_drawn_in_a_fixed_order_and_nothing_else():
     )
 
     assert titles(training_charts([full])) == [
-        "Next move",
-        "Adding or beginning",
+        "Motion token",
+        "Add or begin motion",
         "All terms, weighted",
         "Accuracy of moves",
-        "Leaving: predicted and logged",
-        "Adding: predicted and logged",
+        "Removal: predicted and logged",
+        "Insertion: predicted and logged",
     ]
     assert training_charts([]) == []

@@ -313,7 +313,7 @@ def test_the_page_draws_errors_counts_scores_training_and_a_rollout(written):
     assert "Agents by window" in titles
     assert "Scores by window (corrected)" in titles
     assert "Score of each feature (paper)" in titles
-    assert {"Next move", "Leaving: predicted and logged"} <= set(titles)
+    assert {"Motion token", "Removal: predicted and logged"} <= set(titles)
     assert any(title.startswith("Rollout 0 of") for title in titles)
     assert any(title.startswith("Log of") for title in titles)
 
