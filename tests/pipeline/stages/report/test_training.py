@@ -96,13 +96,15 @@ def test_runs_are_compared_in_one_file_with_the_same_bytes_each_time(
 
     assert target.read_text() == first
     assert "&lt;Both&gt;" in first
-    assert {"InfGen", "SMART", "Motion token"} <= set(re.findall(r">([^<>]+)</text>", first))
+    assert {"InfGen", "SMART", "Motion token"} <= set(
+        re.findall(r">([^<>]+)</text>", first)
+    )
     if suffix == ".svg":
         ET.fromstring(first)
 
 
 def test_another_suffix_is_refused(path, tmp_path):
-    with pytest.raises(ConfigError, match=r"\.svg or \.html"):
+    with pytest.raises(ConfigError, match=r"\.svg, \.pdf or \.html"):
         compare([str(path)], tmp_path / "out.png", "t")
 
 
