@@ -3,12 +3,15 @@
 import json
 import os
 import re
+import shutil
 from pathlib import Path
 
 import pytest
 
 from cli import main
 from pipeline.settings.stages_file import DEFAULT_FILE
+
+pytestmark = pytest.mark.slow
 
 PRESETS = """
   pair:
@@ -59,8 +62,8 @@ MADE = re.compile(r'"state": "(\w+)"')
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory):
-    """A folder in which the comparison was made."""
+def made(tmp_path_factory):
+    """A folder in which the comparison was made, and the exit code of that."""
     folder = tmp_path_factory.mktemp("desk")
     before = Path.cwd()
     os.chdir(folder)
@@ -68,6 +71,15 @@ def desk(tmp_path_factory):
     (folder / "presets.yaml").write_text(text)
     yield folder, call(*PAIR, *FROM, "--json")
     os.chdir(before)
+
+
+@pytest.fixture
+def desk(made, tmp_path, monkeypatch):
+    """A copy of that folder, to work in: what a test makes there no other test sees."""
+    folder, code = made
+    shutil.copytree(folder, tmp_path, symlinks=True, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path, code
 
 
 def call(*words):
@@ -78,8 +90,8 @@ def call(*words):
 
 
 @pytest.fixture(scope="module")
-def told(desk):
-    return json.loads((desk[0] / "R/presets/pair/comparison.json").read_text())
+def told(made):
+    return json.loads((made[0] / "R/presets/pair/comparison.json").read_text())
 
 
 def test_it_leaves_tables_in_three_forms_every_number_and_one_page(desk):
@@ -88,7 +100,8 @@ def test_it_leaves_tables_in_three_forms_every_number_and_one_page(desk):
 
     assert code == 0
     names = {path.name for path in shown.iterdir()}
-    assert {"comparison.html", "comparison.json", "tables.json", "tables"} <= names
+    files = {"comparison.html", "comparison.json", "tables.json", "figures.pdf"}
+    assert {*files, "tables"} <= names
     tables = {path.stem for path in (shown / "tables").iterdir()}
     assert tables == {
         "claims",
@@ -125,12 +138,12 @@ def test_every_number_can_be_traced(desk, told):
 def test_what_arms_have_in_common_was_made_once(desk):
     store = desk[0] / "R/store"
 
-    def made(stage):
+    def count(stage):
         return len(list((store / stage).glob("*/manifest.json")))
 
     shared = ("ingest", "build-vocab", "tokenize", "reference", "comparison")
-    assert [made(stage) for stage in shared] == [1, 1, 1, 1, 1]
-    assert (made("train"), made("rollout"), made("score")) == (4, RUNS, RUNS)
+    assert [count(stage) for stage in shared] == [1, 1, 1, 1, 1]
+    assert (count("train"), count("rollout"), count("score")) == (4, RUNS, RUNS)
 
 
 def test_the_mean_over_seeds_is_that_of_the_runs(told):
@@ -148,8 +161,10 @@ def test_the_mean_over_seeds_is_that_of_the_runs(told):
 def test_the_page_stands_alone(desk):
     page = (desk[0] / "R/presets/pair/comparison.html").read_text()
 
-    assert not re.findall(r"@import|url\(|<script|https?://(?!www\.w3)", page)
+    assert not re.findall(r"@import|url\((?!#)|<script|https?://(?!www\.w3)", page)
     assert page.count("<svg") == page.count("</svg>") > 5
+    pdf = (desk[0] / "R/presets/pair/figures.pdf").read_bytes()
+    assert pdf.count(b"/MediaBox") == page.count("<svg")
     assert "nan" not in re.findall(r'd="([^"]*)"', page)
     assert "InfGen / SMART" in page
 
@@ -205,7 +220,7 @@ def test_an_arm_that_cannot_be_is_refused_before_any_other_is_begun(desk, capsys
 
     assert call("run", "report", "--preset", "wrong", *SETTINGS, *FROM) == 2
     error = capsys.readouterr().err
-    assert "model.width is 15; expected a multiple of model.heads (2)" in error
+    assert "model: width is 15; expected a multiple of heads (2)" in error
     assert "run 1 of" not in error
 
 

@@ -1,4 +1,4 @@
-"""Tables as HTML, Markdown, LaTeX, CSV and JSON. Everything is escaped."""
+"""Tables as Markdown, LaTeX, CSV and JSON. Everything is escaped."""
 
 import csv
 import io
@@ -17,7 +17,6 @@ _LATEX = {
     "±": r"$\pm$",
     **{sign: f"\\{sign}" for sign in "&%$#_{}"},
 }
-NO_BREAK = "\N{NO-BREAK SPACE}"
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
@@ -30,7 +29,7 @@ class Table:
         columns: Names of the columns.
         rows: Cells; None where there is nothing.
         note: Below it.
-        links: Page that the first cell of each row leads to; empty for none. In HTML only.
+        links: Page that the first cell of each row leads to; empty for none. On pages only.
     """
 
     title: str
@@ -39,19 +38,10 @@ class Table:
     note: str = ""
     links: Sequence[str] = ()
 
-    def to_html(self) -> str:
-        """Write it for a page."""
-        head = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
-        rows = ["".join(_html_cell(cell) for cell in row) for row in self.rows]
-        for at, page in enumerate(self.links):
-            if page:
-                rows[at] = _linked(rows[at], page)
-        body = "".join(f"<tr>{row}</tr>" for row in rows)
-        note = f'<p class="note">{escape(self.note)}</p>' if self.note else ""
-        return (
-            f'<h3>{escape(self.title)}</h3><div class="wide"><table><thead><tr>{head}</tr>'
-            f"</thead><tbody>{body}</tbody></table></div>{note}"
-        )
+    @property
+    def name(self) -> str:
+        """Name of its files, without a suffix."""
+        return slug(self.title)
 
     def to_markdown(self) -> str:
         """Write it in Markdown, heading included."""
@@ -95,6 +85,16 @@ class Table:
         return {"columns": list(self.columns), "rows": rows}
 
 
+def slug(title: str) -> str:
+    """Name a file after a title: small letters, digits and hyphens."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+
+
+def is_text(cell: Cell) -> bool:
+    """Whether a cell holds words, not a figure (``0.5 ± 0.1``)."""
+    return isinstance(cell, str) and any(sign.isalpha() for sign in cell)
+
+
 def words(cell: Cell) -> str:
     """Write a cell for people."""
     if cell is None:
@@ -115,20 +115,6 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Cell
         else:
             found.append((f"{prefix}{name}", value))
     return found
-
-
-def _html_cell(cell: Cell) -> str:
-    """Write a cell; words stand to the left, but not figures (0.5 ± 0.1)."""
-    is_text = isinstance(cell, str) and any(sign.isalpha() for sign in cell)
-    if is_text:
-        return f'<td class="text">{escape(words(cell))}</td>'
-    return f"<td>{escape(words(cell)).replace(' ', NO_BREAK)}</td>"
-
-
-def _linked(row: str, page: str) -> str:
-    """Make a link of the first cell of a row of HTML."""
-    head, words, rest = re.split(r"(?<=>)([^<]*)(?=</td>)", row, maxsplit=1)
-    return f'{head}<a href="{escape(page, quote=True)}">{words}</a>{rest}'
 
 
 def markdown(text: str) -> str:

@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from infgen.clock import CLOCK
-from infgen.views.charts.comparison import comparison_chart
-from infgen.views.charts.figures import Series
+from infgen.views.charts.canvas import Chart
+from infgen.views.charts.lines import Series, line_chart
 from infgen.views.sheets import Sheet
 from pipeline.comparison.claims import PROTOCOLS
 from pipeline.comparison.result import LONG, ComparisonResult
@@ -22,7 +22,7 @@ _TRAFFIC = (
 )
 
 
-def figures(found: ComparisonResult) -> list[str]:
+def charts(found: ComparisonResult) -> list[Chart]:
     """Draw the count errors, the traffic, and each bucket's score, window by window."""
     ace = f"ace/{found.preset.count_error}_near"
     drawn = [_chart(found, ace, "Agent count error (ACE)", "agents", logs=False)]
@@ -35,7 +35,7 @@ def figures(found: ComparisonResult) -> list[str]:
         for protocol in PROTOCOLS
         for name, label in {"composite": "composite", **BUCKETS}.items()
     ]
-    return [drawing for drawing in drawn if drawing]
+    return [chart for chart in drawn if chart is not None]
 
 
 def curve_sheet(found: ComparisonResult) -> Sheet:
@@ -61,12 +61,12 @@ def _chart(
     *,
     factor: float = 1.0,
     logs: bool = True,
-) -> str:
+) -> Chart | None:
     lines = [_scaled(line, factor) for line in _lines(found, name)]
     if not lines:
-        return ""
+        return None
     logged = _logged(found, name) if logs else None
-    return comparison_chart(
+    return line_chart(
         lines,
         None if logged is None else _scaled(logged, factor),
         title=f"{title} by window",

@@ -10,11 +10,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from infgen.views.page import figures, heading, page, paragraph
-from infgen.views.sheets import Sheet
+from infgen.views.charts.canvas import write_pdf
+from infgen.views.page import render
 from pipeline.comparison.execution import ExecutedRun
-from pipeline.comparison.figures import curve_sheet
-from pipeline.comparison.figures import figures as drawings
+from pipeline.comparison.figures import charts, curve_sheet
 from pipeline.comparison.result import ComparisonResult, compare
 from pipeline.comparison.runs import PAGE, PRESET, SHOWN, Comparison
 from pipeline.comparison.tables import caveats, standing_alone, tables
@@ -27,9 +26,10 @@ from pipeline.settings.presets import Preset
 
 SCHEMA = "infgen.comparison/2"
 STAGE, PRESETS = "comparison", "presets"
-NUMBERS, TABLES = "comparison.json", "tables"
+NUMBERS, TABLES, FIGURES = "comparison.json", "tables", "figures.pdf"
 _MODULES = (
-    "infgen.views.charts.comparison",
+    "infgen.views.charts.canvas",
+    "infgen.views.charts.lines",
     "infgen.views.page",
     "infgen.views.published",
     "infgen.views.sheets",
@@ -116,18 +116,18 @@ def _write(folder: Path, found: ComparisonResult) -> None:
     shown = {sheet.name: sheet.for_people() for sheet in sheets}
     told = {name: {"title": one.title, **one.to_json()} for name, one in shown.items()}
     write_json(folder / SHOWN, told)
-    title = f"{found.preset.name}: methods side by side"
-    write_file(folder / PAGE, page(title, _page(found, sheets)).encode())
-
-
-def _page(found: ComparisonResult, sheets: Sequence[Sheet]) -> list[str]:
-    parts = [paragraph(_words(found)), *[paragraph(c, note=True) for c in caveats(found)]]
-    if found.missing:
-        parts += [heading("Missing"), *[paragraph(each) for each in found.missing]]
-    parts.append(heading("Tables"))
-    parts += [sheet.for_people().to_html() for sheet in sheets]
-    parts += [heading("Along the rollouts"), figures(drawings(found))]
-    return parts
+    drawn = charts(found)
+    write_file(folder / FIGURES, write_pdf(drawn))
+    page = render(
+        "comparison.html",
+        title=f"{found.preset.name}: methods side by side",
+        about=_words(found),
+        caveats=caveats(found),
+        missing=found.missing,
+        tables=list(shown.values()),
+        charts=drawn,
+    )
+    write_file(folder / PAGE, page.encode())
 
 
 def _words(found: ComparisonResult) -> str:

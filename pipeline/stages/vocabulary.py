@@ -4,7 +4,7 @@ A unit is one ingested file: a bounded sample of its moves and map pieces. Sampl
 chosen by hashes of what they are, so neither workers nor the order of files matter.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -31,7 +31,6 @@ from infgen.tokens.clustering.sample_keys import name_key
 from infgen.tokens.clustering.vocabularies import Origin, cluster_map, cluster_motion
 from infgen.tokens.tracks import Paths, TokensError, read_paths
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
-from infgen.views.charts.vocabularies import vocabulary_page
 from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import (
     FinishedUnit,
@@ -47,6 +46,7 @@ from pipeline.storage.initial_weights import find_initial_weights
 from pipeline.storage.splits import in_split, split_of
 
 if TYPE_CHECKING:
+    from infgen.views.tables import Table
     from pipeline.storage.columns import PackedRecords
 
 T = TypeVar("T")
@@ -189,7 +189,7 @@ def finish(
     matches, familiar = (
         match_paths(side.paths, motion) for side in (validation_split, learn)
     )
-    report = {
+    report: dict[str, Any] = {
         "scenes": {side: sum(done.report[side] for done in units) for side in _SIDES},
         "validation_split": _held_out_words(units, settings),
         "tolerance_m": settings.tolerance_m,
@@ -199,12 +199,47 @@ def finish(
             roads, road_origin, validation_split.curves.curve_m, learn.curves.curve_m
         ),
     }
+    # Matplotlib takes longer to load than a cached run lasts.
+    from infgen.views.charts.canvas import write_pdf  # noqa: PLC0415
+    from infgen.views.charts.vocabularies import vocabulary_charts  # noqa: PLC0415
+    from infgen.views.page import render  # noqa: PLC0415
     from pipeline.storage.zarr_store import write_file, write_json  # noqa: PLC0415
 
     write_json(target / "report.json", report)
-    page = vocabulary_page(report, motion, move_origin, roads, road_origin)
+    motion_charts, map_chart = vocabulary_charts(motion, move_origin, roads, road_origin)
+    page = render(
+        "vocabularies.html",
+        title="Vocabularies",
+        report=report,
+        motion_table=_figures_table("Motion tokens", report["motion"]),
+        map_table=_figures_table("Map tokens", {"map tokens": report["roads"]}),
+        motion_charts=motion_charts,
+        map_chart=map_chart,
+    )
     write_file(target / "report.html", page.encode())
+    write_file(target / "figures.pdf", write_pdf([*motion_charts, map_chart]))
     return _headline(report)
+
+
+def _figures_table(title: str, columns: Mapping[str, Mapping[str, Any]]) -> "Table":
+    """Lay figures out: one row each, one column per vocabulary."""
+    from infgen.views.tables import Table  # noqa: PLC0415
+
+    names = next(iter(columns.values()))
+    rows = [
+        [name.replace("_", " "), *(_cell(column[name]) for column in columns.values())]
+        for name in names
+    ]
+    return Table(title, ["", *columns], rows)
+
+
+def _cell(figure: Any) -> Any:
+    """A figure for a table; several become one line with their names."""
+    if figure is None:
+        return "nothing to measure"
+    if isinstance(figure, Mapping):
+        return ", ".join(f"{name} {value:g}" for name, value in figure.items())
+    return figure
 
 
 def _clustered(learn: _Gathered, settings: VocabSettings, progress: Progress) -> _Books:

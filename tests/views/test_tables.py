@@ -1,7 +1,6 @@
 import csv
 import io
 import re
-import xml.etree.ElementTree as ET
 
 import pytest
 
@@ -29,23 +28,6 @@ TABLE = Table(
 )
 def test_cells_are_written_for_people(cell, expected):
     assert words(cell) == expected
-
-
-def test_html_is_well_formed_and_escaped():
-    html = TABLE.to_html()
-
-    root = ET.fromstring(f"<div>{html}</div>")
-    cells = [cell.text for cell in root.iter("td")]
-    assert cells == ["x|y", "0.1235", "3", "<b>", "-", "-1"]
-    assert "<b>" not in html
-    assert root.find("h3").text == "A & B"
-
-
-def test_words_stand_to_the_left_and_figures_to_the_right_in_one_line():
-    html = Table("t", ["a", "b"], [["0.5 m", "0.5 ± 0.1"]]).to_html()
-
-    assert '<td class="text">0.5 m</td>' in html
-    assert "<td>0.5\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}0.1</td>" in html
 
 
 def test_markdown_keeps_its_columns_whatever_the_cells_hold():
@@ -115,10 +97,13 @@ def test_published_rows_are_those_of_the_paper():
         assert mean == pytest.approx(each.long_term["placement"], abs=6e-5)
 
 
-def test_a_row_may_lead_to_a_page():
+def test_links_stay_out_of_what_is_no_page():
     table = Table("t", ["a", "b"], [["<x>", 1], ["y", 2]], links=["p&q.html", ""])
 
-    page = table.to_html()
-    assert '<td class="text"><a href="p&amp;q.html">&lt;x&gt;</a></td><td>1</td>' in page
-    assert page.count("<a ") == 1
     assert "p&q" not in table.to_markdown() + table.to_csv() + table.to_latex()
+
+
+def test_a_table_is_named_after_its_title():
+    assert Table("Beside the paper: 30 s (Table 2)", [], []).name == (
+        "beside-the-paper-30-s-table-2"
+    )

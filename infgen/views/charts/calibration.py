@@ -1,20 +1,18 @@
-"""How far a probability is to be trusted: what was predicted against what was logged."""
+"""How far a probability is to be trusted: predicted rates against logged rates."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
 from jaxtyping import Float64
+from matplotlib.axes import Axes
 
-from infgen.views.charts.axes import NUM_COLOURS, Axis, dot, drawing, fit, grid, names, text
+from infgen.views.charts.canvas import COLOURS, QUIET, Chart, set_logarithmic
 
-WIDTH_PX = 360.0
-_LEFT_PX, _RIGHT_PX, _TOP_PX = 56.0, 22.0, 30.0
-_PLOT_PX = WIDTH_PX - _LEFT_PX - _RIGHT_PX
-_COUNTS_PX, _ROW_PX = 88.0, 16.0
-_NUMBER_PX = 10.0
-"""From one run's counts to the next's."""
+_WIDTH_PX = 360.0
+_LEFT_PX, _RIGHT_PX, _TOP_PX = 60.0, 18.0, 34.0
+_PLOT_PX = _WIDTH_PX - _LEFT_PX - _RIGHT_PX
+_COUNTS_PX, _ROW_PX, _COUNT_PX = 88.0, 16.0, 9.0
 _LOG_BELOW = 0.05
 """Rates as low as this ask for logarithmic axes."""
 NORMAL_95 = 1.959963984540054
@@ -41,32 +39,33 @@ class Bins:
         return Bins(self.count[rows], self.predicted[rows], self.happened[rows])
 
 
-def calibration_chart(runs: Mapping[str, Bins], *, title: str) -> str:
+def calibration_chart(runs: Mapping[str, Bins], *, title: str) -> Chart:
     """Draw the logged rate over the predicted one, bin by bin, with 95 % intervals.
 
-    Below the diagonal too much was predicted. Below the axis stands how many decisions a
-    bin holds; the last lines compare the overall rates.
+    A bin below the diagonal was predicted too often. Numbers below the axis count the
+    decisions of each bin; the last lines compare the overall rates.
 
     Args:
         runs: Bins by the name of the run.
         title: Of the chart.
     """
     bins = {name: found.filled() for name, found in runs.items()}
-    bottom_px = _TOP_PX + _PLOT_PX
-    x_axis, y_axis, marks = _axes(bins, bottom_px)
-    last_px = bottom_px + _COUNTS_PX
-    parts = [
-        grid(x_axis, y_axis, marks, marks),
-        names(x_axis, y_axis, "predicted rate", "logged rate"),
-        f'<path class="diagonal" d="M{x_axis.from_px:g} {y_axis.from_px:g}'
-        f'L{x_axis.to_px:g} {y_axis.to_px:g}"/>',
-        text(_LEFT_PX - 6, bottom_px + 50, "count", "end"),
-    ]
-    for at, (name, found) in enumerate(bins.items()):
-        parts.append(_points(found, at, x_axis, y_axis))
-        parts.append(_counts(found, at, x_axis, bottom_px + 40 + _NUMBER_PX * at))
-        parts.append(_overall(name, found, at, last_px + _ROW_PX * at))
-    return drawing(WIDTH_PX, last_px + _ROW_PX * len(bins), title, parts)
+    low, high, logarithmic = _limits(bins)
+
+    def draw(axes: Axes) -> None:
+        if logarithmic:
+            set_logarithmic(axes, x=True)
+        axes.set(xlim=(low, high), ylim=(low, high))
+        axes.plot([low, high], [low, high], color=QUIET, lw=1, ls=(0, (4, 3)))
+        axes.set(xlabel="predicted rate", ylabel="logged rate")
+        axes.xaxis.labelpad = 28.0  # The counts stand above the label.
+        for at, (name, found) in enumerate(bins.items()):
+            _draw_bins(axes, found, at)
+            _draw_overall(axes, f"{name}: {overall(found)}", at)
+
+    bottom_px = _COUNTS_PX + _ROW_PX * len(bins)
+    margins_px = (_LEFT_PX, _RIGHT_PX, _TOP_PX, bottom_px)
+    return Chart(title, draw, _WIDTH_PX, _TOP_PX + _PLOT_PX + bottom_px, margins_px)
 
 
 def binomial_interval(
@@ -81,7 +80,7 @@ def binomial_interval(
 
 
 def overall(bins: Bins) -> str:
-    """Say in a line what was predicted, what happened, and how they compare."""
+    """Compare the predicted and the logged rate of all decisions in one line."""
     count = max(1.0, float(bins.count.sum()))
     predicted, logged = (
         float(bins.predicted.sum()) / count,
@@ -91,51 +90,54 @@ def overall(bins: Bins) -> str:
     return f"predicted {predicted:.4f}, logged {logged:.4f}, ratio {ratio}"
 
 
-def _axes(bins: Mapping[str, Bins], bottom_px: float) -> tuple[Axis, Axis, list[float]]:
-    """One scale for both axes, logarithmic where rates are low."""
-    rates = [
-        np.stack([found.predicted / found.count, found.happened / found.count])
-        for found in bins.values()
-    ]
-    known = np.concatenate([np.zeros(0), *[np.ravel(part) for part in rates]])
-    known = known[known > 0]
-    logarithmic = bool(len(known) and known.min() < _LOG_BELOW)
-    ends = [] if logarithmic else [np.array([0.0, 1.0])]
-    x_axis, marks = fit(
-        [*rates, *ends], _LEFT_PX, WIDTH_PX - _RIGHT_PX, logarithmic=logarithmic
+def _limits(bins: Mapping[str, Bins]) -> tuple[float, float, bool]:
+    """Ends of both axes; logarithmic where rates are low."""
+    sums = [(each.predicted, each.happened, each.count) for each in bins.values()]
+    rates = np.concatenate(
+        [np.zeros(0), *(part / count for *parts, count in sums for part in parts)]
     )
-    y_axis = Axis(x_axis.low, x_axis.high, bottom_px, _TOP_PX, logarithmic)
-    return x_axis, y_axis, marks
+    known = rates[rates > 0]
+    if not len(known) or known.min() >= _LOG_BELOW:
+        return 0.0, 1.0, False
+    low, high = known.min() / 1.5, min(1.0, known.max() * 1.5)
+    return float(low), float(high), True
 
 
-def _points(bins: Bins, at: int, x_axis: Axis, y_axis: Axis) -> str:
-    """Draw a dot per bin on its interval; a rate of nothing stands at the axis."""
-    colour = f"c{at % NUM_COLOURS}"
-    predicted, logged = bins.predicted / bins.count, bins.happened / bins.count
-    parts = []
-    for x, y, (low, high) in zip(
-        predicted.tolist(),
-        logged.tolist(),
-        binomial_interval(bins.happened, bins.count).T.tolist(),
-        strict=True,
-    ):
-        x_px, high = x_axis.px(x), min(high, y_axis.high)
-        parts.append(
-            f'<path class="line {colour}" '
-            f'd="M{x_px:.1f} {y_axis.px(low):.1f}V{y_axis.px(high):.1f}"/>'
-            + dot(x_px, y_axis.px(y), at, 3.5)
+def _draw_bins(axes: Axes, bins: Bins, at: int) -> None:
+    """Draw a dot per bin on its interval; a rate of zero stands at the axis."""
+    colour = COLOURS[at % len(COLOURS)]
+    predicted = bins.predicted / bins.count
+    logged = np.maximum(bins.happened / bins.count, axes.get_ylim()[0])
+    interval = np.clip(binomial_interval(bins.happened, bins.count), *axes.get_ylim())
+    axes.vlines(predicted, *interval, color=colour)
+    axes.plot(predicted, logged, "o", color=colour, ms=6, clip_on=False)
+    for x, count in zip(predicted.tolist(), bins.count.tolist(), strict=True):
+        axes.annotate(
+            _short(count),
+            (x, 0.0),
+            (_COUNT_PX * at, -20.0),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            rotation=90,
+            ha="center",
+            va="top",
+            fontsize=9,
+            color=colour,
         )
-    return "".join(parts)
 
 
-def _counts(bins: Bins, at: int, x_axis: Axis, y_px: float) -> str:
-    """Write how many decisions each bin holds, upwards, below its dot."""
-    places = [x_axis.px(float(x)) for x in bins.predicted / bins.count]
-    return "".join(
-        f'<text class="small w{at % NUM_COLOURS}" text-anchor="end" '
-        f'transform="translate({x_px + 3:.1f} {y_px:.1f}) rotate(-90)">'
-        f"{escape(_short(count))}</text>"
-        for x_px, count in zip(places, bins.count.tolist(), strict=True)
+def _draw_overall(axes: Axes, words: str, at: int) -> None:
+    """Write a line below the axes, in the colour of its run."""
+    y_px = -(_COUNTS_PX - 22.0) - _ROW_PX * at
+    axes.annotate(
+        f"● {words}",
+        (0.0, 0.0),
+        (-_LEFT_PX + 8.0, y_px),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=9,
+        va="top",
+        color=COLOURS[at % len(COLOURS)],
     )
 
 
@@ -144,7 +146,3 @@ def _short(count: float) -> str:
     if count < 10_000:
         return f"{count:.0f}"
     return f"{count / 1e3:.3g}k" if count < 1e6 else f"{count / 1e6:.3g}M"
-
-
-def _overall(name: str, bins: Bins, at: int, y_px: float) -> str:
-    return dot(12.0, y_px - 4, at, 4.0) + text(24.0, y_px, f"{name}: {overall(bins)}")

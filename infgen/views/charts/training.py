@@ -10,24 +10,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float64
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
-from infgen.views.charts.axes import (
-    NUM_COLOURS,
-    Axis,
-    dot,
-    drawing,
-    fit,
-    grid,
-    line_path,
-    names,
-    text,
-)
 from infgen.views.charts.calibration import Bins, calibration_chart
-from infgen.views.charts.figures import Series
+from infgen.views.charts.canvas import COLOURS, DASHES, INK, Chart, set_logarithmic
+from infgen.views.charts.lines import LEGEND_ROW_PX, Series, draw_legend
 
-WIDTH_PX, HEIGHT_PX = 360.0, 262.0
-_LEFT_PX, _RIGHT_PX, _TOP_PX, _BOTTOM_PX = 56.0, 22.0, 30.0, 70.0
-_LEGEND_PX, _COLUMN_PX = 16.0, 180.0
+_WIDTH_PX, _PLOT_PX = 360.0, 162.0
+_LEFT_PX, _RIGHT_PX, _TOP_PX, _LABEL_PX = 60.0, 18.0, 34.0, 46.0
 _NEAR, _MOST_NEAR = 4, 1 / 10
 """A running mean reaches so many values to either side ..."""
 _NEAR_SHARE = 1 / 40
@@ -91,7 +83,7 @@ class Run:
         return Series(line.name, line.x, running_mean(line.y, weight))
 
 
-def training_charts(runs: Sequence[Run]) -> list[str]:
+def training_charts(runs: Sequence[Run]) -> list[Chart]:
     """Draw every figure that any run logged: terms of the loss, accuracy, calibration."""
     logged = {name for run in runs for name in (*run.train, *run.validation)}
     losses = [name for name in LOSSES if name in logged]
@@ -118,7 +110,7 @@ def _unit(runs: Sequence[Run], term: str) -> str:
     return "loss, nats" if chosen else "loss"
 
 
-def calibration_charts(runs: Sequence[Run]) -> list[str]:
+def calibration_charts(runs: Sequence[Run]) -> list[Chart]:
     """Draw how far to trust the probabilities of leaving and of adding."""
     drawn = []
     for term, event in _EVENTS.items():
@@ -128,29 +120,29 @@ def calibration_charts(runs: Sequence[Run]) -> list[str]:
     return drawn
 
 
-def figure_chart(runs: Sequence[Run], figure: str, title: str, y_label: str) -> str:
+def figure_chart(runs: Sequence[Run], figure: str, title: str, y_label: str) -> Chart:
     """Draw one figure of all runs that logged it, train and validation."""
     logged = {
         at: run
         for at, run in enumerate(runs)
         if figure in run.train or figure in run.validation
     }
-    height = HEIGHT_PX + _LEGEND_PX * -(-len(logged) // 2)
-    x_axis, x_marks, y_axis, y_marks = _axes(list(logged.values()), figure)
-    parts = [
-        grid(x_axis, y_axis, x_marks, y_marks),
-        names(x_axis, y_axis, "step", y_label),
-    ]
-    for at, run in logged.items():
-        if figure in run.train:
-            parts.append(_spans(run.train[figure], at, x_axis, y_axis))
-    for at, run in logged.items():
-        if figure in run.train:
-            parts.append(_curve(_thinned(run.smoothed(figure)), at, x_axis, y_axis))
-        if figure in run.validation:
-            parts.append(_measured(run.validation[figure], at, x_axis, y_axis))
-    parts.append(_legend({at: run.name for at, run in logged.items()}, HEIGHT_PX - 14))
-    return drawing(WIDTH_PX, height, title, parts)
+    low, high, logarithmic = _limits(list(logged.values()), figure)
+
+    def draw(axes: Axes) -> None:
+        if logarithmic:
+            set_logarithmic(axes)
+        axes.set(ylim=(low, high), xlabel="step", ylabel=y_label)
+        axes.plot([], [], color=INK, label="training, running mean")
+        axes.plot([], [], color=INK, linestyle=DASHES[2], label="held-out")
+        for at, run in logged.items():
+            _draw_run(axes, run, figure, COLOURS[at % len(COLOURS)])
+        axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+        draw_legend(axes, _PLOT_PX)
+
+    bottom_px = _LABEL_PX + LEGEND_ROW_PX * (1 + -(-len(logged) // 2))
+    margins_px = (_LEFT_PX, _RIGHT_PX, _TOP_PX, bottom_px)
+    return Chart(title, draw, _WIDTH_PX, _TOP_PX + _PLOT_PX + bottom_px, margins_px)
 
 
 def running_mean(
@@ -168,56 +160,55 @@ def running_mean(
     return np.divide(total, share, out=np.full(len(values), np.nan), where=share > 0)
 
 
-def _axes(runs: Sequence[Run], figure: str) -> tuple[Axis, list[float], Axis, list[float]]:
-    """Scales and ticks that all lines lie on, and nearly all single values."""
-    found = [run.train[figure] for run in runs if figure in run.train]
-    lines = [run.smoothed(figure) for run in runs if figure in run.train]
-    lines += [run.validation[figure] for run in runs if figure in run.validation]
-    values = [line.y for line in lines]
-    smooth = np.concatenate([np.zeros(0), *values])
-    smooth = smooth[np.isfinite(smooth)]
-    falls = bool(len(smooth) and 0 < _LOG_FROM * smooth.min() < smooth.max())
-    logarithmic = falls and figure not in _ALWAYS_LINEAR
-    for line in found:
-        known = line.y[np.isfinite(line.y)]
-        if len(known):
-            values.append(np.quantile(known, [_OUTLIERS, 1 - _OUTLIERS]))
-    x_axis, x_marks = fit(
-        [line.x for line in lines], _LEFT_PX, WIDTH_PX - _RIGHT_PX, most=5
-    )
-    y_axis, y_marks = fit(values, HEIGHT_PX - _BOTTOM_PX, _TOP_PX, logarithmic=logarithmic)
-    return x_axis, x_marks, y_axis, y_marks
+def _limits(runs: Sequence[Run], figure: str) -> tuple[float, float, bool]:
+    """Ends of the y axis, for all lines and nearly all values; whether logarithmic."""
+    lines = [run.smoothed(figure).y for run in runs if figure in run.train]
+    lines += [run.validation[figure].y for run in runs if figure in run.validation]
+    smooth = _known(lines)
+    singles = [_known([run.train[figure].y]) for run in runs if figure in run.train]
+    ends = [np.quantile(each, [_OUTLIERS, 1 - _OUTLIERS]) for each in singles if len(each)]
+    found = _known([smooth, *ends])
+    if not len(found):
+        return 0.0, 1.0, False
+    low, high = float(found.min()), float(found.max())
+    falls = 0 < _LOG_FROM * smooth.min() < smooth.max()
+    if falls and figure not in _ALWAYS_LINEAR:
+        return float(found[found > 0].min()) / 1.2, high * 1.2, True
+    room = 0.05 * (high - low) or 0.5 * abs(high) or 0.5
+    return low - room, high + room, False
 
 
-def _spans(line: Series, at: int, x_axis: Axis, y_axis: Axis) -> str:
-    """Draw between which values a figure lies, stretch by stretch."""
+def _known(parts: Sequence[np.ndarray]) -> Float64[np.ndarray, " known"]:
+    values = np.concatenate([np.zeros(0), *parts])
+    return values[np.isfinite(values)]
+
+
+def _draw_run(axes: Axes, run: Run, figure: str, colour: str) -> None:
+    """Draw the span of single values, their running mean, and what validations found."""
+    axes.plot([], [], color=colour, label=run.name)
+    if figure in run.train:
+        _draw_spans(axes, run.train[figure], colour)
+        line = _thinned(run.smoothed(figure))
+        axes.plot(line.x, line.y, color=colour)
+    if figure in run.validation:
+        line = run.validation[figure]
+        dashed = Line2D(
+            line.x, line.y, color=colour, linestyle=DASHES[2], marker="o", ms=5, mew=0
+        )
+        axes.add_line(dashed)
+
+
+def _draw_spans(axes: Axes, line: Series, colour: str) -> None:
+    """Shade between the least and the greatest value, stretch by stretch."""
     known = np.isfinite(line.y)
-    x, y = line.x[known], np.clip(line.y[known], y_axis.low, y_axis.high)
-    parts = np.array_split(np.arange(len(x)), min(_SPANS, len(x)) or 1)
+    x, y = line.x[known], line.y[known]
     if not len(x):
-        return ""
+        return
+    parts = np.array_split(np.arange(len(x)), min(_SPANS, len(x)))
     middle = np.array([x[part].mean() for part in parts])
     low = np.array([y[part].min() for part in parts])
     high = np.array([y[part].max() for part in parts])
-    outline = np.concatenate([middle, middle[::-1]]), np.concatenate([high, low[::-1]])
-    path, _ = line_path(*outline, x_axis, y_axis)
-    return f'<path class="band c{at % NUM_COLOURS}" d="{path}Z"/>'
-
-
-def _curve(line: Series, at: int, x_axis: Axis, y_axis: Axis) -> str:
-    path, _ = line_path(line.x, line.y, x_axis, y_axis)
-    return f'<path class="line c{at % NUM_COLOURS}" d="{path}"/>'
-
-
-def _measured(line: Series, at: int, x_axis: Axis, y_axis: Axis) -> str:
-    """Draw a dashed line with a dot at every known point."""
-    path, _ = line_path(line.x, line.y, x_axis, y_axis)
-    dots = [
-        dot(x_axis.px(x), y_axis.px(y), at, 2.5)
-        for x, y in zip(line.x.tolist(), line.y.tolist(), strict=True)
-        if np.isfinite(y)
-    ]
-    return f'<path class="line c{at % NUM_COLOURS} d2" d="{path}"/>{"".join(dots)}'
+    axes.fill_between(middle, low, high, color=colour, alpha=0.16, linewidth=0)
 
 
 def _thinned(line: Series) -> Series:
@@ -225,22 +216,3 @@ def _thinned(line: Series) -> Series:
     most = min(2 * _SPANS, len(line.x))
     kept = np.unique(np.linspace(0, len(line.x) - 1, most).round().astype(int))
     return Series(line.name, line.x[kept], line.y[kept])
-
-
-def _legend(runs: Mapping[int, str], y_px: float) -> str:
-    """Say what bold and dashed lines are, and whose the colours are."""
-    second_px = _LEFT_PX + _COLUMN_PX
-    parts = [
-        f'<path class="line inked" d="M{_LEFT_PX:g} {y_px - 4:g}h24"/>',
-        text(_LEFT_PX + 30, y_px, "training, running mean"),
-        f'<path class="line inked d2" d="M{second_px:g} {y_px - 4:g}h24"/>',
-        text(second_px + 30, y_px, "held-out"),
-    ]
-    for place, (at, name) in enumerate(runs.items()):
-        row, column = divmod(place, 2)
-        x_px, row_px = _LEFT_PX + _COLUMN_PX * column, y_px + _LEGEND_PX * (row + 1)
-        parts.append(
-            f'<path class="line c{at % NUM_COLOURS}" d="M{x_px:g} {row_px - 4:g}h24"/>'
-            + text(x_px + 30, row_px, name)
-        )
-    return "".join(parts)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from infgen.clock import CLOCK
-from infgen.views.charts.figures import Interval, Series, interval_chart, line_chart
+from infgen.views.charts.canvas import Chart
+from infgen.views.charts.lines import Interval, Series, interval_chart, line_chart
 from pipeline.engine.stage import FinishedUnit, Inputs
 from pipeline.stages.report.tables import BUCKETS, FEATURES
 
@@ -40,7 +41,7 @@ def read_curves(path: Path, summary: Mapping[str, Any]) -> Curves:
     return found
 
 
-def score_charts(summary: Mapping[str, Any], curves: Curves) -> list[str]:
+def score_charts(summary: Mapping[str, Any], curves: Curves) -> list[Chart]:
     """Draw how scores and counts change along the rollouts, and each feature's score."""
     counts = summary["numbers"].get("agents/near", {})
     drawn = [
@@ -68,7 +69,7 @@ def score_charts(summary: Mapping[str, Any], curves: Curves) -> list[str]:
         words = {f"{protocol}/{name}": label for name, label in names.items()}
         drawn.append(_chart(words, curves, f"Scores by window ({protocol})", "likelihood"))
         drawn.append(_features(protocol, summary["protocols"][protocol]["scores"]))
-    return [drawing for drawing in drawn if drawing]
+    return [chart for chart in drawn if chart is not None]
 
 
 def first_simulated(inputs: Inputs) -> SimulatedScene | None:
@@ -110,18 +111,17 @@ def _chart(
     curves: Curves,
     title: str,
     y_label: str,
-    *more: Series | None,
-) -> str:
+    truth: Series | None = None,
+) -> Chart | None:
     series = [
         Series(label, curves[name].x, curves[name].y)
         for name, label in words.items()
         if name in curves
     ]
-    series += [each for each in more if each is not None]
     if not series:
-        return ""
+        return None
     x_label = "middle of the window, s after now"
-    return line_chart(series, title=title, x_label=x_label, y_label=y_label)
+    return line_chart(series, truth, title=title, x_label=x_label, y_label=y_label)
 
 
 def _level(name: str, value: float | None, beside: Series | None) -> Series | None:
@@ -131,7 +131,7 @@ def _level(name: str, value: float | None, beside: Series | None) -> Series | No
     return Series(name, beside.x, np.full(len(beside.x), value))
 
 
-def _features(protocol: str, scores: Mapping[str, Any]) -> str:
+def _features(protocol: str, scores: Mapping[str, Any]) -> Chart:
     rows = [
         Interval(label, *(_nan(scores[name].get(field)) for field in _FIELDS))
         for name, label in FEATURES.items()

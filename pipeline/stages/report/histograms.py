@@ -7,7 +7,8 @@ import numpy as np
 
 from infgen.metrics.long_term.protocols import FEATURES, PROTOCOLS, Feature
 from infgen.metrics.long_term.reference import Counts, add_up
-from infgen.views.charts.figures import Series, line_chart
+from infgen.views.charts.canvas import Chart
+from infgen.views.charts.lines import Series, line_chart
 from infgen.views.tables import Cell, Table
 from pipeline.stages.reference_files import read_counts
 from pipeline.stages.report.tables import FEATURES as WORDS
@@ -38,7 +39,7 @@ def read_both(inputs: "Inputs") -> tuple[Counts, Counts]:
     return read_counts(inputs.folder("reference")), played
 
 
-def charts(logs: Counts, played: Counts) -> list[str]:
+def charts(logs: Counts, played: Counts) -> list[Chart]:
     """Draw each feature's histogram: the logs' and the rollouts'."""
     at = next(i for i, protocol in enumerate(PROTOCOLS) if protocol.name == DRAWN)
     return [
@@ -47,7 +48,7 @@ def charts(logs: Counts, played: Counts) -> list[str]:
     ]
 
 
-def _chart(feature: Feature, logs: np.ndarray, played: np.ndarray) -> str:
+def _chart(feature: Feature, logs: np.ndarray, played: np.ndarray) -> Chart:
     edges = feature.histogram.edges.astype(np.float64)
     lines = []
     for name, counts in (("rollouts", played), ("logs", logs)):

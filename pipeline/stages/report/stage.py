@@ -5,7 +5,6 @@ but for the page of machines and times below ``run``.
 """
 
 import json
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +16,7 @@ from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage,
 
 if TYPE_CHECKING:
     from infgen.metrics.long_term.reference import Counts
+    from infgen.views.charts.canvas import Chart
     from infgen.views.tables import Table
 
 STAGES = (
@@ -30,7 +30,7 @@ STAGES = (
     "score",
 )
 LOWEST = 10
-TABLES = "tables"
+TABLES, FIGURES = "tables", "figures.pdf"
 PASSPORT = "passport.html"
 
 
@@ -55,8 +55,9 @@ def finish(
     settings: ReportSettings,
     progress: Progress,
 ) -> Report:
-    """Write every table in three forms, the table of scores as JSON too, and the page."""
-    from infgen.views.page import page  # noqa: PLC0415
+    """Write the page, every table in three forms, and every chart as PDF."""
+    from infgen.views.charts.canvas import write_pdf  # noqa: PLC0415
+    from infgen.views.page import render  # noqa: PLC0415
     from pipeline.engine.atomic import write_file, write_json  # noqa: PLC0415
     from pipeline.stages.report import histograms  # noqa: PLC0415
     from pipeline.stages.report.figures import find_lowest  # noqa: PLC0415
@@ -69,23 +70,35 @@ def finish(
     manifests = {stage: read_manifest(inputs.folder(stage)) for stage in STAGES}
     lowest = find_lowest(inputs.folder("score") / "scores.parquet", LOWEST)
     pages = write_players(inputs, target, lowest, settings.player_pages)
-    scores, *more = [
-        *_score_tables(summary, manifests),
-        worst_table(lowest, pages),
-    ]
+    tables = [*_score_tables(summary, manifests), worst_table(lowest, pages)]
     about = passport(inputs, manifests)
     counts = histograms.read_both(inputs)
     progress(1, 3, "tables")
-    parts = _page(inputs, summary, manifests, [scores, *more], about, counts)
+    charts = _charts(inputs, summary, counts)
+    values = {
+        "title": settings.title,
+        "summary": summary,
+        "weights": manifests["train"]["report"].get("weights", "unknown"),
+        "scores": tables[0],
+        "paper_tables": tables[1:3],
+        "feature_tables": tables[3:],
+        "passport_tables": about,
+        "machines_page": f"{RUN_FOLDER}/{PASSPORT}",
+        "strips": _strips(inputs),
+        **charts,
+    }
+    page = render("report.html", **values)
     progress(2, 3, "figures")
-    _write_tables(target / TABLES, [scores, *more, *about, histograms.table(*counts)])
+    _write_tables(target / TABLES, [*tables, *about, histograms.table(*counts)])
+    figures = write_pdf(chart for part in charts.values() for chart in part)
+    write_file(target / FIGURES, figures)
     _write_passport(inputs, target / RUN_FOLDER, settings.title)
-    write_json(target / "table.json", scores.to_json())
+    write_json(target / "table.json", tables[0].to_json())
     texts = {
-        "table.csv": scores.to_csv(),
-        "table.tex": "".join(table.to_latex() for table in (scores, *more)),
-        "report.md": _markdown(settings.title, [scores, *more, *about]),
-        "report.html": page(settings.title, parts),
+        "table.csv": tables[0].to_csv(),
+        "table.tex": "".join(table.to_latex() for table in tables),
+        "report.md": _markdown(settings.title, [*tables, *about]),
+        "report.html": page,
     }
     for name, text in texts.items():
         write_file(target / name, text.encode())
@@ -97,30 +110,52 @@ def finish(
     }
 
 
+def _charts(
+    inputs: Inputs, summary: Mapping[str, Any], counts: "tuple[Counts, Counts]"
+) -> "dict[str, Sequence[Chart]]":
+    """Charts by the name that the page has for them."""
+    from pipeline.stages.report import figures, histograms  # noqa: PLC0415
+    from pipeline.stages.report.training import LOG, training_figures  # noqa: PLC0415
+
+    curves = figures.read_curves(inputs.folder("score") / "curves.parquet", summary)
+    return {
+        "score_charts": figures.score_charts(summary, curves),
+        "histogram_charts": histograms.charts(*counts),
+        "training_charts": training_figures(inputs.folder("train") / LOG, "this run"),
+    }
+
+
+def _strips(inputs: Inputs) -> list[str]:
+    """Draw the first scene and a rollout of it, as SVG; nothing without rollouts."""
+    from pipeline.stages.report.figures import first_simulated, strips  # noqa: PLC0415
+
+    found = first_simulated(inputs)
+    return strips(found) if found else []
+
+
 def _write_tables(folder: Path, tables: "Sequence[Table]") -> None:
     """Write each table as Markdown, LaTeX and CSV, named after its title."""
     from pipeline.engine.atomic import write_file  # noqa: PLC0415
 
     folder.mkdir(exist_ok=True)
     for table in tables:
-        name = re.sub(r"[^a-z0-9]+", "-", table.title.lower()).strip("-")
         for suffix, text in (
             ("md", table.to_markdown()),
             ("tex", table.to_latex()),
             ("csv", table.to_csv()),
         ):
-            write_file(folder / f"{name}.{suffix}", text.encode())
+            write_file(folder / f"{table.name}.{suffix}", text.encode())
 
 
 def _write_passport(inputs: Inputs, folder: Path, title: str) -> None:
     """Write the page of machines and times."""
-    from infgen.views.page import page  # noqa: PLC0415
+    from infgen.views.page import render  # noqa: PLC0415
     from pipeline.engine.atomic import write_file  # noqa: PLC0415
     from pipeline.stages.report.passport import times  # noqa: PLC0415
 
     folder.mkdir(exist_ok=True)
-    parts = [table.to_html() for table in times(inputs, STAGES)]
-    write_file(folder / PASSPORT, page(f"{title}: machines and times", parts).encode())
+    values = {"title": f"{title}: machines and times", "tables": times(inputs, STAGES)}
+    write_file(folder / PASSPORT, render("tables.html", **values).encode())
 
 
 def _composite(summary: Mapping[str, Any], protocol: str) -> float | None:
@@ -143,53 +178,6 @@ def _score_tables(
     ]
 
 
-def _page(
-    inputs: Inputs,
-    summary: Mapping[str, Any],
-    manifests: Mapping[str, Any],
-    tables: "Sequence[Table]",
-    about: "Sequence[Table]",
-    counts: "tuple[Counts, Counts]",
-) -> list[str]:
-    from infgen.views.page import figures, heading, inset, paragraph  # noqa: PLC0415
-    from pipeline.stages.report import figures as drawings  # noqa: PLC0415
-    from pipeline.stages.report import histograms  # noqa: PLC0415
-    from pipeline.stages.report.training import LOG, training_figures  # noqa: PLC0415
-
-    curves = drawings.read_curves(inputs.folder("score") / "curves.parquet", summary)
-    training = training_figures(inputs.folder("train") / LOG, "this run")
-    played = drawings.first_simulated(inputs)
-    weights = manifests["train"]["report"].get("weights", "unknown")
-    scores, long_term, short_term, *more = (table.to_html() for table in tables)
-    return [
-        paragraph(
-            f"{summary['rollouts']} rollouts of {summary['scenes']} scenes, scored against "
-            f"{summary['logs']} logs. Weights {weights}."
-        ),
-        heading("Scores"),
-        scores,
-        heading("Along the rollouts"),
-        figures(drawings.score_charts(summary, curves)),
-        heading("Beside the paper"),
-        long_term,
-        short_term,
-        heading("A rollout"),
-        figures(drawings.strips(played) if played else []),
-        heading("Features and scenes"),
-        figures(histograms.charts(*counts)),
-        *more,
-        heading("Training"),
-        figures(training),
-        heading("Run passport"),
-        *(table.to_html() for table in about),
-        heading("Machines and times"),
-        inset(
-            f"{RUN_FOLDER}/{PASSPORT}",
-            "Machines and times differ from run to run, so they stand beside this page:",
-        ),
-    ]
-
-
 def _markdown(title: str, tables: "Sequence[Table]") -> str:
     from infgen.views.tables import markdown  # noqa: PLC0415
 
@@ -205,7 +193,7 @@ def _section(manifest: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 STAGE = Stage(
     name="report",
-    version=4,
+    version=5,
     settings={"report": ReportSettings},
     plan=plan,
     work=work,

@@ -4,7 +4,7 @@ On its own: ``python -m pipeline.stages.report.training RUN... --out curves.svg`
 runs. A run is a log, a folder that holds one (a stage's, or a unit's that is still
 training), or the root of an experiment, with a name before it if
 wanted: ``SMART=work/smart``. The suffix of ``--out`` says what is written: one drawing
-(``.svg``) or a page (``.html``).
+(``.svg`` or ``.pdf``) or a page (``.html``).
 """
 
 import sys
@@ -17,9 +17,10 @@ import numpy as np
 
 from infgen.errors import ConfigError
 from infgen.views.charts.calibration import Bins
-from infgen.views.charts.figures import Series
+from infgen.views.charts.canvas import Chart, write_pdf, write_sheet
+from infgen.views.charts.lines import Series
 from infgen.views.charts.training import Run, training_charts
-from infgen.views.page import figures, page, sheet
+from infgen.views.page import render
 from pipeline.engine.atomic import write_file
 from pipeline.stages.train.train_log import read_log
 
@@ -53,7 +54,7 @@ def read_run(path: Path, name: str) -> Run:
     )
 
 
-def training_figures(path: Path, name: str) -> list[str]:
+def training_figures(path: Path, name: str) -> list[Chart]:
     """Draw how one run went; nothing without a log."""
     return training_charts([read_run(path, name)]) if path.is_file() else []
 
@@ -132,12 +133,14 @@ def compare(words: Sequence[str], target: Path, title: str) -> None:
     runs = [read_run(path, name) for name, path in map(find_log, words)]
     drawn = training_charts(runs)
     if target.suffix == ".svg":
-        written = sheet(title, drawn)
+        written = write_sheet(title, drawn).encode()
+    elif target.suffix == ".pdf":
+        written = write_pdf(drawn)
     elif target.suffix == ".html":
-        written = page(title, [figures(drawn)])
+        written = render("training.html", title=title, charts=drawn).encode()
     else:
-        raise ConfigError(f"--out {target}: expected a name ending in .svg or .html")
-    write_file(target, written.encode())
+        raise ConfigError(f"--out {target}: expected a name ending in .svg, .pdf or .html")
+    write_file(target, written)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -9,7 +9,7 @@ from infgen.metrics.long_term.protocols import FEATURES
 from infgen.views.published import ABLATIONS, PAPER
 from infgen.views.sheets import Measured
 from pipeline.comparison.execution import ExecutedRun
-from pipeline.comparison.figures import curve_sheet, figures
+from pipeline.comparison.figures import charts, curve_sheet
 from pipeline.comparison.result import ComparisonResult
 from pipeline.comparison.runs import ArmRun
 from pipeline.comparison.tables import caveats, standing_alone, tables
@@ -198,12 +198,12 @@ def test_seeds_are_averaged_and_the_note_says_what_the_interval_is(found):
 
 
 def test_curves_of_all_arms_are_in_one_chart_of_each_number(found):
-    drawn = figures(found)
+    drawn = charts(found)
 
-    assert [part for part in drawn if "Agent count error (ACE) by window" in part]
-    (entries,) = [part for part in drawn if "Entries within 75 m by window" in part]
+    assert [part for part in drawn if part.title == "Agent count error (ACE) by window"]
+    (entries,) = [part for part in drawn if part.title == "Entries within 75 m by window"]
     for label in ("InfGen", "SMART", "CatK", "no cell token"):
-        assert f">{label}</text>" in entries
+        assert f">{label}</text>" in entries.to_svg()
     sheet = curve_sheet(found)
     row = ["InfGen", "corrected/entry_rate", 4.5, 1.0]
     assert row in sheet.rows
@@ -219,7 +219,7 @@ def test_a_comparison_of_nothing_is_a_list_of_what_failed():
 
     (only,) = tables(empty)
     assert only.name == "runs"
-    assert figures(empty) == []
+    assert charts(empty) == []
     assert empty.to_json()["missing"] == [
         "infgen, seed 0, long: train: weights: OSError: full"
     ]

@@ -1,77 +1,57 @@
-import re
-from xml.etree import ElementTree
-
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 
-from infgen.config import VocabSettings
-from infgen.tokens.clustering.coverage import Matches, describe_map, describe_motion
 from infgen.tokens.clustering.vocabularies import Origin
-from infgen.views.charts.vocabularies import vocabulary_page
-
-NOTHING = Matches(np.empty(0, np.int8), np.empty(0, int), np.empty(0))
+from infgen.views.charts.canvas import COLOURS
+from infgen.views.charts.vocabularies import vocabulary_charts
 
 
 @pytest.fixture
-def page(metre_moves, bent_roads):
-    move_origin = np.full((3, 61), Origin.LOGGED, np.int8)
-    move_origin[2] = Origin.MADE
+def charts(metre_moves, bent_roads):
+    motion_origin = np.full((3, 61), Origin.LOGGED, np.int8)
+    motion_origin[2] = Origin.MADE
     road_origin = np.full(9, Origin.LOGGED, np.int8)
-    curves = bent_roads.curve_m
-    report = {
-        "scenes": {"learn": 7, "held-out": 0},
-        "validation_split": "0 scenes of split <none>",
-        "tolerance_m": 0.05,
-        "road_tolerance_m": 0.1,
-        "motion": describe_motion(
-            metre_moves, move_origin, NOTHING, NOTHING, VocabSettings()
-        ),
-        "roads": describe_map(bent_roads, road_origin, curves, curves),
-    }
-    return vocabulary_page(report, metre_moves, move_origin, bent_roads, road_origin)
+    motion, roads = vocabulary_charts(metre_moves, motion_origin, bent_roads, road_origin)
+    return [*motion, roads]
 
 
-def pictures(page):
-    return [ElementTree.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", page)]
+def lines(chart):
+    """The one line of all curves and their ends."""
+    (axes,) = chart.to_figure().axes
+    return axes.get_lines()
 
 
-def test_the_page_is_self_contained(page):
-    assert page.startswith("<!doctype html>")
-    assert not re.search(r"<script|<link|<img|@import|url\(", page)
-    links = re.findall(r"https?://[^\"]*", page)
-    assert set(links) == {"http://www.w3.org/2000/svg"}
-
-
-def test_every_kind_and_the_map_have_a_picture_that_is_valid_svg(page):
-    assert len(pictures(page)) == 4
-
-
-def test_every_move_is_drawn_in_the_colour_of_its_origin(page):
-    for svg, count in zip(pictures(page), [61, 61, 61, 9], strict=True):
-        drawn = [path for path in svg.iter() if path.get("stroke-opacity")]
-        assert len(drawn) == 1
-        assert len(re.findall("M", drawn[0].get("d"))) == count
-    vehicle, _, cyclist, _ = pictures(page)
-    colours = [
-        {path.get("stroke") for path in svg.iter() if path.get("stroke-opacity")}
-        for svg in (vehicle, cyclist)
+def test_every_agent_type_and_the_map_have_a_chart(charts):
+    assert [chart.title.split(":")[0] for chart in charts] == [
+        "Vehicle",
+        "Pedestrian",
+        "Cyclist",
+        "Map tokens",
     ]
-    assert colours[0] != colours[1]
 
 
-def test_what_could_not_be_measured_is_said_and_words_are_escaped(page):
-    assert "nothing to measure" in page
-    assert "split &lt;none&gt;" in page
-    assert "7 scenes" in page
+def test_every_token_is_drawn_in_the_colour_of_its_origin(charts):
+    for chart, count in zip(charts, [61, 61, 61, 9], strict=True):
+        (line,) = lines(chart)
+        gaps = np.isnan(line.get_xdata()).sum()
+        assert gaps == 2 * count  # One behind the curve, one behind its end.
+    assert to_hex(lines(charts[0])[0].get_color()) == COLOURS[0]
+    assert to_hex(lines(charts[2])[0].get_color()) == COLOURS[1]
 
 
-def test_nothing_is_drawn_outside_the_picture(page):
-    for svg in pictures(page):
-        _, _, width, height = map(float, svg.get("viewBox").split())
-        for path in svg.iter():
-            if path.get("stroke-opacity"):
-                lines = path.get("d").replace("m-.8 0h1.6", "")  # the dots at the ends
-                points = re.findall(r"[ML ]?(-?[\d.]+) (-?[\d.]+)", lines)
-                xy = np.array(points, float)
-                assert (xy >= -0.1).all()
-                assert (xy <= [width + 0.1, height + 0.1]).all()
+def test_curves_are_drawn_to_scale_and_within_the_axes(charts):
+    for chart in charts:
+        (axes,) = chart.to_figure().axes
+        xy = axes.get_lines()[0].get_xydata()
+        ends = np.array([axes.get_xlim(), axes.get_ylim()]).T
+        known = xy[np.isfinite(xy).all(1)]
+        assert (known >= ends[0] - 0.1).all()
+        assert (known <= ends[1] + 0.1).all()
+        box = axes.get_window_extent()
+        width_m, height_m = ends[1] - ends[0]
+        assert box.width / width_m == pytest.approx(box.height / height_m, rel=1e-6)
+
+
+def test_a_chart_of_thousands_of_tokens_stays_small(metre_moves, charts):
+    assert len(charts[0].to_svg()) < 60_000

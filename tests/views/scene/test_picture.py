@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from infgen.rollout.rollout import NEVER, Rollout
-from infgen.views.page import figures, heading, page, paragraph
 from infgen.views.scene.picture import VIEW_PX, rollout_strip, scene_strip
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -128,14 +127,3 @@ def test_names_are_escaped(drive):
     scene = replace(drive(speed_mps=5.0), scenario_id="<script>")
 
     assert "<script>" not in scene_strip(scene, [10])
-
-
-def test_a_page_loads_nothing_from_elsewhere_and_escapes_its_words():
-    html = page("<A>", [heading("<h>"), paragraph("<p>", note=True), figures(["<svg/>"])])
-
-    assert html.startswith("<!doctype html>")
-    assert "&lt;A&gt;" in html
-    assert "&lt;h&gt;" in html
-    assert "&lt;p&gt;" in html
-    assert not re.findall(r"(?:src|href)=|@import|url\(|<script", html)
-    assert "prefers-color-scheme: dark" in html

@@ -221,7 +221,9 @@ def write(inputs, folder: Path, **changes):
     settings = replace(ReportSettings(), **changes)
     assert report.plan(inputs, settings) == []
     told = report.finish(inputs, [], folder, settings, silent)
-    files = {path.name: path.read_text() for path in sorted(folder.glob("*.*"))}
+    files = {path.name: path.read_text("latin-1") for path in folder.glob("*.pdf")}
+    texts = [path for path in sorted(folder.glob("*.*")) if path.name not in files]
+    files |= {path.name: path.read_text() for path in texts}
     below = {
         f"{path.parent.name}/{path.name}": path.read_text()
         for path in sorted(folder.glob("*/*"))
@@ -239,10 +241,15 @@ def summary(inputs):
     return json.loads((inputs.folder("score") / "summary.json").read_text())
 
 
-def test_the_report_comes_in_five_forms(written):
+def test_the_report_comes_in_six_forms(written):
     told, files = written
 
+    assert (
+        files["figures.pdf"].count("/MediaBox")
+        == files["report.html"].count("<figure>") - 2
+    )
     assert sorted(name for name in files if "/" not in name) == [
+        "figures.pdf",
         "report.html",
         "report.md",
         "table.csv",
@@ -297,10 +304,10 @@ def test_the_page_stands_alone(written):
     page = written[1]["report.html"]
 
     assert page.startswith("<!doctype html>")
-    linked = set(re.findall(r'(?:src|href)\s*=\s*"([^"]*)"', page))
+    linked = set(re.findall(r'(?:src|href)\s*=\s*"([^"#][^"]*)"', page))
     assert "run/passport.html" in linked
     assert linked <= written[1].keys()
-    assert not re.findall(r"@import|url\(|<script|https?://(?!www\.w3)", page)
+    assert not re.findall(r"@import|url\((?!#)|<script|https?://(?!www\.w3)", page)
     assert page.count("<svg") == page.count("</svg>")
     assert "nan" not in re.findall(r'd="([^"]*)"', page)
 

@@ -104,7 +104,7 @@ def test_runs_are_compared_in_one_file_with_the_same_bytes_each_time(
 
 
 def test_another_suffix_is_refused(path, tmp_path):
-    with pytest.raises(ConfigError, match=r"\.svg or \.html"):
+    with pytest.raises(ConfigError, match=r"\.svg, \.pdf or \.html"):
         compare([str(path)], tmp_path / "out.png", "t")
 
 
