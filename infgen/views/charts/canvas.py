@@ -8,6 +8,7 @@ import io
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from html import escape
 from typing import Any
 
@@ -42,6 +43,7 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.titlesize": 13,
     "axes.titleweight": "bold",
+    "axes.titley": 1.0,
     "axes.titlecolor": INK,
     "axes.xmargin": 0,
     "axes.ymargin": 0,
@@ -68,9 +70,9 @@ _LONG_DECIMALS = re.compile(r"(\.\d\d)\d+")
 _COUNTED_IDS = re.compile(r' id="[A-Za-z0-9.]+_\d+"')
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Chart:
-    """A chart that has yet to be drawn.
+    """A chart that is drawn when it is first asked for.
 
     Attributes:
         title: Above it; its page of a PDF is named after it.
@@ -88,7 +90,7 @@ class Chart:
 
     def to_svg(self) -> str:
         """Draw it as SVG that an HTML page can hold."""
-        return _write_svg(self.to_figure, self.title)
+        return _write_svg(self.figure, self.title)
 
     def draw_at(self, figure: Figure, left_px: float, top_px: float) -> None:
         """Draw it with its upper left corner at a place of a figure."""
@@ -106,10 +108,12 @@ class Chart:
         axes.set_title(self.title)
         self.draw(axes)
 
-    def to_figure(self) -> Figure:
-        """Draw it as a figure of its own, in the style that matplotlib has at the time."""
-        figure = _empty_figure(self.width_px, self.height_px)
-        self.draw_at(figure, 0.0, 0.0)
+    @cached_property
+    def figure(self) -> Figure:
+        """The chart as a figure of its own; drawn once, whatever it is written as."""
+        with rc_context(_STYLE):
+            figure = _empty_figure(self.width_px, self.height_px)
+            self.draw_at(figure, 0.0, 0.0)
         return figure
 
 
@@ -129,18 +133,16 @@ def write_pdf(charts: Iterable[Chart]) -> bytes:
     file = io.BytesIO()
     with rc_context(_STYLE), PdfPages(file, metadata={"CreationDate": None}) as pages:
         for chart in charts:
-            pages.savefig(chart.to_figure())
+            pages.savefig(chart.figure)
     return file.getvalue()
 
 
 def write_sheet(title: str, charts: Sequence[Chart], columns: int = 3) -> str:
     """Draw charts as one SVG, row by row."""
-
-    def make_figure() -> Figure:
-        starts = range(0, len(charts), columns)
-        rows = [charts[start : start + columns] for start in starts]
-        widths_px = [sum(c.width_px + _GAP_PX for c in row) - _GAP_PX for row in rows]
-        heights_px = [max(c.height_px for c in row) + _GAP_PX for row in rows]
+    rows = [charts[start : start + columns] for start in range(0, len(charts), columns)]
+    widths_px = [sum(c.width_px + _GAP_PX for c in row) - _GAP_PX for row in rows]
+    heights_px = [max(c.height_px for c in row) + _GAP_PX for row in rows]
+    with rc_context(_STYLE):
         figure = _empty_figure(max(widths_px, default=200.0), _HEAD_PX + sum(heights_px))
         figure.suptitle(title, fontsize=15, color=INK, va="top")
         top_px = _HEAD_PX
@@ -150,21 +152,19 @@ def write_sheet(title: str, charts: Sequence[Chart], columns: int = 3) -> str:
                 chart.draw_at(figure, left_px, top_px)
                 left_px += chart.width_px + _GAP_PX
             top_px += height_px
-        return figure
-
-    return _write_svg(make_figure, title)
+    return _write_svg(figure, title)
 
 
 def _empty_figure(width_px: float, height_px: float) -> Figure:
     return Figure((width_px / _PX_PER_INCH, height_px / _PX_PER_INCH), dpi=_PX_PER_INCH)
 
 
-def _write_svg(make_figure: Callable[[], Figure], title: str) -> str:
+def _write_svg(figure: Figure, title: str) -> str:
     """Write SVG in pixels whose colours follow the page, and are those here without one."""
     file = io.StringIO()
     nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     with rc_context(_STYLE):
-        make_figure().savefig(file, format="svg", transparent=True, metadata=nothing)
+        figure.savefig(file, format="svg", transparent=True, metadata=nothing)
     drawn = file.getvalue()
     drawn = drawn[drawn.index("<svg") :].replace('pt" height=', '" height=')
     drawn = drawn.replace('pt" viewBox', '" role="img" viewBox', 1)

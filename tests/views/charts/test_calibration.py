@@ -23,7 +23,7 @@ def chart(**runs):
 
 def dots(drawn):
     """Places of the dots of bins: predicted and logged rate."""
-    (axes,) = drawn.to_figure().axes
+    (axes,) = drawn.figure.axes
     marked = [line for line in axes.get_lines() if line.get_marker() == "o"]
     return np.concatenate([line.get_xydata() for line in marked])
 
@@ -60,13 +60,13 @@ def test_a_calibrated_model_lies_on_the_diagonal():
     drawn = chart(a=bins([100, 100, 100], [0.2, 0.5, 0.9], [20, 50, 90]))
 
     assert dots(drawn) == pytest.approx(np.array([[0.2, 0.2], [0.5, 0.5], [0.9, 0.9]]))
-    diagonal = drawn.to_figure().axes[0].get_lines()[0].get_xydata()
+    diagonal = drawn.figure.axes[0].get_lines()[0].get_xydata()
     assert diagonal.tolist() == [[0.0, 0.0], [1.0, 1.0]]
 
 
 def test_low_rates_stand_on_logarithmic_axes_and_none_at_their_end():
     drawn = chart(a=bins([9000, 900, 90], [0.001, 0.01, 0.1], [0, 9, 9]))
-    (axes,) = drawn.to_figure().axes
+    (axes,) = drawn.figure.axes
 
     assert axes.get_xscale() == axes.get_yscale() == "log"
     assert dots(drawn)[0, 1] == axes.get_ylim()[0]

@@ -21,7 +21,7 @@ def chart(*lines, truth=None):
 
 
 def axes(chart):
-    (found,) = chart.to_figure().axes
+    (found,) = chart.figure.axes
     return found
 
 
@@ -71,7 +71,7 @@ def test_the_truth_is_drawn_in_ink_and_named_last():
 @pytest.mark.parametrize("count", [1, 4, 9, 14])
 def test_the_legend_lies_within_the_chart(count):
     drawn = chart(*[series([0.0, at], f"method {at}") for at in range(count)])
-    figure = drawn.to_figure()
+    figure = drawn.figure
     figure.draw_without_rendering()
     box = figure.axes[0].get_legend().get_window_extent()
 

@@ -27,7 +27,7 @@ def drawn(runs, figure="motion"):
 
 
 def axes(chart):
-    (found,) = chart.to_figure().axes
+    (found,) = chart.figure.axes
     return found
 
 

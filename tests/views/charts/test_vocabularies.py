@@ -18,7 +18,7 @@ def charts(metre_moves, bent_roads):
 
 def lines(chart):
     """The one line of all curves and their ends."""
-    (axes,) = chart.to_figure().axes
+    (axes,) = chart.figure.axes
     return axes.get_lines()
 
 
@@ -42,7 +42,7 @@ def test_every_token_is_drawn_in_the_colour_of_its_origin(charts):
 
 def test_curves_are_drawn_to_scale_and_within_the_axes(charts):
     for chart in charts:
-        (axes,) = chart.to_figure().axes
+        (axes,) = chart.figure.axes
         xy = axes.get_lines()[0].get_xydata()
         ends = np.array([axes.get_xlim(), axes.get_ylim()]).T
         known = xy[np.isfinite(xy).all(1)]
