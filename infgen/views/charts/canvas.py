@@ -58,9 +58,9 @@ _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "infgen",
     "text.parse_math": False,
-    "xtick.color": FAINT,
+    "xtick.bottom": False,
     "xtick.labelcolor": INK,
-    "ytick.color": FAINT,
+    "ytick.left": False,
     "ytick.labelcolor": INK,
 }
 _PX_PER_INCH = 72.0

@@ -90,6 +90,7 @@ def made(folder: Path, *names: str) -> tuple[Root, dict[str, FinishedInputs]]:
     return root, {name: FinishedInputs(root, plan[name]) for name in plan.stages}
 
 
+@pytest.mark.slow
 def test_a_file_that_is_there_twice_changes_nothing(tmp_path, source, monkeypatch):
     # What syncing is for is not seen by a test.
     monkeypatch.setattr(os, "fsync", lambda handle: None)
