@@ -120,6 +120,7 @@ def test_a_command_that_does_not_exist_would_be_found():
         check_infgen(["run", "reprt"])
 
 
+@pytest.mark.slow
 def test_the_readers_folder_has_the_profiles_of_the_package(desk):
     ours = load_stages(desk.folder / "stages.yaml", {})
 

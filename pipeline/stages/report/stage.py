@@ -70,7 +70,7 @@ def finish(
     manifests = {stage: read_manifest(inputs.folder(stage)) for stage in STAGES}
     lowest = find_lowest(inputs.folder("score") / "scores.parquet", LOWEST)
     pages = write_players(inputs, target, lowest, settings.player_pages)
-    tables = [*_score_tables(summary, manifests), worst_table(lowest, pages)]
+    tables = [*score_tables(summary, manifests), worst_table(lowest, pages)]
     about = passport(inputs, manifests)
     counts = histograms.read_both(inputs)
     progress(1, 3, "tables")
@@ -163,9 +163,8 @@ def _composite(summary: Mapping[str, Any], protocol: str) -> float | None:
     return value
 
 
-def _score_tables(
-    summary: Mapping[str, Any], manifests: Mapping[str, Any]
-) -> "list[Table]":
+def score_tables(summary: Mapping[str, Any], manifests: Mapping[str, Any]) -> "list[Table]":
+    """Tables of scores: the run's own, two beside the paper's, and divergences."""
     from pipeline.stages.report import tables  # noqa: PLC0415
 
     rollout = RolloutSettings(**_section(manifests["rollout"], "rollout"))
