@@ -43,7 +43,7 @@ from infgen.scene import Scene
 from infgen.tokens.tokenizer import tokenize_scene
 from pipeline.storage.weights import load_network
 
-SAMPLED = ("life", "kind", "move", "presence")
+SAMPLED = ("life", "agent_type", "motion_token", "presence")
 
 
 class Saying(Stepper):

@@ -137,7 +137,7 @@ def kept_velocity(traffic: Traffic, num_steps: int) -> Traffic:
             z_m=kept(motion.z_m, moves=False),
             heading_rad=kept(motion.heading_rad, moves=False),
             size_lwh_m=motion.size_lwh_m[rows],
-            kind=motion.kind[rows],
+            agent_type=motion.agent_type[rows],
             valid=np.concatenate([valid, future], axis=-1),
         ),
         events=Events(*nothing, *nothing),

@@ -34,14 +34,14 @@ class InsertedSample:
         off_road: Whether vehicles are off the road when first near.
         overlaps: Whether who is first near overlaps somebody there.
         bearing_rad: Where from, as the ego sees it: 0 is ahead, left is positive.
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
     """
 
     first_mps: list[Float64[np.ndarray, " agent"]] = field(default_factory=list)
     off_road: list[Bool[np.ndarray, " agent"]] = field(default_factory=list)
     overlaps: list[Bool[np.ndarray, " agent"]] = field(default_factory=list)
     bearing_rad: list[Float32[np.ndarray, " agent"]] = field(default_factory=list)
-    kind: list[Int64[np.ndarray, " agent"]] = field(default_factory=list)
+    agent_type: list[Int64[np.ndarray, " agent"]] = field(default_factory=list)
 
     def take(
         self,
@@ -73,17 +73,17 @@ class InsertedSample:
         seen = there.any(axis=1)
         mean_mps = mps / np.maximum(there.sum(axis=1), 1)
         self.first_mps.append(mean_mps[seen].astype(float))
-        self.kind.append(motion.kind[rows].astype(np.int64))
+        self.agent_type.append(motion.agent_type[rows].astype(np.int64))
         self.bearing_rad.append(_bearing_rad(traffic, rows, first[rows]))
         self.overlaps.append(_overlaps_at(traffic, rows, first[rows]))
-        vehicles = rows[motion.kind[rows] == AgentType.VEHICLE]
+        vehicles = rows[motion.agent_type[rows] == AgentType.VEHICLE]
         if edges is not None and len(vehicles):
             self.off_road.append(_off_at(traffic, vehicles, first[vehicles], edges))
 
     def numbers(self) -> dict[str, float | None]:
         """Return their figures; only how many were seen (0) if there are none."""
         mps, off = _joined(self.first_mps), _joined(self.off_road)
-        kind, overlaps = _joined(self.kind), _joined(self.overlaps)
+        agent_type, overlaps = _joined(self.agent_type), _joined(self.overlaps)
         if not len(mps):
             return {"seen": 0.0}
         return {
@@ -93,8 +93,8 @@ class InsertedSample:
             "90 % m/s": float(np.percentile(mps, 90)),
             "vehicles off-road": float(off.mean()) if len(off) else None,
             "overlap somebody": float(overlaps.mean()),
-            "pedestrians": float((kind == AgentType.PEDESTRIAN).mean()),
-            "cyclists": float((kind == AgentType.CYCLIST).mean()),
+            "pedestrians": float((agent_type == AgentType.PEDESTRIAN).mean()),
+            "cyclists": float((agent_type == AgentType.CYCLIST).mean()),
         }
 
     def speed_counts(self) -> Float64[np.ndarray, " bin"]:

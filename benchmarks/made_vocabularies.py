@@ -23,8 +23,8 @@ def made_vocabularies() -> tuple[MotionVocabulary, MapVocabulary]:
     limits = motion_limits(settings)
     path = np.stack(
         [
-            np.concatenate([still, make_fan(kind, limits, spacing_m)])[:moves]
-            for kind, spacing_m in enumerate(FAN_SPACING_M)
+            np.concatenate([still, make_fan(agent_type, limits, spacing_m)])[:moves]
+            for agent_type, spacing_m in enumerate(FAN_SPACING_M)
         ]
     )
     motion = MotionVocabulary(BOX_LW_M, path, np.zeros(path.shape[:2], dtype=bool))

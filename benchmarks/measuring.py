@@ -61,8 +61,8 @@ def peak_mib(device: str) -> float:
 
 def peak_flops(device: str, *, bf16: bool) -> float:
     """Operations a second (of the clock) of a product of large matrices."""
-    kind = torch.bfloat16 if bf16 else torch.float32
-    one = torch.randn(PEAK_SIDE, PEAK_SIDE, device=device, dtype=kind)
+    agent_type = torch.bfloat16 if bf16 else torch.float32
+    one = torch.randn(PEAK_SIDE, PEAK_SIDE, device=device, dtype=agent_type)
     other, best = one.clone(), 0.0
 
     def product() -> Tensor:

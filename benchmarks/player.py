@@ -88,7 +88,7 @@ def _crowd(name: str, rng: np.random.Generator) -> Showing:
     step_m = CLOCK.step_s * speed_mps[..., None]
     ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     xy_m = start + np.cumsum(step_m * ahead, axis=1)
-    kind = rng.choice(
+    agent_type = rng.choice(
         [AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST],
         AGENTS,
         p=[0.7, 0.2, 0.1],
@@ -100,9 +100,11 @@ def _crowd(name: str, rng: np.random.Generator) -> Showing:
         name=name,
         ego=0,
         id=np.arange(AGENTS, dtype=np.int32),
-        kind=kind.astype(np.int8),
+        agent_type=agent_type.astype(np.int8),
         role=role.astype(np.int8),
-        size_lw_m=np.where(kind[:, None] == 0, [4.6, 2.0], [0.9, 0.8]).astype(np.float32),
+        size_lw_m=np.where(agent_type[:, None] == 0, [4.6, 2.0], [0.9, 0.8]).astype(
+            np.float32
+        ),
         pose=pose.astype(np.float32),
         valid=np.ones((AGENTS, STEPS), bool),
         last_step=np.full(AGENTS, STEPS, np.int16),

@@ -78,7 +78,7 @@ def look(network: Network, scene: SceneTokens) -> Stood:
     with torch.no_grad():
         motion = network(batch).motion
     far_m = torch.from_numpy(network.motion_vocabulary().end_pose[..., :2]).norm(dim=-1)
-    moves = (far_m > STILL_M)[batch.agents.kind[0]]  # [agent, move]
+    moves = (far_m > STILL_M)[batch.agents.agent_type[0]]  # [agent, move]
     odds = motion.rows.spread(motion.motion_logits)[0].softmax(
         dim=-1
     )  # [token, agent, move]
@@ -103,7 +103,7 @@ def _who_stood(agents: Agents) -> tuple[Bool[Tensor, "token agent"], ...]:
     step_m = (pose[1:, :, :2] - pose[:-1, :, :2]).norm(dim=-1)  # [token - 1, agent]
     both = seen[1:] & seen[:-1]
     still, moved = both & (step_m < STILL_M), both & (step_m >= STILL_M)
-    vehicle = agents.kind[0] == AgentType.VEHICLE
+    vehicle = agents.agent_type[0] == AgentType.VEHICLE
     stood = torch.zeros_like(seen)
     stood[2:-1] = still[1:-1] & still[:-2] & both[2:] & vehicle
     went = torch.zeros_like(seen)
@@ -136,7 +136,10 @@ def report(found: Sequence[Stood]) -> list[dict[str, object]]:
     )
     rows: list[dict[str, object]] = []
     for at, name in enumerate(SHOWN):
-        for alone, others in ((True, "none on the move"), (False, "others on the move")):
+        for alone, others in (
+            (True, "none on the motion_token"),
+            (False, "others on the motion_token"),
+        ):
             these = (shown == at) & (quiet == alone)
             if these.any():
                 rows.append(

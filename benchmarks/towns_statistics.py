@@ -48,13 +48,13 @@ def measure(scene: Scene) -> tuple[TokenStep, Values]:
 
 
 def _count_agents(traffic: Traffic) -> TokenStep:
-    kind, valid = traffic.motion.kind, traffic.motion.valid[0]
+    agent_type, valid = traffic.motion.agent_type, traffic.motion.valid[0]
     near = valid & (_apart_m(traffic) < NEAR_M)
-    others = np.arange(len(kind)) != traffic.ego
-    counts: TokenStep = {"agents ever": len(kind)}
+    others = np.arange(len(agent_type)) != traffic.ego
+    counts: TokenStep = {"agents ever": len(agent_type)}
     for each in (AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST):
         counts[f"{each.name.lower()}s now"] = float(
-            (traffic.there_now & (kind == each)).sum()
+            (traffic.there_now & (agent_type == each)).sum()
         )
     counts["agents within 75 m, mean over steps"] = float(near[others].sum(axis=0).mean())
     return counts
@@ -107,23 +107,23 @@ def _motion_of(scene: Scene, traffic: Traffic) -> Values:
     changing = speed_valid(known)
     stands = _stands(traffic)
     values: Values = {
-        "vehicles that stand, share": stands[motion.kind == AgentType.VEHICLE],
-        "pedestrians that stand, share": stands[motion.kind == AgentType.PEDESTRIAN],
+        "vehicles that stand, share": stands[motion.agent_type == AgentType.VEHICLE],
+        "pedestrians that stand, share": stands[motion.agent_type == AgentType.PEDESTRIAN],
         "off-road vehicles, share": _off_road(scene, traffic, ~stands & ~stands | stands),
         "off-road moving vehicles, share": _off_road(scene, traffic, ~stands),
         "speed of the ego": found.speed_mps[0, traffic.ego][known[traffic.ego]],
     }
-    for kind in (AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST):
-        goes = (~stands & (motion.kind == kind))[:, None]
-        name = kind.name.lower()
+    for agent_type in (AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST):
+        goes = (~stands & (motion.agent_type == agent_type))[:, None]
+        name = agent_type.name.lower()
         values[f"speed of {name}s that move"] = found.speed_mps[0][goes & known]
         values[f"acceleration of {name}s that move"] = found.accel_mps2[0][goes & changing]
         values[f"yaw rate of {name}s that move"] = found.yaw_rate_rad_s[0][goes & known]
         values[f"yaw acceleration of {name}s that move"] = found.yaw_accel_rad_s2[0][
             goes & changing
         ]
-        values[f"length of {name}s"] = motion.size_lwh_m[motion.kind == kind, 0]
-        values[f"width of {name}s"] = motion.size_lwh_m[motion.kind == kind, 1]
+        values[f"length of {name}s"] = motion.size_lwh_m[motion.agent_type == agent_type, 0]
+        values[f"width of {name}s"] = motion.size_lwh_m[motion.agent_type == agent_type, 1]
     return values
 
 
@@ -140,7 +140,7 @@ def _off_road(scene: Scene, traffic: Traffic, which: np.ndarray) -> np.ndarray:
     """Whether some vehicles are off the road now."""
     edges = scene_road_edges(scene)
     rows = np.flatnonzero(
-        which & (traffic.motion.kind == AgentType.VEHICLE) & traffic.there_now
+        which & (traffic.motion.agent_type == AgentType.VEHICLE) & traffic.there_now
     )
     if edges is None or not len(rows):
         return np.zeros(0, bool)

@@ -136,7 +136,7 @@ def take(side: Side, whole: Traffic, place: Place, look: Look) -> None:
     others = np.arange(len(valid)) != traffic.ego
     away_m = np.hypot(x_m - x_m[traffic.ego], y_m - y_m[traffic.ego])
     near = valid & (away_m < look.radius_m) & others[:, None]
-    vehicle = (motion.kind == AgentType.VEHICLE)[:, None]
+    vehicle = (motion.agent_type == AgentType.VEHICLE)[:, None]
     speed_mps = speed(x_m, y_m)
     known = speed_valid(valid)
 

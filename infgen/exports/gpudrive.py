@@ -81,7 +81,7 @@ def _object(states: States, row: int) -> dict[str, Any]:
         "velocity": _points(velocity),
         "valid": valid.tolist(),
         "goalPosition": _points(position[last : last + 1])[0],
-        "type": agent_name(int(states.kind[row])).lower(),
+        "type": agent_name(int(states.agent_type[row])).lower(),
         "id": int(states.id[row]),
         "mark_as_expert": False,
     }

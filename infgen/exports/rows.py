@@ -15,7 +15,7 @@ Columns = Mapping[str, np.ndarray]
 def rows_of(rollouts: Sequence[Rollout], scene: Scene) -> Columns:
     """Lay the rollouts of one scene end to end, in order of rollout, agent and step.
 
-    Columns: ``rollout``; ``agent`` (track id); ``kind`` (``AgentType``); ``step`` and
+    Columns: ``rollout``; ``agent`` (track id); ``agent_type`` (``AgentType``); ``step`` and
     ``time_s`` (0 is now); ``x_m``, ``y_m``, ``z_m`` (world frame, float64);
     ``heading_rad``; ``velocity_x_mps`` and ``velocity_y_mps``; ``length_m``, ``width_m``,
     ``height_m``; ``is_ego``; ``is_logged`` (False: inserted); ``is_history`` (not played).
@@ -32,7 +32,7 @@ def _rows(rollout: Rollout, scene: Scene) -> Columns:
     return {
         "rollout": np.full(len(agent), rollout.index, np.int32),
         "agent": states.id[agent],
-        "kind": states.kind[agent],
+        "agent_type": states.agent_type[agent],
         "step": step.astype(np.int32),
         "time_s": np.round(CLOCK.step_s * (step - rollout.now), 3),
         **dict(zip(("x_m", "y_m", "z_m"), states.xyz_m[agent, step].T, strict=True)),

@@ -87,11 +87,11 @@ def with_arrays(part: Any) -> Any:
 
 
 def _track(states: States, row: int) -> dict[str, Any]:
-    valid, kind = states.valid[row], agent_name(int(states.kind[row]))
+    valid, agent_type = states.valid[row], agent_name(int(states.agent_type[row]))
     size_lwh_m = np.where(valid[:, None], states.size_lwh_m[row], np.float32(0))
     length, width, height = rounded(size_lwh_m.T)
     return {
-        "type": kind,
+        "type": agent_type,
         "state": {
             "position": rounded(states.xyz_m[row]),
             "length": length,
@@ -101,13 +101,13 @@ def _track(states: States, row: int) -> dict[str, Any]:
             "velocity": rounded(states.velocity_mps[row]),
             "valid": valid.tolist(),
         },
-        "metadata": _object(kind, int(states.id[row]), len(valid)),
+        "metadata": _object(agent_type, int(states.id[row]), len(valid)),
     }
 
 
-def _object(kind: str, number: int, num_steps: int) -> dict[str, Any]:
+def _object(agent_type: str, number: int, num_steps: int) -> dict[str, Any]:
     return {
-        "type": kind,
+        "type": agent_type,
         "object_id": str(number),
         "track_length": num_steps,
         "dataset": DATASET,
@@ -136,7 +136,7 @@ def _lights(lights: Lights) -> dict[str, Any]:
 
 
 def _about(rollout: Rollout, scene: Scene, states: States, name: str) -> dict[str, Any]:
-    kinds = dict(zip(states.id.tolist(), states.kind.tolist(), strict=True))
+    kinds = dict(zip(states.id.tolist(), states.agent_type.tolist(), strict=True))
     wanted = zip(
         scene.tracks.id[scene.predict_row].tolist(),
         scene.predict_difficulty.tolist(),

@@ -16,7 +16,7 @@ class States:
 
     Attributes:
         id: Track ids; inserted agents count on from the log's largest.
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         size_lwh_m: One box per agent.
         xyz_m: Box centres.
         heading_rad: Counter-clockwise from +x.
@@ -26,7 +26,7 @@ class States:
     """
 
     id: Int64[np.ndarray, " agent"]
-    kind: Int8[np.ndarray, " agent"]
+    agent_type: Int8[np.ndarray, " agent"]
     size_lwh_m: Float32[np.ndarray, "agent 3"]
     xyz_m: Float64[np.ndarray, "agent step 3"]
     heading_rad: Float32[np.ndarray, "agent step"]
@@ -64,7 +64,7 @@ def states_of(rollout: Rollout, scene: Scene, num_steps: int | None = None) -> S
     _take_logged(velocity_mps, rollout, rows, scene)
     return States(
         id=rollout.id[rows].astype(np.int64),
-        kind=rollout.kind[rows],
+        agent_type=rollout.agent_type[rows],
         size_lwh_m=rollout.size_lwh_m[rows],
         xyz_m=np.where(valid[..., None], xyz_m, 0.0),
         heading_rad=np.where(valid, rollout.heading_rad[rows, steps], np.float32(0)),

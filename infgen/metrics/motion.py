@@ -16,7 +16,7 @@ class Motion:
         z_m: Box centres.
         heading_rad: Counter-clockwise from +x, not necessarily wrapped.
         size_lwh_m: Length, width and height of each box.
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         valid: Whether the box is there.
     """
 
@@ -25,7 +25,7 @@ class Motion:
     z_m: Float32[np.ndarray, "rollout agent step"]
     heading_rad: Float32[np.ndarray, "rollout agent step"]
     size_lwh_m: Float32[np.ndarray, "agent 3"]
-    kind: Int8[np.ndarray, " agent"]
+    agent_type: Int8[np.ndarray, " agent"]
     valid: Bool[np.ndarray, "rollout agent step"]
 
     @property

@@ -21,7 +21,7 @@ from infgen.model.layers import (
 from infgen.model.logits import MotionOutputs
 from infgen.model.motion_head import MotionHead
 from infgen.model.neighbour_attention import Shared
-from infgen.model.neighbours import NeighbourRows, NeighbourSpec, RoadFeatures
+from infgen.model.neighbours import MapFeatures, NeighbourRows, NeighbourSpec
 from infgen.model.relations import Rows, direction, relation_embedding
 from infgen.model.settings import ModelSettings
 from infgen.model.signal_features import SignalAhead
@@ -51,23 +51,23 @@ class AgentRows:
     """Agents to embed, one per row.
 
     Attributes:
-        kind: ``AgentType`` [row].
+        agent_type: ``AgentType`` [row].
         size_lwh_m: Boxes [row, 3].
         pose: Poses [row, 3].
         before: Poses one token step earlier [row, 3] ...
         known: ... and whether they were seen [row].
-        move: Vocabulary row, ``FIRST_MOTION_TOKEN`` or ``NO_MOTION_TOKEN`` [row].
+        motion_token: Vocabulary row, ``FIRST_MOTION_TOKEN`` or ``NO_MOTION_TOKEN`` [row].
         presence: ``Presence`` [row].
         cell: Cell of the ego's grid, or ``NO_CELL`` [row].
         ego: Whether it is the ego [row].
     """
 
-    kind: Tensor
+    agent_type: Tensor
     size_lwh_m: Tensor
     pose: Tensor
     before: Tensor
     known: Tensor
-    move: Tensor
+    motion_token: Tensor
     presence: Tensor
     cell: Tensor
     ego: Tensor
@@ -78,7 +78,8 @@ class AgentTables:
     """Embeddings that depend on no scene.
 
     Attributes:
-        moves: Of every kind's moves, then ``FIRST_MOTION_TOKEN``, then ``NO_MOTION_TOKEN``.
+        moves: Of every agent type's motion tokens, then ``FIRST_MOTION_TOKEN``, then
+            ``NO_MOTION_TOKEN``.
         cells: Of every cell, then ``NO_CELL``; None without a life cycle.
     """
 
@@ -118,7 +119,7 @@ class AgentEmbedding(nn.Module):
         self.fuse = embedding_mlp((4 if life else 2) * width, width)
 
     def tables(self) -> AgentTables:
-        """Embed all moves and cells."""
+        """Embed all motion tokens and cells."""
         moves = [mlp(m) for mlp, m in zip(self.moves, self.corners_m, strict=True)]
         cells = None
         if self.cells is not None and self.no_cell is not None:
@@ -127,14 +128,21 @@ class AgentEmbedding(nn.Module):
 
     def forward(self, agents: AgentRows, tables: AgentTables) -> Tensor:
         """Embed agents: [N, D]."""
-        move = agents.kind * self.num_motion_tokens + agents.move
+        motion_token = agents.agent_type * self.num_motion_tokens + agents.motion_token
         special = len(KINDS) * self.num_motion_tokens
-        move = torch.where(agents.move == FIRST_MOTION_TOKEN, special, move)
-        move = torch.where(agents.move == NO_MOTION_TOKEN, special + 1, move)
-        what = self.kind(agents.kind) + self.size(agents.size_lwh_m)
+        motion_token = torch.where(
+            agents.motion_token == FIRST_MOTION_TOKEN, special, motion_token
+        )
+        motion_token = torch.where(
+            agents.motion_token == NO_MOTION_TOKEN, special + 1, motion_token
+        )
+        what = self.kind(agents.agent_type) + self.size(agents.size_lwh_m)
         if self.ego is not None:
             what = what + agents.ego[:, None] * self.ego
-        parts = [gather(tables.moves, move), self.motion(_last_motion(agents), what)]
+        parts = [
+            gather(tables.moves, motion_token),
+            self.motion(_last_motion(agents), what),
+        ]
         if self.presence is not None and tables.cells is not None:
             cell = torch.where(agents.cell == NO_CELL, self.num_cells, agents.cell)
             parts += [self.presence(agents.presence), gather(tables.cells, cell)]
@@ -229,7 +237,7 @@ class MotionStack(nn.Module):
         ahead_m = settings.signal_ahead_m
         self.light = SignalAhead(width, ahead_m) if ahead_m else None
 
-    def roads_reach(self) -> NeighbourSpec:
+    def map_reach(self) -> NeighbourSpec:
         """How agents see roads."""
         s = self.settings
         return NeighbourSpec.of(
@@ -248,7 +256,7 @@ class MotionStack(nn.Module):
         )
 
     def lights_ahead(
-        self, roads: RoadFeatures, pose: Tensor, scene: Tensor, token: Tensor
+        self, roads: MapFeatures, pose: Tensor, scene: Tensor, token: Tensor
     ) -> Tensor | None:
         """Tell agents on maps [N] at token steps [N] what the lights ahead show [N, D]."""
         if self.light is None or roads.lines is None:
@@ -271,26 +279,26 @@ class MotionStack(nn.Module):
         return None if self.shaped is None else self.shaped.table()
 
     def foretell(
-        self, rows: Rows, x_ND: Tensor, kind: Tensor, shapes: Tensor | None
+        self, rows: Rows, x_ND: Tensor, agent_type: Tensor, shapes: Tensor | None
     ) -> MotionOutputs:
         """Say of every row what it does next.
 
         Args:
             rows: The visible agents.
             x_ND: Their updated features.
-            kind: ``AgentType`` of each.
+            agent_type: ``AgentType`` of each.
             shapes: ``motion_features``.
         """
         return MotionOutputs(
             rows,
-            self._moves(x_ND, kind, shapes),
+            self._moves(x_ND, agent_type, shapes),
             None if self.leave is None else self.leave(x_ND)[:, 0],
             None if self.pattern is None else self.pattern(x_ND),
         )
 
-    def _moves(self, x_ND: Tensor, kind: Tensor, shapes: Tensor | None) -> Tensor:
+    def _moves(self, x_ND: Tensor, agent_type: Tensor, shapes: Tensor | None) -> Tensor:
         if self.shaped is not None and shapes is not None:
-            shaped: Tensor = self.shaped(x_ND, kind, shapes)
+            shaped: Tensor = self.shaped(x_ND, agent_type, shapes)
             return shaped
         if self.move is None:
             raise ValueError("the motion head needs features; pass motion_features()")

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from infgen.model.layers import AttentionSources, embedding_mlp, gather
-from infgen.model.neighbours import RoadFeatures, grid_place
+from infgen.model.neighbours import MapFeatures, grid_place
 from infgen.model.relations import wrap_angle
 from infgen.tokens.grid import Grid
 from infgen.tokens.scene_tokens import NO_CELL
@@ -46,7 +46,7 @@ class CellSources:
     present: Tensor
 
     @classmethod
-    def roads(cls, roads: RoadFeatures, scene: Tensor) -> "CellSources":
+    def roads(cls, roads: MapFeatures, scene: Tensor) -> "CellSources":
         """All map tokens of the maps [N] of queries, at about their middles."""
         pose = roads.pose
         along = torch.stack([pose[..., 2].cos(), pose[..., 2].sin()], dim=-1)
@@ -55,7 +55,7 @@ class CellSources:
         return cls(roads.features, roads.rows.number[scene], pose[scene], roads.real[scene])
 
     @classmethod
-    def near(cls, roads: RoadFeatures, seen: AttentionSources) -> "CellSources":
+    def near(cls, roads: MapFeatures, seen: AttentionSources) -> "CellSources":
         """The map tokens that queries [N] see, at their first points."""
         pose = roads.rows.pack(roads.pose)
         return cls(roads.features, seen.index, pose[seen.index], seen.present)

@@ -70,7 +70,7 @@ class CellStack(nn.Module):
         features = settings.cell_feature_width if by_cell else 0
         self.cell_features = CellFeatures(width, features, grid) if features else None
 
-    def roads_reach(self) -> NeighbourSpec:
+    def map_reach(self) -> NeighbourSpec:
         """How the query sees roads."""
         s = self.settings
         return NeighbourSpec.of(
@@ -176,7 +176,7 @@ class DetailStack(nn.Module):
             HeadingFeatures(width, features, grid.num_headings) if features else None
         )
 
-    def roads_reach(self) -> NeighbourSpec:
+    def map_reach(self) -> NeighbourSpec:
         """How the query sees roads."""
         s = self.settings
         return NeighbourSpec.of(
@@ -205,18 +205,18 @@ class DetailStack(nn.Module):
         return centre_m if self.offset is not None else centre_m + offset_m
 
     def answer(
-        self, rows: Rows, x: Tensor, kind: Tensor, pose: Tensor, roads: CellSources
+        self, rows: Rows, x: Tensor, agent_type: Tensor, pose: Tensor, roads: CellSources
     ) -> DetailOutputs:
         """Return logits of the type, and size, heading and offset per type.
 
         Args:
             rows: What the features are of.
             x: Updated features [N, ..., D].
-            kind: ``AgentType`` of each.
+            agent_type: ``AgentType`` of each.
             pose: Pose of the query [N, 3] ...
             roads: ... and the map tokens seen from there.
         """
-        given = x + self.given_kind(kind)
+        given = x + self.given_kind(agent_type)
         turn, offset = self.turn, self.offset
         heading = None if self.heading is None else self.heading(given)
         if self.bearings is not None and heading is not None:

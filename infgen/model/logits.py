@@ -13,7 +13,7 @@ class MotionOutputs:
 
     Attributes:
         rows: The visible agents among [scene, token, agent].
-        motion_logits: [row, move], by the vocabulary of the agent's kind.
+        motion_logits: [row, motion_token], by the vocabulary of the agent's kind.
         remove_logit: Log-odds that the next token is the agent's last [row].
         pattern_logits: When within the next token a log would show the agent [row, 32].
     """
@@ -49,12 +49,12 @@ class DetailOutputs:
 
     Attributes:
         rows: The agents described among [scene, detail].
-        agent_type_logits: [row, kind].
-        size_log_m: Logarithm of length, width, height, given the kind [row, 3].
-        heading_logits: Given the kind [row, heading] ...
+        agent_type_logits: [row, agent_type].
+        size_log_m: Logarithm of length, width, height, given the agent type [row, 3].
+        heading_logits: Given the agent type [row, heading] ...
         turned_rad: ... or the heading itself, relative to the ego's [row].
-        offset_m: From the cell's centre, in the ego's grid frame, given the kind [row, 2];
-            None where places are regressed.
+        offset_m: From the cell's centre, in the ego's grid frame, given the agent type
+            [row, 2]; None where places are regressed.
     """
 
     rows: Rows
@@ -66,7 +66,7 @@ class DetailOutputs:
 
 
 @dataclass(frozen=True, slots=True)
-class RoadOutputs:
+class MapOutputs:
     """Hidden map tokens: their logits [prediction, token] and what they are."""
 
     logits: Tensor
@@ -87,4 +87,4 @@ class Outputs:
     motion: MotionOutputs
     entries: InsertionOutputs | None
     details: DetailOutputs | None
-    roads: RoadOutputs | None
+    roads: MapOutputs | None

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from infgen.model.batching.batch import Roads
+from infgen.model.batching.batch import MapTokens
 from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
-from infgen.model.map_grid import RoadGrid
-from infgen.model.neighbours import NeighbourRows, NeighbourSpec, RoadFeatures, SignalStates
+from infgen.model.map_grid import MapGrid
+from infgen.model.neighbours import MapFeatures, NeighbourRows, NeighbourSpec, SignalStates
 from infgen.model.relations import Rows, relation_embedding
 from infgen.model.settings import ModelSettings
 from infgen.model.signal_features import StopLines
@@ -24,16 +24,16 @@ class MapContext:
 
     rows: Rows
     neighbours: NeighbourRows
-    grid: RoadGrid
+    grid: MapGrid
 
-    def covered(self, roads: Roads) -> "MapContext":
+    def covered(self, roads: MapTokens) -> "MapContext":
         """Exclude hidden tokens as sources: their positions would reveal them."""
         kept = ~self.rows.pack(roads.picked)
         present = self.neighbours.present & kept[self.neighbours.index]
         return replace(self, neighbours=replace(self.neighbours, present=present))
 
 
-class RoadEncoder(nn.Module):
+class MapEncoder(nn.Module):
     """Embed map tokens and let them see their neighbours (SPEC 4.3)."""
 
     curve_m: Tensor
@@ -59,9 +59,9 @@ class RoadEncoder(nn.Module):
         )
         self.next_token = mlp(width, width, vocabulary.num_map_tokens)
 
-    def look(self, roads: Roads) -> MapContext:
+    def look(self, roads: MapTokens) -> MapContext:
         """Find the neighbours of all map tokens."""
-        rows, grid = Rows.where(roads.real), RoadGrid.of(roads.pose, roads.real)
+        rows, grid = Rows.where(roads.real), MapGrid.of(roads.pose, roads.real)
         reach = NeighbourSpec.of(self.radius_m, self.neighbours, self.relation)
         pose, count = rows.pack(roads.pose), roads.real.shape[1]
         scene = rows.at // max(1, count)
@@ -77,7 +77,7 @@ class RoadEncoder(nn.Module):
         )
         return MapContext(rows, neighbours, grid)
 
-    def forward(self, roads: Roads, sight: MapContext) -> RoadFeatures:
+    def forward(self, roads: MapTokens, sight: MapContext) -> MapFeatures:
         """Encode every map token."""
         neighbours = sight.neighbours
         x = self._embed(roads, sight.rows)
@@ -88,11 +88,13 @@ class RoadEncoder(nn.Module):
             looks, signal_states = self._signal_states(roads, rows, x)
             features = torch.cat([features, looks])
         lines = StopLines.of(roads) if self.stop_lines else None
-        return RoadFeatures(
+        return MapFeatures(
             rows, features, roads.pose, roads.real, sight.grid, signal_states, lines
         )
 
-    def predict_hidden(self, roads: Roads, covered: RoadFeatures) -> tuple[Tensor, Tensor]:
+    def predict_hidden(
+        self, roads: MapTokens, covered: MapFeatures
+    ) -> tuple[Tensor, Tensor]:
         """Predict hidden map tokens from their predecessors, which did not see them.
 
         A token is predicted if it is hidden and its predecessor is not.
@@ -109,7 +111,7 @@ class RoadEncoder(nn.Module):
         before = covered.rows.number.roll(1, dims=1)[wanted]
         return self.next_token(covered.features[before]), roads.token[wanted]
 
-    def _embed(self, roads: Roads, rows: Rows) -> Tensor:
+    def _embed(self, roads: MapTokens, rows: Rows) -> Tensor:
         """What each map token is, by itself [row, D]."""
         shapes = self.curve(self.curve_m.flatten(1))  # [token, D]
         embedded: Tensor = gather(shapes, rows.pack(roads.token))
@@ -120,7 +122,7 @@ class RoadEncoder(nn.Module):
         return embedded + self.signal(rows.pack(roads.signal))
 
     def _signal_states(
-        self, roads: Roads, rows: Rows, x: Tensor
+        self, roads: MapTokens, rows: Rows, x: Tensor
     ) -> tuple[Tensor, SignalStates]:
         """Say what map tokens with a light look like under each class of it."""
         lit = rows.pack(roads.light).nonzero()[:, 0]

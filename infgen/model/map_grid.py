@@ -22,7 +22,7 @@ MARGIN_M = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class RoadGrid:
+class MapGrid:
     """Map tokens of some maps, sorted into squares.
 
     Attributes:
@@ -43,7 +43,7 @@ class RoadGrid:
     @torch.no_grad()
     def of(
         cls, pose: Float32[Tensor, "scene road 3"], real: Bool[Tensor, "scene road"]
-    ) -> "RoadGrid":
+    ) -> "MapGrid":
         """Sort the real tokens of maps."""
         xy_m = pose[..., :2].contiguous()
         shown_m = torch.where(real[..., None], xy_m, torch.inf)

@@ -2,8 +2,9 @@
 
 The paper gives each of two thousand moves a logit of its own (SPEC 4.5), each learned
 alone: what is seen of one says nothing about the next one, ten centimetres to its left.
-Here every move has a feature that follows from the pose where it ends, so moves that lead
-to nearly the same place share features, so that few scenes teach all of them.
+Here every motion token has a feature that follows from the pose where it ends, so motion
+tokens that lead to nearly the same place share features, so that few scenes teach all of
+them.
 """
 
 import math
@@ -17,7 +18,7 @@ from infgen.model.layers import mlp
 from infgen.tokens.vocabulary import MotionVocabulary
 
 LONGEST_WAVE_M = 64.0
-"""Longer than any move. Each wave is half as long as the one before it ..."""
+"""Longer than any motion token. Each wave is half as long as the one before it ..."""
 WAVES = 9
 """... down to a quarter of a metre."""
 TURN_WAVES = 6
@@ -27,9 +28,9 @@ UNIT_M = 10.0
 
 
 class MotionHead(nn.Module):
-    """Logits of every kind's moves, from their shapes.
+    """Logits of every agent type's motion tokens, from their shapes.
 
-    Shape letters as in ``layers``; C is the width of the moves' features.
+    Shape letters as in ``layers``; C is the width of the motion tokens' features.
     """
 
     waves: Tensor
@@ -49,14 +50,16 @@ class MotionHead(nn.Module):
         self.usual = nn.Parameter(torch.zeros(waves.shape[:2]))
 
     def table(self) -> Tensor:
-        """Features of all kinds' moves [3, move, C]: they depend on no scene."""
+        """Features [3, motion_token, C] of all motion tokens; no scene changes them."""
         shapes: Tensor = self.shape(self.waves)
         return shapes
 
-    def forward(self, x_ND: Tensor, kind: Int64[Tensor, " row"], shapes: Tensor) -> Tensor:
-        """Logits [N, move] of agents of some kinds, by their features and ``table``."""
+    def forward(
+        self, x_ND: Tensor, agent_type: Int64[Tensor, " row"], shapes: Tensor
+    ) -> Tensor:
+        """Logits [N, motion_token] of agents, by their features and those of ``table``."""
         wanted = self.wanted(x_ND)
-        rows = [(kind == each).nonzero()[:, 0] for each in range(len(shapes))]
+        rows = [(agent_type == each).nonzero()[:, 0] for each in range(len(shapes))]
         parts = [
             torch.addmm(usual.to(wanted.dtype), wanted[row], shape.T)
             for row, shape, usual in zip(rows, shapes, self.usual, strict=True)
@@ -65,9 +68,9 @@ class MotionHead(nn.Module):
 
 
 def _waves(
-    end_pose: Float32[np.ndarray, "3 move 3"],
-) -> Float32[np.ndarray, "3 move wave"]:
-    """Describe where moves end, from coarse to fine."""
+    end_pose: Float32[np.ndarray, "3 motion_token 3"],
+) -> Float32[np.ndarray, "3 motion_token wave"]:
+    """Describe where motion tokens end, from coarse to fine."""
     per_m = 2 * math.pi / LONGEST_WAVE_M * 2.0 ** np.arange(WAVES)
     phase = [end_pose[..., axis, None] * per_m for axis in (0, 1)]
     phase.append(end_pose[..., 2, None] * 2.0 ** np.arange(TURN_WAVES))

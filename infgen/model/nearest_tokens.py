@@ -1,4 +1,4 @@
-"""The nearest move and where it leads, on tensors: ``tokens.moves`` for any device.
+"""The nearest motion token and where it leads, on tensors: ``tokens.moves`` for any device.
 
 Distances are float64 throughout, so neither autocast nor a GPU's short-cuts in matrix
 products touch them.
@@ -14,26 +14,26 @@ from infgen.tokens.motion_tokens import make_match_table
 from infgen.tokens.vocabulary import MotionVocabulary
 
 _ROWS_AT_ONCE = 1024
-"""Keeps the table of gaps (rows x moves) within 16 MiB."""
+"""Keeps the table of gaps (rows x motion tokens) within 16 MiB."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotionTokenEnds:
-    """Where the moves of a vocabulary end. Fields as in ``tokens.moves.MatchTable``.
+    """Where the motion tokens of a vocabulary end; as ``tokens.motion_tokens.MatchTable``.
 
     Attributes:
         pose: In the frame of each move's start.
-        size_lw_m: Box that moves of each kind are compared by.
+        size_lw_m: Box that moves of each agent type are compared by.
         reach_m: Half the diagonal of that box.
         weights: Of the squared distance of two spreads.
         corners_m: Corners of the box at each end: x of the four, then y.
     """
 
-    pose: Float32[Tensor, "3 move 3"]
+    pose: Float32[Tensor, "3 motion_token 3"]
     size_lw_m: Float64[Tensor, "3 2"]
     reach_m: Float64[Tensor, " 3"]
-    weights: Float64[Tensor, "3 5 move"]
-    corners_m: Float64[Tensor, "3 move 8"]
+    weights: Float64[Tensor, "3 5 motion_token"]
+    corners_m: Float64[Tensor, "3 motion_token 8"]
 
     @classmethod
     def of(cls, vocabulary: MotionVocabulary, device: torch.device) -> "MotionTokenEnds":
@@ -53,35 +53,38 @@ class MotionTokenEnds:
 
 
 def nearest(
-    wanted: Float32[Tensor, "row 3"], kind: Int64[Tensor, " row"], ends: MotionTokenEnds
+    wanted: Float32[Tensor, "row 3"],
+    agent_type: Int64[Tensor, " row"],
+    ends: MotionTokenEnds,
 ) -> Int64[Tensor, " row"]:
-    """Find the move of all that ends nearest to each pose wanted (in its start's frame).
+    """Find the motion token that ends nearest to each pose wanted (in its start's frame).
 
-    The same as ``tokens.moves.nearest_motion_tokens``: of equally near moves the first.
+    The same as ``tokens.motion_tokens.nearest_motion_tokens``: of equally near motion
+    tokens the first.
     """
-    move = torch.empty_like(kind)
+    motion_token = torch.empty_like(agent_type)
     for number in range(len(ends.pose)):
-        for rows in torch.split((kind == number).nonzero()[:, 0], _ROWS_AT_ONCE):
-            move[rows] = _nearest(wanted[rows].double(), number, ends)
-    return move
+        for rows in torch.split((agent_type == number).nonzero()[:, 0], _ROWS_AT_ONCE):
+            motion_token[rows] = _nearest(wanted[rows].double(), number, ends)
+    return motion_token
 
 
 def nearest_of(
     wanted: Float32[Tensor, "row 3"],
-    kind: Int64[Tensor, " row"],
+    agent_type: Int64[Tensor, " row"],
     choice: Int64[Tensor, "row choice"],
     ends: MotionTokenEnds,
 ) -> Int64[Tensor, " row"]:
-    """Find the move of some that ends nearest to each pose wanted.
+    """Find the motion token of some that ends nearest to each pose wanted.
 
     Args:
         wanted: Where to, in the frame of each move's start.
-        kind: ``AgentType`` of each row.
-        choice: The moves to choose from; of equally near ones the first.
-        ends: Where moves end.
+        agent_type: ``AgentType`` of each row.
+        choice: The motion tokens to choose from; of equally near ones the first.
+        ends: Where motion tokens end.
     """
-    aim_m = _corners(wanted.double(), ends.size_lw_m[kind])
-    gap_m = _mean_gap(ends.corners_m[kind[:, None], choice], aim_m[:, None])
+    aim_m = _corners(wanted.double(), ends.size_lw_m[agent_type])
+    gap_m = _mean_gap(ends.corners_m[agent_type[:, None], choice], aim_m[:, None])
     return choice.gather(1, gap_m.argmin(dim=1, keepdim=True))[:, 0]
 
 
@@ -111,13 +114,13 @@ def wrap_angle(angle_rad: Tensor) -> Tensor:
 
 
 def _nearest(wanted: Tensor, number: int, ends: MotionTokenEnds) -> Tensor:
-    """Return the nearest move of one kind to each pose wanted (float64)."""
+    """Return the nearest motion token of one agent type to each pose wanted (float64)."""
     aim_m = _corners(wanted, ends.size_lw_m[number])
-    row, move = _candidates(wanted, aim_m, number, ends)
-    gap_m = _mean_gap(ends.corners_m[number, move], aim_m[row])
+    row, motion_token = _candidates(wanted, aim_m, number, ends)
+    gap_m = _mean_gap(ends.corners_m[number, motion_token], aim_m[row])
     far_m = gap_m.new_full((len(wanted),), torch.inf)
     least_m = far_m.scatter_reduce(0, row, gap_m, "amin")
-    best = torch.where(gap_m == least_m[row], move, ends.pose.shape[1])
+    best = torch.where(gap_m == least_m[row], motion_token, ends.pose.shape[1])
     last = row.new_full((len(wanted),), ends.pose.shape[1])
     return last.scatter_reduce(0, row, best, "amin")
 
@@ -125,16 +128,16 @@ def _nearest(wanted: Tensor, number: int, ends: MotionTokenEnds) -> Tensor:
 def _candidates(
     wanted: Tensor, aim_m: Tensor, number: int, ends: MotionTokenEnds
 ) -> tuple[Tensor, Tensor]:
-    """Return rows and moves among which each row's nearest move surely is."""
+    """Return rows and motion tokens; each row's nearest motion token is among them."""
     spread = _spread(wanted, ends.reach_m[number])
     square = spread.square().sum(dim=-1, keepdim=True)
     weights = ends.weights[number]
-    gap = spread @ weights[:4] + weights[4] + square  # [row, move]
+    gap = spread @ weights[:4] + weights[4] + square  # [row, motion_token]
     guess_m = _mean_gap(ends.corners_m[number, gap.argmin(dim=1)], aim_m)
-    # The nearest move is no farther than the guess, its spread at most 1.42 times.
+    # The nearest motion token is no farther than the guess, its spread at most 1.42 times.
     most = 2 * guess_m.square() + 1e-9 * (1 + square[:, 0])  # With room for rounding.
-    row, move = (gap <= most[:, None]).nonzero(as_tuple=True)
-    return row, move
+    row, motion_token = (gap <= most[:, None]).nonzero(as_tuple=True)
+    return row, motion_token
 
 
 def _mean_gap(one_m: Tensor, other_m: Tensor) -> Tensor:

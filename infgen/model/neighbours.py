@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from infgen.model.layers import AttentionSources
-from infgen.model.map_grid import RoadGrid
+from infgen.model.map_grid import MapGrid
 from infgen.model.neighbour_attention import Shared
 from infgen.model.relation_tables import RelationEmbedding
 from infgen.model.relations import Rows, across, nearest, relations
@@ -94,7 +94,7 @@ class NeighbourRows:
 
 
 @dataclass(frozen=True, slots=True)
-class RoadFeatures:
+class MapFeatures:
     """Encoded maps, one after the other.
 
     Attributes:
@@ -112,7 +112,7 @@ class RoadFeatures:
     features: Tensor
     pose: Tensor
     real: Tensor
-    grid: RoadGrid
+    grid: MapGrid
     signal_states: "SignalStates | None"
     lines: StopLines | None
 
@@ -188,7 +188,7 @@ def find_map_neighbours(
     reach: NeighbourSpec,
     targets: Rows,
     target_pose: Float32[Tensor, "group target 3"],
-    roads: RoadFeatures,
+    roads: MapFeatures,
     scene: Int64[Tensor, " group"],
     token: Int64[Tensor, " row"] | None = None,
 ) -> AttentionSources:

@@ -15,14 +15,14 @@ from infgen.model.layers import initialise, normed
 from infgen.model.logits import (
     DetailOutputs,
     InsertionOutputs,
+    MapOutputs,
     MotionOutputs,
     Outputs,
-    RoadOutputs,
 )
-from infgen.model.map import RoadEncoder
+from infgen.model.map import MapEncoder
 from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import (
-    RoadFeatures,
+    MapFeatures,
     cell_pose,
     find_map_neighbours,
     find_neighbours,
@@ -62,7 +62,7 @@ class Network(nn.Module):
             ("road_real", roads.real),
         ):
             self.register_buffer(name, torch.from_numpy(array.copy()))
-        self.roads = RoadEncoder(settings, roads)
+        self.roads = MapEncoder(settings, roads)
         self.embed = AgentEmbedding(settings, motion, cells)
         self.motion = MotionStack(settings, motion, CLOCK.token_s)
         self.cells = CellStack(settings, cells) if settings.insertion_and_removal else None
@@ -77,7 +77,7 @@ class Network(nn.Module):
         return make_grid(self.grid_settings)
 
     def motion_vocabulary(self) -> MotionVocabulary:
-        """Return the moves that motion logits choose from."""
+        """Return the motion tokens that motion logits choose from."""
         names = ("motion_size_lw_m", "motion_path", "motion_real")
         return MotionVocabulary(*(self.get_buffer(n).numpy(force=True) for n in names))
 
@@ -110,21 +110,21 @@ class Network(nn.Module):
             motion=self._motion(agents, rows, x, roads),
             entries=None if cells is None else _entries(cells, batch, rows, raw, roads),
             details=None if details is None else _details(details, batch, rows, raw, roads),
-            roads=None if hidden is None else RoadOutputs(*hidden),
+            roads=None if hidden is None else MapOutputs(*hidden),
         )
 
     def _motion(
-        self, agents: Agents, rows: Rows, x: Tensor, roads: RoadFeatures
+        self, agents: Agents, rows: Rows, x: Tensor, roads: MapFeatures
     ) -> MotionOutputs:
         """Run the motion stack over the visible agents of all tokens."""
-        visible, scene = agents.visible, _count(agents.kind)
+        visible, scene = agents.visible, _count(agents.agent_type)
         by_scene = Rows(rows.at, rows.number.flatten(1))
         by_token = Rows(rows.at, rows.number.flatten(0, 1))
         pose = agents.pose.flatten(0, 1)  # [scene token, agent, 3]
         visible = visible.flatten(0, 1)
         others = ~torch.eye(visible.shape[1], dtype=torch.bool, device=visible.device)
         past_index, past_present, past_relation = self._past(agents, rows)
-        reach, token = self.motion.roads_reach(), _tokens(agents, rows)
+        reach, token = self.motion.map_reach(), _tokens(agents, rows)
         sight = AgentContext(
             past_relation,
             past_present,
@@ -144,8 +144,8 @@ class Network(nn.Module):
             ),
         )
         x = self.motion(x, past_index, sight)
-        kind = rows.pack(agents.kind[:, None].expand(agents.visible.shape))
-        return self.motion.foretell(rows, x, kind, self.motion.motion_features())
+        agent_type = rows.pack(agents.agent_type[:, None].expand(agents.visible.shape))
+        return self.motion.foretell(rows, x, agent_type, self.motion.motion_features())
 
     def _past(self, agents: Agents, rows: Rows) -> tuple[Tensor, Tensor, Shared]:
         """Rows, presence and relations of every row's own past, oldest first [N, K]."""
@@ -165,7 +165,7 @@ class Network(nn.Module):
 
 
 def _entries(
-    stack: CellStack, batch: Batch, rows: Rows, raw: Tensor, roads: RoadFeatures
+    stack: CellStack, batch: Batch, rows: Rows, raw: Tensor, roads: MapFeatures
 ) -> InsertionOutputs:
     """Ask for the inserted agents of every token, each slot seeing those before it."""
     agents, entries = batch.agents, batch.entries
@@ -173,7 +173,7 @@ def _entries(
     alone = Rows(asked.at, asked.number.flatten()[:, None])
     ego_pose = agents.pose[:, :, EGO]
     around = find_neighbours(
-        stack.agents_reach(agents.kind.shape[1]),
+        stack.agents_reach(agents.agent_type.shape[1]),
         alone,
         ego_pose.flatten(0, 1)[:, None],
         agents.pose.flatten(0, 1),
@@ -186,8 +186,8 @@ def _entries(
     seen = around.seen(raw)
     seen = replace(seen, present=seen.present[:, None] & (turn < slot))
     occupied = stack.occupied(cell.expand_as(seen.present), seen.present)
-    reach, scene = stack.roads_reach(), _count(agents.kind)
-    roads_seen = find_map_neighbours(reach, asked, ego_pose, roads, scene)
+    reach, scene = stack.map_reach(), _count(agents.agent_type)
+    map_seen = find_map_neighbours(reach, asked, ego_pose, roads, scene)
     cell_features = None
     if stack.cell_features is not None:
         there = agents.visible & (
@@ -200,11 +200,11 @@ def _entries(
         cell_features = stack.cell_features(
             asked.pack(ego_pose), CellSources.roads(roads, map_of), lying
         )
-    return stack.answer(asked, stack(occupied, roads_seen, seen), cell_features)
+    return stack.answer(asked, stack(occupied, map_seen, seen), cell_features)
 
 
 def _details(
-    stack: DetailStack, batch: Batch, rows: Rows, raw: Tensor, roads: RoadFeatures
+    stack: DetailStack, batch: Batch, rows: Rows, raw: Tensor, roads: MapFeatures
 ) -> DetailOutputs:
     """Describe agents where they enter, without seeing them."""
     agents, details = batch.agents, batch.details
@@ -215,7 +215,7 @@ def _details(
     pose = cell_pose(ego_pose, stack.query_pose(cell, wanted.pack(details.offset_m)))
     each = Rows(_count(pose), _count(pose)[:, None])
 
-    place = torch.arange(agents.kind.shape[1], device=raw.device)
+    place = torch.arange(agents.agent_type.shape[1], device=raw.device)
     turn = wanted.pack(details.turn)[:, None]
     allowed = agents.visible[scene, token] & (agents.turn[scene, token] < turn)
     allowed &= place != wanted.pack(details.agent)[:, None]
@@ -227,11 +227,11 @@ def _details(
         rows.number[scene, token],
         allowed[:, None],
     )
-    reach = stack.roads_reach()
-    roads_seen = find_map_neighbours(reach, each, pose[:, None], roads, scene)
-    x = stack(cell, roads_seen, around.seen(raw))
-    kind = wanted.pack(details.kind)
-    return stack.answer(wanted, x, kind, pose, CellSources.near(roads, roads_seen))
+    reach = stack.map_reach()
+    map_seen = find_map_neighbours(reach, each, pose[:, None], roads, scene)
+    x = stack(cell, map_seen, around.seen(raw))
+    agent_type = wanted.pack(details.agent_type)
+    return stack.answer(wanted, x, agent_type, pose, CellSources.near(roads, map_seen))
 
 
 def _tokens(agents: Agents, rows: Rows) -> Tensor:
@@ -253,12 +253,12 @@ def _agent_rows(agents: Agents, rows: Rows) -> AgentRows:
     before = torch.cat([pose[:, :1], pose[:, :-1]], dim=1)
     tokens = pose.shape[1]
     return AgentRows(
-        kind=rows.pack(agents.kind[:, None].expand(-1, tokens, -1)),
+        agent_type=rows.pack(agents.agent_type[:, None].expand(-1, tokens, -1)),
         size_lwh_m=rows.pack(agents.size_lwh_m[:, None].expand(-1, tokens, -1, -1)),
         pose=rows.pack(pose),
         before=rows.pack(before),
         known=rows.pack(seen_before),
-        move=rows.pack(agents.move),
+        motion_token=rows.pack(agents.motion_token),
         presence=rows.pack(agents.presence),
         cell=rows.pack(agents.cell),
         ego=rows.at % visible.shape[-1] == EGO,

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor, nn
 
-from infgen.model.batching.batch import Roads
+from infgen.model.batching.batch import MapTokens
 from infgen.model.layers import embedding_mlp
 from infgen.tokens.scene_tokens import SignalClass
 from infgen.tokens.signals import REMEMBERED
@@ -47,7 +47,7 @@ class StopLines:
     since: Int64[Tensor, "scene light token"]
 
     @classmethod
-    def of(cls, roads: Roads) -> "StopLines":
+    def of(cls, roads: MapTokens) -> "StopLines":
         """Find the lines of maps: the first map tokens of lanes with a light."""
         starts = roads.real & (roads.light > 0) & ~roads.follows
         lines = int(starts.sum(dim=1).max()) if starts.numel() else 0

@@ -6,7 +6,7 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from infgen.model.layers import AttentionSources
-from infgen.model.neighbours import RoadFeatures
+from infgen.model.neighbours import MapFeatures
 from infgen.model.token_step import TokenStep
 
 
@@ -25,7 +25,7 @@ class StepMemory:
         features: Normed features of them before each block [block, rollout, row, place, D].
     """
 
-    roads: RoadFeatures
+    roads: MapFeatures
     scene: Tensor
     columns: int
     pose: Tensor
@@ -65,7 +65,7 @@ class Insertions:
 
     token: int
     rollout: Tensor
-    map: RoadFeatures
+    map: MapFeatures
     scene: Tensor
     before: Tensor
     known: Tensor

@@ -10,10 +10,10 @@ token step ``c`` of a closed loop::
     entries = stepper.entry_begin(memory, column)    # map part, once per half second
     while some rollout goes on:
         query = stepper.entry_query(entries)         # add?  which cell?
-        details = stepper.entry_details(entries, cell)   # kind; the rest given the kind
-        column = ...  # with inserted agents as rows: ENTERING, not observed
-        entries = stepper.entry_add(entries, column)
-    motion = stepper.motion_step(memory, column)     # next move, leaving next?
+        details = stepper.entry_details(entries, cell)   # kind; the rest given the agent
+        type column = ...  # with inserted agents as rows: ENTERING, not observed entries =
+        stepper.entry_add(entries, column)
+    motion = stepper.motion_step(memory, column)     # next motion token, leaving next?
 
 Dims: ``rollout`` is any mix of scenes and rollouts of them, ``row`` the places for agents.
 Row 0 is always the ego. A row that is ABSENT costs nothing. A row that is INSERTED starts
@@ -27,7 +27,7 @@ from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from infgen.model.agents import AgentContext, AgentRows
-from infgen.model.batching.batch import Roads
+from infgen.model.batching.batch import MapTokens
 from infgen.model.cell_features import CellSources
 from infgen.model.insertion import CellStack, DetailStack
 from infgen.model.layers import AttentionSources, normed
@@ -61,9 +61,9 @@ class _InsertionBlocks:
         return cls(
             cells,
             details,
-            cells.roads_reach(),
+            cells.map_reach(),
             cells.agents_reach(0),
-            details.roads_reach(),
+            details.map_reach(),
             details.agents_reach(),
         )
 
@@ -80,7 +80,7 @@ class Stepper:
         self._tables = network.embed.tables()
         self._past_table = network.motion.past_relation.table()
         self._shapes = network.motion.motion_features()
-        self._roads_reach = network.motion.roads_reach()
+        self._map_reach = network.motion.map_reach()
         self._agents_reach = network.motion.agents_reach()
         self._asking: _InsertionBlocks | None = None
         if network.cells is not None and network.details is not None:
@@ -98,7 +98,7 @@ class Stepper:
 
     @torch.no_grad()
     def begin(
-        self, roads: Roads, scene: Int64[Tensor, " rollout"], rows: int
+        self, roads: MapTokens, scene: Int64[Tensor, " rollout"], rows: int
     ) -> StepMemory:
         """Encode maps and start with an empty past.
 
@@ -142,7 +142,7 @@ class Stepper:
         memory.visible[:, :, place] = visible
         memory.columns += 1
         return MotionStep(
-            motion.foretell(rows, x, rows.pack(token_step.kind), self._shapes)
+            motion.foretell(rows, x, rows.pack(token_step.agent_type), self._shapes)
         )
 
     @torch.no_grad()
@@ -292,12 +292,12 @@ class Stepper:
     ) -> Tensor:
         """Embed some rows of a token step, given the poses known before it."""
         agents = AgentRows(
-            kind=rows.pack(token_step.kind),
+            agent_type=rows.pack(token_step.agent_type),
             size_lwh_m=rows.pack(token_step.size_lwh_m),
             pose=rows.pack(token_step.pose),
             before=rows.pack(before),
             known=rows.pack(known),
-            move=rows.pack(token_step.move),
+            motion_token=rows.pack(token_step.motion_token),
             presence=rows.pack(token_step.presence),
             cell=rows.pack(token_step.cell),
             ego=rows.at % token_step.cell.shape[-1] == EGO,
@@ -323,7 +323,7 @@ class Stepper:
         scene = memory.scene[rows.at // visible.shape[1]]
         light = self.network.motion.lights_ahead(memory.roads, pose, scene, token)
         roads = find_map_neighbours(
-            self._roads_reach, rows, token_step.pose, memory.roads, memory.scene, token
+            self._map_reach, rows, token_step.pose, memory.roads, memory.scene, token
         )
         place = torch.arange(memory.window, device=visible.device)
         ago = (place - memory.columns) % memory.window - memory.window  # -window ... -1

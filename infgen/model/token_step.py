@@ -17,20 +17,20 @@ class TokenStep:
     """All agents of all rollouts at the end of one token step.
 
     Attributes:
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         size_lwh_m: Boxes.
         pose: Quantised x, y, heading (world frame of the scene).
-        move: Move that led here, ``FIRST_MOTION_TOKEN`` where entering, else
-            ``NO_MOTION_TOKEN``.
+        motion_token: Motion token that led here, ``FIRST_MOTION_TOKEN`` where entering,
+            else ``NO_MOTION_TOKEN``.
         presence: ``Presence``. REMOVED is the last column of an agent.
         observed: False where absent, unseen or entering (as ``SceneTokens.observed``).
         cell: Cell of the ego's grid that holds the agent, or ``NO_CELL``.
     """
 
-    kind: Int64[Tensor, "rollout row"]
+    agent_type: Int64[Tensor, "rollout row"]
     size_lwh_m: Float32[Tensor, "rollout row 3"]
     pose: Float32[Tensor, "rollout row 3"]
-    move: Int64[Tensor, "rollout row"]
+    motion_token: Int64[Tensor, "rollout row"]
     presence: Int64[Tensor, "rollout row"]
     observed: Bool[Tensor, "rollout row"]
     cell: Int64[Tensor, "rollout row"]
@@ -57,8 +57,8 @@ class MotionStep:
     packed: MotionOutputs
 
     @property
-    def motion_logits(self) -> Float32[Tensor, "rollout row move"]:
-        """Next move, by the row's own kind's vocabulary."""
+    def motion_logits(self) -> Float32[Tensor, "rollout row motion_token"]:
+        """Next motion token, by the row's own agent type's vocabulary."""
         return self.packed.rows.spread(self.packed.motion_logits)
 
     @property
@@ -104,15 +104,15 @@ class InsertionDetails:
 
     Attributes:
         agent_type_logits: ``AgentType`` given the cell.
-        size_lwh_m: Box, given the kind.
-        heading_logits: Heading bin relative to the ego, given the kind ...
+        size_lwh_m: Box, given the agent type.
+        heading_logits: Heading bin relative to the ego, given the agent type ...
         turned_rad: ... or the heading itself, relative to the ego.
-        offset_m: Position less the cell's centre, in the ego's grid frame, given the kind;
-            None where the place was known already.
+        offset_m: Position less the cell's centre, in the ego's grid frame, given the agent
+            type; None where the place was known already.
     """
 
-    agent_type_logits: Float32[Tensor, "rollout kind"]
-    size_lwh_m: Float32[Tensor, "rollout kind 3"]
-    heading_logits: Float32[Tensor, "rollout kind heading"] | None
-    turned_rad: Float32[Tensor, "rollout kind"] | None
-    offset_m: Float32[Tensor, "rollout kind 2"] | None
+    agent_type_logits: Float32[Tensor, "rollout agent_type"]
+    size_lwh_m: Float32[Tensor, "rollout agent_type 3"]
+    heading_logits: Float32[Tensor, "rollout agent_type heading"] | None
+    turned_rad: Float32[Tensor, "rollout agent_type"] | None
+    offset_m: Float32[Tensor, "rollout agent_type 2"] | None

@@ -207,16 +207,16 @@ def _sample_details(
     details = simulator.stepper.entry_details(
         active.entries, simulator.tensor(cell.astype(np.int64)), asked_at
     )
-    kind = choose(details.agent_type_logits, uniforms(Purpose.KIND))
+    agent_type = choose(details.agent_type_logits, uniforms(Purpose.AGENT_TYPE))
     if details.offset_m is not None:
-        offset_m = _of_type(details.offset_m, kind).cpu().numpy()
+        offset_m = _of_type(details.offset_m, agent_type).cpu().numpy()
         position_m = _within(position_m + offset_m, simulator.grid)
     found = InsertedAgents(
         who=np.ones(len(cell), dtype=bool),
         position_m=position_m,
-        turned_rad=_sample_heading(simulator, details, kind, uniforms),
-        kind=kind.cpu().numpy().astype(np.int8),
-        size_lwh_m=_of_type(details.size_lwh_m, kind).cpu().numpy(),
+        turned_rad=_sample_heading(simulator, details, agent_type, uniforms),
+        agent_type=agent_type.cpu().numpy().astype(np.int8),
+        size_lwh_m=_of_type(details.size_lwh_m, agent_type).cpu().numpy(),
     )
     return found, cell
 
@@ -251,23 +251,26 @@ def _within(position_m: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def _sample_heading(
-    simulator: Simulator, details: InsertionDetails, kind: Tensor, uniforms: UniformNumbers
+    simulator: Simulator,
+    details: InsertionDetails,
+    agent_type: Tensor,
+    uniforms: UniformNumbers,
 ) -> np.ndarray:
     """Sample the heading of every inserted agent relative to the ego."""
     if details.heading_logits is None:
         assert details.turned_rad is not None
-        return _of_type(details.turned_rad, kind).cpu().numpy()
+        return _of_type(details.turned_rad, agent_type).cpu().numpy()
     drawn = choose(
-        _of_type(details.heading_logits, kind),
+        _of_type(details.heading_logits, agent_type),
         uniforms(Purpose.HEADING),
         temperature=simulator.settings.heading_temperature,
     )
     return decode_heading(drawn.cpu().numpy().astype(np.int16), simulator.grid)
 
 
-def _of_type(values: Tensor, kind: Tensor) -> Tensor:
+def _of_type(values: Tensor, agent_type: Tensor) -> Tensor:
     """Take the values [rollout, ...] of the sampled agent types."""
-    return values[torch.arange(len(kind), device=kind.device), kind]
+    return values[torch.arange(len(agent_type), device=agent_type.device), agent_type]
 
 
 def _taken(cells: np.ndarray, count: int) -> Bool[np.ndarray, "rollout cell"]:

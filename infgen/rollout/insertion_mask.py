@@ -38,7 +38,7 @@ class InsertionMask:
     along_m: Float32[np.ndarray, "scene lane 2"]
     scene: Int64[np.ndarray, " rollout"]
     lane_m: float
-    end_pose: Float32[np.ndarray, "3 move 3"]
+    end_pose: Float32[np.ndarray, "3 motion_token 3"]
 
     def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "InsertionMask":
         """Keep some rollouts only."""
@@ -49,8 +49,8 @@ class InsertionMask:
     ) -> Bool[np.ndarray, " rollout"]:
         """Tell which inserted agents have an allowed position."""
         pose = insertion_pose(population.pose[:, EGO_ROW], inserted)
-        pedestrian = inserted.kind == AgentType.PEDESTRIAN
-        passed = pedestrian[:, None] & (population.kind == AgentType.PEDESTRIAN)
+        pedestrian = inserted.agent_type == AgentType.PEDESTRIAN
+        passed = pedestrian[:, None] & (population.agent_type == AgentType.PEDESTRIAN)
         overlaps = np.zeros(len(pose), dtype=bool)
         for everyone in (population.pose, self._soon(population)):
             meets = boxes_overlap(
@@ -63,14 +63,14 @@ class InsertionMask:
             overlaps |= meets.any(axis=1)
         no_lanes = (self.start_m == NOWHERE_M).all(axis=(1, 2))[self.scene]
         near_lane = self.lane_distance_m(pose[:, :2]) <= self.lane_m
-        near_lane |= no_lanes | (inserted.kind != AgentType.VEHICLE)
+        near_lane |= no_lanes | (inserted.agent_type != AgentType.VEHICLE)
         return near_lane & ~overlaps
 
     def _soon(self, population: Population) -> Float32[np.ndarray, "rollout row 3"]:
         """Poses one token step ahead if every agent repeats its motion token."""
-        moves = population.move >= 0
-        move = np.where(moves, population.move, 0)
-        step = self.end_pose[population.kind, move] * moves[..., None]
+        moves = population.motion_token >= 0
+        motion_token = np.where(moves, population.motion_token, 0)
+        step = self.end_pose[population.agent_type, motion_token] * moves[..., None]
         return to_world(step, population.pose)
 
     def lane_distance_m(

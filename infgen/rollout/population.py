@@ -33,21 +33,21 @@ class Population:
     Attributes:
         agent_number: Number of the agent in its rollout, or ``NOBODY`` in a free row.
         num_agents_so_far: Agent numbers given so far in each rollout.
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         size_lwh_m: Boxes.
         pose: x, y, heading in the scene's frame.
-        move: Motion token of this token step, ``FIRST_MOTION_TOKEN`` where inserted, else
-            ``NO_MOTION_TOKEN``.
+        motion_token: Motion token of this token step, ``FIRST_MOTION_TOKEN`` where
+            inserted, else ``NO_MOTION_TOKEN``.
         presence: ``Presence``; ``ABSENT`` in a free row.
         observed: False where absent, just inserted, or (in the history) not in the log.
     """
 
     agent_number: Int32[np.ndarray, "rollout row"]
     num_agents_so_far: Int32[np.ndarray, " rollout"]
-    kind: Int8[np.ndarray, "rollout row"]
+    agent_type: Int8[np.ndarray, "rollout row"]
     size_lwh_m: Float32[np.ndarray, "rollout row 3"]
     pose: Float32[np.ndarray, "rollout row 3"]
-    move: Int16[np.ndarray, "rollout row"]
+    motion_token: Int16[np.ndarray, "rollout row"]
     presence: Int8[np.ndarray, "rollout row"]
     observed: Bool[np.ndarray, "rollout row"]
 
@@ -99,14 +99,14 @@ class InsertedAgents:
         who: Rollouts that have one; the values of others are undefined.
         position_m: Position in the grid frame of the ego.
         turned_rad: Heading relative to the ego.
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         size_lwh_m: Box.
     """
 
     who: Bool[np.ndarray, " rollout"]
     position_m: Float32[np.ndarray, "rollout 2"]
     turned_rad: Float32[np.ndarray, " rollout"]
-    kind: Int8[np.ndarray, " rollout"]
+    agent_type: Int8[np.ndarray, " rollout"]
     size_lwh_m: Float32[np.ndarray, "rollout 3"]
 
     def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "InsertedAgents":
@@ -161,10 +161,10 @@ def _place_logged_at(starts: Sequence[RolloutStart], rows: int, token: int) -> P
         place = slice(0, len(order))
         empty.agent_number[at, place] = order
         empty.num_agents_so_far[at] = len(order)
-        empty.kind[at, place] = history.agent_type[order]
+        empty.agent_type[at, place] = history.agent_type[order]
         empty.size_lwh_m[at, place] = history.size_lwh_m[order]
         empty.pose[at, place] = history.pose[order, token]
-        empty.move[at, place] = history.motion_token[order, token]
+        empty.motion_token[at, place] = history.motion_token[order, token]
         empty.presence[at, place] = history.presence[order, token]
         empty.observed[at, place] = history.observed[order, token]
         if token == history.now:
@@ -186,10 +186,10 @@ def _empty(rollouts: int, rows: int) -> Population:
     return Population(
         agent_number=np.full(shape, NOBODY, dtype=np.int32),
         num_agents_so_far=np.zeros(rollouts, dtype=np.int32),
-        kind=np.zeros(shape, dtype=np.int8),
+        agent_type=np.zeros(shape, dtype=np.int8),
         size_lwh_m=np.zeros((*shape, 3), dtype=np.float32),
         pose=np.zeros((*shape, 3), dtype=np.float32),
-        move=np.full(shape, NO_MOTION_TOKEN, dtype=np.int16),
+        motion_token=np.full(shape, NO_MOTION_TOKEN, dtype=np.int16),
         presence=np.zeros(shape, dtype=np.int8),
         observed=np.zeros(shape, dtype=bool),
     )
@@ -197,7 +197,7 @@ def _empty(rollouts: int, rows: int) -> Population:
 
 def advance_agents(
     population: Population,
-    move: Int64[np.ndarray, "rollout row"],
+    motion_token: Int64[np.ndarray, "rollout row"],
     remove: Bool[np.ndarray, "rollout row"],
     vocabulary: MotionVocabulary,
 ) -> tuple[Population, Float32[np.ndarray, "rollout row 5 3"]]:
@@ -205,7 +205,7 @@ def advance_agents(
 
     Args:
         population: At the end of a token step.
-        move: Next motion token of each row.
+        motion_token: Next motion token of each row.
         remove: Rows whose agent is present for the last time; never the ego.
         vocabulary: Motion tokens.
 
@@ -217,14 +217,14 @@ def advance_agents(
     there = (population.presence != Presence.ABSENT) & ~gone
     remove = remove & there
     remove[:, EGO_ROW] = False
-    steps = vocabulary.path[population.kind, move][:, :, 1:]
+    steps = vocabulary.path[population.agent_type, motion_token][:, :, 1:]
     path = to_world(steps, population.pose[:, :, None]) * there[..., None, None]
     presence = np.where(remove, Presence.REMOVED, Presence.PRESENT) * there
     moved = replace(
         population,
         agent_number=np.where(there, population.agent_number, NOBODY).astype(np.int32),
         pose=path[:, :, -1],
-        move=np.where(there, move, NO_MOTION_TOKEN).astype(np.int16),
+        motion_token=np.where(there, motion_token, NO_MOTION_TOKEN).astype(np.int16),
         presence=presence.astype(np.int8),
         observed=there,
     )
@@ -269,10 +269,10 @@ def add_inserted(
     new = population.take(np.arange(len(fits)))  # A copy.
     new.num_agents_so_far[fits] += 1
     new.agent_number[rollout, row] = population.num_agents_so_far[rollout]
-    new.kind[rollout, row] = inserted.kind[rollout]
+    new.agent_type[rollout, row] = inserted.agent_type[rollout]
     new.size_lwh_m[rollout, row] = inserted.size_lwh_m[rollout]
     new.pose[rollout, row] = insertion_pose(population.pose[:, EGO_ROW], inserted)[rollout]
-    new.move[rollout, row] = FIRST_MOTION_TOKEN
+    new.motion_token[rollout, row] = FIRST_MOTION_TOKEN
     new.presence[rollout, row] = Presence.INSERTED
     new.observed[rollout, row] = False
     rows = np.full(len(fits), -1, dtype=np.int64)

@@ -16,11 +16,11 @@ from jaxtyping import Float64
 class Purpose(IntEnum):
     """What a number decides."""
 
-    MOVE = 0
+    MOTION_TOKEN = 0
     LEAVE = 1
     ADD = 2
     CELL = 3
-    KIND = 4
+    AGENT_TYPE = 4
     HEADING = 5
     PATTERN = 6
 

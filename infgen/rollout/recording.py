@@ -33,7 +33,7 @@ class Frame:
         removed: Rows whose agent is present for the last time.
         inserted_number: Number of the agent inserted at the end of this token step, else
             ``NOBODY``; its row is free in ``agent_number``.
-        kind: ``AgentType`` of every row after this token step.
+        agent_type: ``AgentType`` of every row after this token step.
         size_lwh_m: Box of every row after this token step.
     """
 
@@ -43,7 +43,7 @@ class Frame:
     shown: Bool[np.ndarray, "rollout row 5"]
     removed: Bool[np.ndarray, "rollout row"]
     inserted_number: Int32[np.ndarray, "rollout row"]
-    kind: Int8[np.ndarray, "rollout row"]
+    agent_type: Int8[np.ndarray, "rollout row"]
     size_lwh_m: Float32[np.ndarray, "rollout row 3"]
 
 
@@ -113,7 +113,7 @@ class _RecordedAgents:
     pose: Float32[np.ndarray, "agent step 3"]
     there: Bool[np.ndarray, "agent step"]
     valid: Bool[np.ndarray, "agent step"]
-    kind: Int8[np.ndarray, " agent"]
+    agent_type: Int8[np.ndarray, " agent"]
     size_lwh_m: Float32[np.ndarray, "agent 3"]
     entry_step: Int16[np.ndarray, " agent"]
     exit_step: Int16[np.ndarray, " agent"]
@@ -129,7 +129,7 @@ def _record(start: RolloutStart, frames: Sequence[Frame], at: int) -> _RecordedA
         pose=np.zeros((count, steps, 3), dtype=np.float32),
         there=np.zeros((count, steps), dtype=bool),
         valid=np.zeros((count, steps), dtype=bool),
-        kind=np.zeros(count, dtype=np.int8),
+        agent_type=np.zeros(count, dtype=np.int8),
         size_lwh_m=np.zeros((count, 3), dtype=np.float32),
         entry_step=np.zeros(count, dtype=np.int16),
         exit_step=np.full(count, NEVER, dtype=np.int16),
@@ -147,7 +147,7 @@ def _write_history(recorded: _RecordedAgents, start: RolloutStart) -> None:
     recorded.there[:logged, span] = recorded.valid[:logged, span] = seen
     recorded.pose[:logged, span, :2] = tracks.xyz_m[rows, span, :2] * seen[..., None]
     recorded.pose[:logged, span, 2] = tracks.heading_rad[rows, span] * seen
-    recorded.kind[:logged] = start.history.agent_type
+    recorded.agent_type[:logged] = start.history.agent_type
     recorded.size_lwh_m[:logged] = start.history.size_lwh_m
     recorded.entry_step[:logged] = seen.argmax(axis=1)
 
@@ -161,13 +161,13 @@ def _write_frame(recorded: _RecordedAgents, frame: Frame, at: int) -> None:
     recorded.there[agent_number[there], span] = True
     recorded.valid[agent_number[there], span] = frame.shown[at][there]
     recorded.exit_step[agent_number[frame.removed[at]]] = end
-    recorded.kind[inserted_number[new]] = frame.kind[at][new]
+    recorded.agent_type[inserted_number[new]] = frame.agent_type[at][new]
     recorded.size_lwh_m[inserted_number[new]] = frame.size_lwh_m[at][new]
     recorded.entry_step[inserted_number[new]] = end
 
 
 def _rollout(start: RolloutStart, recorded: _RecordedAgents, weights: str) -> Rollout:
-    count, logged = len(recorded.kind), start.history.num_agents
+    count, logged = len(recorded.agent_type), start.history.num_agents
     first_id = int(start.scene.tracks.id.max()) + 1
     inserted_id = np.arange(first_id, first_id + count - logged, dtype=np.int32)
     z_m = _heights(start, recorded)
@@ -180,7 +180,7 @@ def _rollout(start: RolloutStart, recorded: _RecordedAgents, weights: str) -> Ro
         now=start.scene.now,
         ego=start.history.ego,
         id=np.concatenate([start.history.track_id, inserted_id]),
-        kind=recorded.kind,
+        agent_type=recorded.agent_type,
         size_lwh_m=recorded.size_lwh_m,
         xyz_m=np.concatenate([recorded.pose[..., :2], z_m[..., None]], axis=-1)
         * recorded.valid[..., None],

@@ -25,7 +25,7 @@ class Rollout:
         now: Last step of the history.
         ego: Row of the recording car.
         id: Track id of logged agents; inserted agents count on from the largest.
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         size_lwh_m: One box per agent.
         xyz_m: Box centres.
         heading_rad: Counter-clockwise from +x.
@@ -44,7 +44,7 @@ class Rollout:
     now: int
     ego: int
     id: Int32[np.ndarray, " agent"]
-    kind: Int8[np.ndarray, " agent"]
+    agent_type: Int8[np.ndarray, " agent"]
     size_lwh_m: Float32[np.ndarray, "agent 3"]
     xyz_m: Float32[np.ndarray, "agent step 3"]
     heading_rad: Float32[np.ndarray, "agent step"]

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from infgen.clock import CLOCK
 from infgen.geometry import wrap_angle
-from infgen.model.batching.batch import Roads, collate_roads
+from infgen.model.batching.batch import MapTokens, collate_maps
 from infgen.model.relations import Rows
 from infgen.model.signal_features import StopLines
 from infgen.model.step_memory import StepMemory
@@ -127,7 +127,7 @@ class Session:
                 after.agent_number,
                 np.int32(NOBODY),
             ),
-            kind=after.kind,
+            agent_type=after.agent_type,
             size_lwh_m=after.size_lwh_m,
         )
 
@@ -176,17 +176,17 @@ class Session:
     ) -> tuple[Population, np.ndarray]:
         """Sample motion tokens and removals; replace those of egos that a caller drives."""
         simulator, settings = self._simulator, self._simulator.settings
-        move = self._moves(before, said, token)
-        move = self._release_stalled(before, said, token, move)
+        motion_token = self._sample_motion_tokens(before, said, token)
+        motion_token = self._release_stalled(before, said, token, motion_token)
         if ego_path is not None:
             target, pose = ego_path[:, -1], before.pose[:, EGO_ROW]
-            kind = before.kind[:, EGO_ROW]
-            move[:, EGO_ROW], _ = follow(target, pose, kind, self._table)
+            agent_type = before.agent_type[:, EGO_ROW]
+            motion_token[:, EGO_ROW], _ = follow(target, pose, agent_type, self._table)
         leave = self._sample_removals(said, token)
-        driven = np.zeros(move.shape, dtype=bool)
+        driven = np.zeros(motion_token.shape, dtype=bool)
         driven[:, EGO_ROW] = ego_path is not None
-        move = self._apply_rules(before, said, token, move, driven)
-        moved, path = advance_agents(before, move, leave, simulator.vocabulary)
+        motion_token = self._apply_rules(before, said, token, motion_token, driven)
+        moved, path = advance_agents(before, motion_token, leave, simulator.vocabulary)
         if settings.removes and settings.removal_radius_m:
             moved = remove_beyond(before, moved, settings.removal_radius_m)
         if ego_path is not None:
@@ -199,39 +199,40 @@ class Session:
         before: Population,
         said: MotionStep,
         token: int,
-        move: Int64[np.ndarray, "rollout row"],
+        motion_token: Int64[np.ndarray, "rollout row"],
         driven: Bool[np.ndarray, "rollout row"],
     ) -> Int64[np.ndarray, "rollout row"]:
         """Sample motion tokens again that lead to a collision or off the road."""
         tries, again = self._simulator.settings.max_motion_samples, ~driven
-        slowest, changed = move.copy(), again
+        check, slowest, changed = self._motion_check, motion_token.copy(), again
         for attempt in range(1, tries):
             # Where no token satisfies both checks, only collisions are checked.
             road = attempt <= tries // 2
-            hits, departs = self._motion_check.rejects(before, move, changed, road=road)
+            hits, departs = check.rejects(before, motion_token, changed, road=road)
             again, steers = (hits | departs) & ~driven, departs & ~hits
-            slower = self._motion_check.is_slower(before, move, slowest)
-            slowest = np.where(slower & steers, move, slowest)
+            slower = check.is_slower(before, motion_token, slowest)
+            slowest = np.where(slower & steers, motion_token, slowest)
             changed = again  # Rows with another token than before, braking ones included.
             if attempt == tries // 2:
                 # A vehicle too fast for all of its samples takes the slowest one.
-                brakes = steers & again & self._motion_check.is_fast(before, move)
-                move, again = np.where(brakes, slowest, move), again & ~brakes
+                brakes = steers & again & check.is_fast(before, motion_token)
+                motion_token = np.where(brakes, slowest, motion_token)
+                again = again & ~brakes
             if not again.any():
                 break
-            move = self._resample_rejected(
-                before, said, token, attempt, move, again, steers
+            motion_token = self._resample_rejected(
+                before, said, token, attempt, motion_token, again, steers
             )
-        return move
+        return motion_token
 
-    def _moves(
+    def _sample_motion_tokens(
         self, before: Population, said: MotionStep, token: int
     ) -> Int64[np.ndarray, "rollout row"]:
         """Sample the motion token of every agent."""
         packed = said.packed
-        kind = packed.rows.pack(self._simulator.tensor(before.kind).long())
-        uniforms = self._uniforms(packed.rows, token, Purpose.MOVE)
-        drawn = self._sample(packed.motion_logits, kind, uniforms)
+        agent_type = packed.rows.pack(self._simulator.tensor(before.agent_type).long())
+        uniforms = self._uniforms(packed.rows, token, Purpose.MOTION_TOKEN)
+        drawn = self._sample(packed.motion_logits, agent_type, uniforms)
         return packed.rows.spread(drawn).cpu().numpy()
 
     def _resample_rejected(
@@ -240,7 +241,7 @@ class Session:
         said: MotionStep,
         token: int,
         attempt: int,
-        move: Int64[np.ndarray, "rollout row"],
+        motion_token: Int64[np.ndarray, "rollout row"],
         again: Bool[np.ndarray, "rollout row"],
         steers: Bool[np.ndarray, "rollout row"],
     ) -> Int64[np.ndarray, "rollout row"]:
@@ -251,18 +252,20 @@ class Session:
             said: Logits of the network.
             token: Index of the token step.
             attempt: Number of the sample.
-            move: Motion tokens so far.
+            motion_token: Motion tokens so far.
             again: Rows to sample again.
             steers: Rows that must not take a token that stands still.
         """
         simulator, rows = self._simulator, said.packed.rows
         which = rows.pack(simulator.tensor(again))
-        uniforms = self._uniforms(rows, token, Purpose.MOVE, attempt)[which]
-        kind = rows.pack(simulator.tensor(before.kind).long())[which]
-        drawn = rows.pack(simulator.tensor(move))
-        stops = rows.pack(simulator.tensor(steers))[which, None] & self._standing[kind]
+        uniforms = self._uniforms(rows, token, Purpose.MOTION_TOKEN, attempt)[which]
+        agent_type = rows.pack(simulator.tensor(before.agent_type).long())[which]
+        drawn = rows.pack(simulator.tensor(motion_token))
+        stops = (
+            rows.pack(simulator.tensor(steers))[which, None] & self._standing[agent_type]
+        )
         logits = said.packed.motion_logits[which].masked_fill(stops, -torch.inf)
-        drawn[which] = self._sample(logits, kind, uniforms)
+        drawn[which] = self._sample(logits, agent_type, uniforms)
         return rows.spread(drawn).cpu().numpy()
 
     def _release_stalled(
@@ -270,20 +273,22 @@ class Session:
         before: Population,
         said: MotionStep,
         token: int,
-        move: Int64[np.ndarray, "rollout row"],
+        motion_token: Int64[np.ndarray, "rollout row"],
     ) -> Int64[np.ndarray, "rollout row"]:
         """Sample a moving token for vehicles that have stalled in a lane."""
         if self._stall_rule is None:
-            return move
+            return motion_token
         stalled = self._stall_rule.stalled(before, token - 1)
-        stalled &= self._simulator.vocabulary.stationary[before.kind, move]
+        stalled &= self._simulator.vocabulary.stationary[before.agent_type, motion_token]
         if not stalled.any():
-            return move
+            return motion_token
         # No other sample of this token step has this number.
         attempt = self._simulator.settings.max_motion_samples
-        return self._resample_rejected(before, said, token, attempt, move, stalled, stalled)
+        return self._resample_rejected(
+            before, said, token, attempt, motion_token, stalled, stalled
+        )
 
-    def _sample(self, logits: Tensor, kind: Tensor, uniforms: Tensor) -> Tensor:
+    def _sample(self, logits: Tensor, agent_type: Tensor, uniforms: Tensor) -> Tensor:
         """Sample motion tokens; tokens that stand still have a nucleus of their own.
 
         A vehicle that seldom sets off then still does.
@@ -295,7 +300,7 @@ class Session:
             settings.motion_top_k,
             nucleus=settings.motion_top_p,
             temperature=settings.motion_temperature,
-            apart=self._standing[kind] if settings.motion_top_p < 1 else None,
+            apart=self._standing[agent_type] if settings.motion_top_p < 1 else None,
         )
 
     def _sample_removals(
@@ -312,10 +317,8 @@ class Session:
         self, rows: Rows, token: int, purpose: Purpose, attempt: int = 0
     ) -> Tensor:
         """Draw a uniform number per row; it does not depend on the other rows."""
-        each = self.population.agent_number.shape[1]
-        return rows.pack(
-            self._simulator.draw_uniforms(self._streams, token, purpose, each, attempt)
-        )
+        each, draw = self.population.agent_number.shape[1], self._simulator.draw_uniforms
+        return rows.pack(draw(self._streams, token, purpose, each, attempt))
 
     def _sample_validity(
         self, before: Population, moved: Population, said: MotionStep, token: int
@@ -340,11 +343,11 @@ class Session:
         return shown
 
 
-def _collate_maps(starts: Sequence[RolloutStart]) -> Roads:
+def _collate_maps(starts: Sequence[RolloutStart]) -> MapTokens:
     """Collate the maps of the rollouts; each map once."""
     maps, _ = number_maps(starts)
     histories = [start.history for start in maps]
-    return collate_roads(
+    return collate_maps(
         histories,
         max(history.num_map_tokens for history in histories),
         [start.lights for start in maps],
@@ -352,7 +355,7 @@ def _collate_maps(starts: Sequence[RolloutStart]) -> Roads:
 
 
 def _make_stall_rule(
-    simulator: Simulator, roads: Roads, starts: Sequence[RolloutStart]
+    simulator: Simulator, roads: MapTokens, starts: Sequence[RolloutStart]
 ) -> StallRule | None:
     """Return the stall rule, or None if it is off."""
     tokens = math.ceil(simulator.settings.max_stall_s / CLOCK.token_s)
@@ -373,7 +376,7 @@ def _make_density_control(
 
 def _start(
     simulator: Simulator,
-    roads: Roads,
+    roads: MapTokens,
     starts: Sequence[RolloutStart],
     streams: Sequence[Stream],
     first: Population,

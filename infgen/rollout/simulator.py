@@ -23,7 +23,7 @@ class Simulator:
 
     Attributes:
         stepper: The network, ready to be played.
-        vocabulary: Its moves.
+        vocabulary: Its motion tokens.
         roads: Its map tokens.
         tokens: How histories are tokenized for it.
         settings: Length, sampling and caps.
@@ -79,10 +79,10 @@ class Simulator:
     def token_step(self, population: Population) -> TokenStep:
         """Show a population to the network."""
         return TokenStep(
-            kind=self.tensor(population.kind).long(),
+            agent_type=self.tensor(population.agent_type).long(),
             size_lwh_m=self.tensor(population.size_lwh_m),
             pose=self.tensor(population.pose),
-            move=self.tensor(population.move).long(),
+            motion_token=self.tensor(population.motion_token).long(),
             presence=self.tensor(population.presence).long(),
             observed=self.tensor(population.observed),
             cell=self.tensor(population.cells(self.grid)).long(),

@@ -32,7 +32,7 @@ def replay(scene: Scene, index: int = 0, shift_m: float = 0.0) -> Rollout:
         now=scene.now,
         ego=int(np.flatnonzero(rows == scene.ego)[0]),
         id=tracks.id[rows],
-        kind=tracks.agent_type[rows],
+        agent_type=tracks.agent_type[rows],
         size_lwh_m=tracks.size_lwh_m[rows, scene.now],
         xyz_m=xyz_m.astype(np.float32),
         heading_rad=np.where(valid, heading_rad, 0).astype(np.float32),
@@ -51,7 +51,7 @@ def decoded_small() -> Scene:
 def without(rollout: Rollout, track: int) -> Rollout:
     """The same without one agent."""
     keep = rollout.id != track
-    per_agent = ("id", "kind", "size_lwh_m", "xyz_m", "heading_rad", "valid")
+    per_agent = ("id", "agent_type", "size_lwh_m", "xyz_m", "heading_rad", "valid")
     per_agent += ("logged", "entry_step", "exit_step")
     changed = {name: getattr(rollout, name)[keep] for name in per_agent}
     ego = int(np.flatnonzero(changed["id"] == rollout.id[rollout.ego])[0])
@@ -64,7 +64,7 @@ def with_newcomer(rollout: Rollout, step: int) -> Rollout:
     where = rollout.xyz_m[rollout.ego] + np.array([0, 5, 0], np.float32)
     added = {
         "id": rollout.id.max() + 1,
-        "kind": np.int8(0),
+        "agent_type": np.int8(0),
         "size_lwh_m": np.array([4, 2, 1.5], np.float32),
         "xyz_m": np.where(valid[:, None], where, 0).astype(np.float32),
         "heading_rad": np.where(valid, rollout.heading_rad[rollout.ego], np.float32(0)),

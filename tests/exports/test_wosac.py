@@ -37,9 +37,9 @@ def rollouts(scene):
 
 
 def of_other_kind(scene, row):
-    kind = scene.tracks.agent_type.copy()
-    kind[row] = AgentType.OTHER
-    return replace(scene, tracks=replace(scene.tracks, agent_type=kind))
+    agent_type = scene.tracks.agent_type.copy()
+    agent_type[row] = AgentType.OTHER
+    return replace(scene, tracks=replace(scene.tracks, agent_type=agent_type))
 
 
 def test_protobuf_reads_what_is_written_and_would_write_the_same_bytes(scene, rollouts):
@@ -108,7 +108,14 @@ def test_objects_stand_in_the_order_of_the_log_whatever_that_of_the_rollouts(
             one,
             **{
                 name: getattr(one, name)[[1, 0, 2]]
-                for name in ("id", "kind", "size_lwh_m", "xyz_m", "heading_rad", "valid")
+                for name in (
+                    "id",
+                    "agent_type",
+                    "size_lwh_m",
+                    "xyz_m",
+                    "heading_rad",
+                    "valid",
+                )
             },
             ego=1,
         )

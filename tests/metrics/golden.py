@@ -49,7 +49,7 @@ def golden_log(scenario: str) -> LoggedScene:
     return LoggedScene(
         scenario_id=scenario,
         id=raw["track_id"].astype(np.int32),
-        kind=(raw["track_type"] - 1).astype(np.int8),
+        agent_type=(raw["track_type"] - 1).astype(np.int8),
         x_m=f32["x"],
         y_m=f32["y"],
         z_m=f32["z"],

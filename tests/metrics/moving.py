@@ -8,7 +8,7 @@ STEP_S = 0.1
 CAR_LWH_M = (4.0, 2.0, 1.5)
 
 
-def boxes(*paths, size_lwh_m=CAR_LWH_M, kind=0, valid=None, steps=11) -> Motion:
+def boxes(*paths, size_lwh_m=CAR_LWH_M, agent_type=0, valid=None, steps=11) -> Motion:
     """One rollout of boxes from (x, y, heading, speed) each, or from poses.
 
     Poses are [step, 3], or [step, 4] with the height of the centre.
@@ -23,7 +23,7 @@ def boxes(*paths, size_lwh_m=CAR_LWH_M, kind=0, valid=None, steps=11) -> Motion:
         z_m=z,
         heading_rad=heading,
         size_lwh_m=np.array(sizes, dtype=np.float32),
-        kind=np.broadcast_to(np.int8(kind), len(paths)).copy(),
+        agent_type=np.broadcast_to(np.int8(agent_type), len(paths)).copy(),
         valid=shown,
     )
 

@@ -63,7 +63,7 @@ def traffic() -> Traffic:
             z_m=raw["pred_z"][None],
             heading_rad=raw["pred_head"][None],
             size_lwh_m=raw["pred_shape"],
-            kind=raw["pred_type"].astype(np.int8),
+            agent_type=raw["pred_type"].astype(np.int8),
             valid=raw["pred_valid"][None],
         ),
         events=Events(*events),

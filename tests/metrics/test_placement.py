@@ -96,7 +96,7 @@ def rollout(paths, valid, entry_step=None, exit_step=None) -> Rollout:
         now=10,
         ego=0,
         id=np.arange(count, dtype=np.int32),
-        kind=np.zeros(count, np.int8),
+        agent_type=np.zeros(count, np.int8),
         size_lwh_m=np.ones((count, 3), np.float32),
         xyz_m=xyz,
         heading_rad=np.zeros((count, steps), np.float32),

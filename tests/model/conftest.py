@@ -104,13 +104,13 @@ def make_record(
     lives = [(0, tokens - 1), *lives]
     agents = len(lives)
     vocabulary = make_motion_codebook()
-    kind = np.array([0, *random.choice(kinds, agents - 1)], dtype=np.int8)
-    move = random.integers(vocabulary.num_motion_tokens, size=(agents, tokens))
+    agent_type = np.array([0, *random.choice(kinds, agents - 1)], dtype=np.int8)
+    motion_token = random.integers(vocabulary.num_motion_tokens, size=(agents, tokens))
     start = random.uniform(-1, 1, size=(agents, 3)) * [spread_m, spread_m, np.pi]
     start[0] = [0, 0, 0.4]
     pose = [start.astype(np.float32)]
     for token in range(1, tokens):
-        ends = vocabulary.end_pose[kind, move[:, token]]
+        ends = vocabulary.end_pose[agent_type, motion_token[:, token]]
         pose.append(to_world(ends, pose[-1]))
     pose = np.stack(pose, axis=1).astype(np.float32)
 
@@ -120,7 +120,7 @@ def make_record(
         presence[row, first] = Presence.INSERTED
         if last < tokens - 1:
             presence[row, last] = Presence.REMOVED
-    return _record(f"scene-{seed}", kind, pose, move, presence, roads, random)
+    return _record(f"scene-{seed}", agent_type, pose, motion_token, presence, roads, random)
 
 
 def _life(random, tokens):
@@ -132,13 +132,15 @@ def _life(random, tokens):
     return 0, int(random.integers(1, tokens - 1))
 
 
-def _record(name, kind, pose, move, presence, roads, random):
+def _record(name, agent_type, pose, motion_token, presence, roads, random):
     agents, tokens = presence.shape
     grid = make_grid(GRID)
     entering = presence == Presence.INSERTED
     absent = presence == Presence.ABSENT
     observed = ~absent & ~entering
-    move = np.where(absent, NO_MOTION_TOKEN, np.where(entering, FIRST_MOTION_TOKEN, move))
+    motion_token = np.where(
+        absent, NO_MOTION_TOKEN, np.where(entering, FIRST_MOTION_TOKEN, motion_token)
+    )
     pose = np.where(absent[..., None], 0, pose).astype(np.float32)
     in_grid_m = to_grid(pose[..., :2], pose[:1])
     cell = np.where(absent, NO_CELL, encode_cell(in_grid_m, grid)).astype(np.int16)
@@ -160,11 +162,11 @@ def _record(name, kind, pose, move, presence, roads, random):
         now=1,
         ego=0,
         track_id=np.arange(agents, dtype=np.int32),
-        agent_type=kind,
+        agent_type=agent_type,
         size_lwh_m=random.uniform(1, 5, size=(agents, 3)).astype(np.float32),
         z_m=np.zeros((agents, tokens), dtype=np.float32),
         pose=pose,
-        motion_token=move.astype(np.int16),
+        motion_token=motion_token.astype(np.int16),
         presence=presence,
         observed=observed,
         pattern=np.where(absent, 0, _any_pattern(absent.shape)).astype(np.uint8),

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from infgen.model.map_grid import SIDE_M, RoadGrid
+from infgen.model.map_grid import SIDE_M, MapGrid
 from infgen.model.relations import nearest
 
 
@@ -40,7 +40,7 @@ def test_neighbours_are_those_of_the_whole_map(seed, roads, radius_m, count):
     xy_m[:5] = pose[scene[:5], 0, :2]
     xy_m[5:10, 0] = pose[scene[5:10], 0, 0] + radius_m
 
-    found = RoadGrid.of(pose, real).nearest(xy_m, scene, radius_m, count)
+    found = MapGrid.of(pose, real).nearest(xy_m, scene, radius_m, count)
 
     wanted = by_looking_at_all(pose, real, xy_m, scene, radius_m, count)
     assert torch.equal(found.present[0], wanted.present[:, 0])
@@ -52,7 +52,7 @@ def test_a_token_is_not_its_own_neighbour():
     scene, itself = real.nonzero().T
 
     xy_m = pose[scene, itself, :2]
-    found = RoadGrid.of(pose, real).nearest(xy_m, scene, 25.0, 8, itself=itself)
+    found = MapGrid.of(pose, real).nearest(xy_m, scene, 25.0, 8, itself=itself)
 
     wanted = by_looking_at_all(pose, real, xy_m, scene, 25.0, 8, itself)
     assert torch.equal(found.index[0], wanted.index[:, 0])
@@ -62,7 +62,7 @@ def test_a_token_is_not_its_own_neighbour():
 def test_few_are_looked_at_on_a_large_map():
     pose, real = maps(5000, extent_m=1000.0)
 
-    _, there = RoadGrid.of(pose, real)._listed(
+    _, there = MapGrid.of(pose, real)._listed(
         torch.full((1, 2), 500.0), torch.zeros(1, dtype=torch.int64), 30.0
     )
 
@@ -73,7 +73,7 @@ def test_few_are_looked_at_on_a_large_map():
 @pytest.mark.parametrize("real", [torch.zeros(2, 5), torch.zeros(2, 0)])
 def test_maps_without_tokens_have_no_neighbours(real):
     pose = torch.zeros(*real.shape, 3)
-    grid = RoadGrid.of(pose, real.bool())
+    grid = MapGrid.of(pose, real.bool())
 
     found = grid.nearest(torch.zeros(3, 2), torch.tensor([0, 1, 1]), 30.0, 4)
 
@@ -81,7 +81,7 @@ def test_maps_without_tokens_have_no_neighbours(real):
 
 
 def test_nobody_looks():
-    grid = RoadGrid.of(*maps(10))
+    grid = MapGrid.of(*maps(10))
 
     found = grid.nearest(torch.zeros(0, 2), torch.zeros(0, dtype=torch.int64), 30.0, 4)
 

@@ -30,14 +30,17 @@ def features(rows, seed=0):
 
 def test_every_row_is_told_by_its_own_kinds_moves_whoever_is_beside_it(head):
     torch.nn.init.normal_(head.usual)
-    x, kind = features(7), torch.tensor([2, 0, 1, 0, 0, 2, 1])
+    x, agent_type = features(7), torch.tensor([2, 0, 1, 0, 0, 2, 1])
 
-    together = head(x, kind, head.table())
+    together = head(x, agent_type, head.table())
 
     for row in range(7):
-        alone = head(x[row : row + 1], kind[row : row + 1], head.table())
+        alone = head(x[row : row + 1], agent_type[row : row + 1], head.table())
         torch.testing.assert_close(together[row], alone[0])
-        by_hand = head.wanted(x[row]) @ head.table()[kind[row]].T + head.usual[kind[row]]
+        by_hand = (
+            head.wanted(x[row]) @ head.table()[agent_type[row]].T
+            + head.usual[agent_type[row]]
+        )
         torch.testing.assert_close(together[row], by_hand)
 
 
@@ -63,17 +66,17 @@ def test_no_two_moves_a_centimetre_apart_look_the_same(head):
 
 
 def test_what_is_learned_of_one_move_is_learned_of_those_beside_it(head):
-    x, kind = features(1), torch.zeros(1, dtype=torch.int64)
+    x, agent_type = features(1), torch.zeros(1, dtype=torch.int64)
     head.usual.requires_grad_(False)
     optimiser = torch.optim.SGD([p for p in head.parameters() if p.requires_grad], 0.02)
-    before = head(x, kind, head.table())[0].detach()
+    before = head(x, agent_type, head.table())[0].detach()
 
     loss = torch.nn.functional.cross_entropy(
-        head(x, kind, head.table()), torch.tensor([20])
+        head(x, agent_type, head.table()), torch.tensor([20])
     )
     loss.backward()
     optimiser.step()
-    gained = head(x, kind, head.table())[0].detach() - before
+    gained = head(x, agent_type, head.table())[0].detach() - before
 
     assert gained[20] > 0
     assert gained[18:23].mean() > 2 * gained[:10].mean()

@@ -43,16 +43,18 @@ def poses(rng, rows, far_m=30.0):
 def test_the_nearest_move_is_the_same_on_tensors(seed, stray, rows):
     rng = np.random.default_rng(seed)
     vocabulary = random_codebook(rng)
-    kind = rng.integers(0, 3, rows).astype(np.int8)
+    agent_type = rng.integers(0, 3, rows).astype(np.int8)
     pose = poses(rng, rows)
-    ahead = advance(pose, kind, rng.integers(0, 200, rows).astype(np.int16), vocabulary)
+    ahead = advance(
+        pose, agent_type, rng.integers(0, 200, rows).astype(np.int16), vocabulary
+    )
     target = ahead + (rng.normal(size=(rows, 3)) * stray).astype(np.float32)
 
     wanted = torch.from_numpy(geometry.to_local(target, pose))
     ends = MotionTokenEnds.of(vocabulary, CPU)
-    found = nearest(wanted, torch.from_numpy(kind).long(), ends)
+    found = nearest(wanted, torch.from_numpy(agent_type).long(), ends)
 
-    expected = nearest_motion_tokens(target, pose, kind, make_match_table(vocabulary))
+    expected = nearest_motion_tokens(target, pose, agent_type, make_match_table(vocabulary))
     np.testing.assert_array_equal(found.numpy(), expected)
 
 
@@ -62,11 +64,11 @@ def test_the_nearest_of_all_moves_is_the_nearest(seed):
     rng = np.random.default_rng(seed)
     ends = MotionTokenEnds.of(random_codebook(rng), CPU)
     wanted = torch.from_numpy(poses(rng, 60, far_m=4.0))
-    kind = torch.from_numpy(rng.integers(0, 3, 60))
+    agent_type = torch.from_numpy(rng.integers(0, 3, 60))
     everything = torch.arange(200).expand(60, 200)
 
     assert torch.equal(
-        nearest_of(wanted, kind, everything, ends), nearest(wanted, kind, ends)
+        nearest_of(wanted, agent_type, everything, ends), nearest(wanted, agent_type, ends)
     )
 
 
@@ -75,10 +77,10 @@ def test_the_nearest_of_some_is_among_them_and_the_first_of_twins():
     vocabulary = random_codebook(rng)
     ends = MotionTokenEnds.of(vocabulary, CPU)
     wanted = torch.from_numpy(vocabulary.end_pose[0, [1, 1, 7]])
-    kind = torch.zeros(3, dtype=torch.int64)
+    agent_type = torch.zeros(3, dtype=torch.int64)
     choice = torch.tensor([[1, 7, 100], [7, 100, 1], [7, 9, 3]])
 
-    assert nearest_of(wanted, kind, choice, ends).tolist() == [1, 100, 7]
+    assert nearest_of(wanted, agent_type, choice, ends).tolist() == [1, 100, 7]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
@@ -87,10 +89,10 @@ def test_the_search_is_exact_under_autocast(dtype):
     vocabulary = random_codebook(rng)
     ends = MotionTokenEnds.of(vocabulary, CPU)
     wanted = torch.from_numpy(vocabulary.end_pose[1])
-    kind = torch.ones(200, dtype=torch.int64)
+    agent_type = torch.ones(200, dtype=torch.int64)
 
     with torch.autocast("cpu", dtype=torch.bfloat16, enabled=dtype == torch.bfloat16):
-        found = nearest(wanted, kind, ends)
+        found = nearest(wanted, agent_type, ends)
 
     expected = torch.arange(200)
     expected[100] = 1  # twins

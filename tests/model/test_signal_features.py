@@ -7,7 +7,7 @@ import torch
 from pydantic import ValidationError
 
 from infgen.config import ModelSettings
-from infgen.model.batching.batch import Roads
+from infgen.model.batching.batch import MapTokens
 from infgen.model.signal_features import CLASSES, LONG_SINCE, StopLines, features
 from infgen.tokens.scene_tokens import SignalClass
 from infgen.tokens.signals import REMEMBERED
@@ -20,7 +20,7 @@ def roads(pose, light, shown, follows=None):
     """Maps of one scene: map tokens with their lights, all of them real."""
     count = len(pose)
     nothing = torch.zeros((1, count), dtype=torch.int64)
-    return Roads(
+    return MapTokens(
         real=torch.ones((1, count), dtype=torch.bool),
         pose=torch.tensor([pose], dtype=torch.float32),
         token=nothing,
@@ -117,7 +117,9 @@ def test_lanes_that_part_at_one_line_are_told_class_by_class():
 def test_scenes_without_lights_beside_others_are_told_of_none():
     one = roads([(5, 0, 0)], [1], [[STOP]])
     none = roads([(5, 0, 0)], [0], [[STOP]])
-    both = Roads(*(torch.cat([getattr(one, f), getattr(none, f)]) for f in one.__slots__))
+    both = MapTokens(
+        *(torch.cat([getattr(one, f), getattr(none, f)]) for f in one.__slots__)
+    )
 
     said = StopLines.of(both).ahead(
         torch.zeros((2, 3)), torch.tensor([0, 1]), torch.tensor([0, 0]), REACH_M

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from infgen.model.batching.batch import collate, collate_roads
+from infgen.model.batching.batch import collate, collate_maps
 from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.neighbours import grid_place
 from infgen.model.stepping import Stepper
@@ -20,10 +20,10 @@ def column_at(agents, token, turns=OUTSIDE + 1):
     hidden = agents.turn[:, token] >= turns
     presence = agents.presence[:, token].masked_fill(hidden, int(Presence.ABSENT))
     return TokenStep(
-        kind=agents.kind,
+        agent_type=agents.agent_type,
         size_lwh_m=agents.size_lwh_m,
         pose=agents.pose[:, token],
-        move=agents.move[:, token].masked_fill(hidden, NO_MOTION_TOKEN),
+        motion_token=agents.motion_token[:, token].masked_fill(hidden, NO_MOTION_TOKEN),
         presence=presence,
         observed=agents.observed[:, token] & ~hidden,
         cell=agents.cell[:, token].masked_fill(hidden, NO_CELL),
@@ -52,8 +52,8 @@ def play(network, batch, records):
     """Teacher-forced logits: motion per token, entries per (token, turn)."""
     stepper = Stepper(network)
     scenes = len(records)
-    rows = batch.agents.kind.shape[1]
-    maps = replace(collate_roads(records, 10_000), shown=batch.roads.shown)
+    rows = batch.agents.agent_type.shape[1]
+    maps = replace(collate_maps(records, 10_000), shown=batch.roads.shown)
     memory = stepper.begin(maps, torch.arange(scenes), rows)
     motion, queries, details = [], {}, {}
     slots, by_cell = batch.entries.agent.shape[2], network.settings.position_token
@@ -120,25 +120,25 @@ def test_details_of_newcomers_are_the_same_step_by_step(both):
     compared = 0
     for row in pack(wanted.inserted).nonzero()[:, 0].tolist():
         token, turn = int(pack(wanted.token)[row]), int(pack(wanted.turn)[row])
-        step, kind = details[token, turn], int(pack(wanted.kind)[row])
+        step, agent_type = details[token, turn], int(pack(wanted.agent_type)[row])
         at = scene[row]
         same(step.agent_type_logits[at], found.agent_type_logits[row])
-        same(step.size_lwh_m[at, kind].log(), found.size_log_m[row])
+        same(step.size_lwh_m[at, agent_type].log(), found.size_log_m[row])
         for name in ("heading_logits", "turned_rad", "offset_m"):
-            same(of(getattr(step, name), at, kind), of(getattr(found, name), row))
+            same(of(getattr(step, name), at, agent_type), of(getattr(found, name), row))
         compared += 1
     assert compared >= 3
 
 
 def test_weights_that_know_motion_only_let_nobody_in(tiny, new_network, records):
     stepper = Stepper(new_network(replace(tiny, insertion_and_removal=False)))
-    roads = collate_roads(records, 10_000)
+    roads = collate_maps(records, 10_000)
     memory = stepper.begin(roads, torch.arange(2), rows=4)
     nobody = TokenStep(
-        kind=torch.zeros((2, 4), dtype=torch.int64),
+        agent_type=torch.zeros((2, 4), dtype=torch.int64),
         size_lwh_m=torch.ones((2, 4, 3)),
         pose=torch.zeros((2, 4, 3)),
-        move=torch.full((2, 4), NO_MOTION_TOKEN),
+        motion_token=torch.full((2, 4), NO_MOTION_TOKEN),
         presence=torch.zeros((2, 4), dtype=torch.int64),
         observed=torch.zeros((2, 4), dtype=torch.bool),
         cell=torch.full((2, 4), NO_CELL),

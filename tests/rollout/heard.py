@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from infgen.model.agents import KINDS
-from infgen.model.batching.batch import Agents, Batch, Details, Insertions, collate_roads
+from infgen.model.batching.batch import Agents, Batch, Details, Insertions, collate_maps
 from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.logits import DetailOutputs, InsertionOutputs, MotionOutputs
 from infgen.model.stepping import Stepper
@@ -149,7 +149,7 @@ def recompute(network, played):
     batch = Batch(
         scenario_ids=tuple(history.scenario_id for history in histories),
         agents=_agents(played),
-        roads=collate_roads(histories, 10_000),
+        roads=collate_maps(histories, 10_000),
         entries=_entries(played),
         details=_details(network, played),
     )
@@ -173,12 +173,12 @@ def _agents(played):
 
     presence = told("presence", int(Presence.ABSENT))
     return Agents(
-        kind=told("kind", 0).amax(dim=1),
+        agent_type=told("agent_type", 0).amax(dim=1),
         size_lwh_m=told("size_lwh_m", 0.0).amax(dim=1),
         near=torch.ones((rollouts, count), dtype=torch.bool),
         pose=told("pose", 0.0),
-        move=told("move", NO_MOTION_TOKEN),
-        label=told("move", NO_MOTION_TOKEN),
+        motion_token=told("motion_token", NO_MOTION_TOKEN),
+        label=told("motion_token", NO_MOTION_TOKEN),
         presence=presence,
         observed=told("observed", False),
         pattern=torch.zeros_like(presence),
@@ -214,8 +214,8 @@ def _details(network, played):
     told, kinds = played.details, len(KINDS)
     rollouts = len(played.starts)
 
-    def spread(name, kind, shape=()):
-        filled = torch.zeros((rollouts, len(told), *shape), dtype=kind)
+    def spread(name, agent_type, shape=()):
+        filled = torch.zeros((rollouts, len(told), *shape), dtype=agent_type)
         for at, one in enumerate(told):
             value = getattr(one, name)
             filled[one.rollout, at] = True if name == "rollout" else value
@@ -234,7 +234,7 @@ def _details(network, played):
         token=token,
         turn=spread("turn", torch.int64),
         cell=cell,
-        kind=torch.arange(kinds).repeat(len(told)).expand(rollouts, -1),
+        agent_type=torch.arange(kinds).repeat(len(told)).expand(rollouts, -1),
         size_lwh_m=torch.ones((*token.shape, 3)),
         heading=torch.zeros_like(token),
         offset_m=offset_m,

@@ -140,7 +140,7 @@ def test_alone_or_among_thirty_two_the_network_says_the_same(start, crossing, li
     alone = play(listening(), [start(scene, chosen)], half_seconds).heard
 
     for one, beside in zip(alone.columns, together.columns, strict=True):
-        np.testing.assert_array_equal(one.move[0], beside.move[chosen])
+        np.testing.assert_array_equal(one.motion_token[0], beside.motion_token[chosen])
         np.testing.assert_array_equal(one.presence[0], beside.presence[chosen])
     for one, beside in zip(alone.motion, together.motion, strict=True):
         torch.testing.assert_close(

@@ -21,14 +21,14 @@ def begun(parked, start):
     return begin, place_logged_agents([begin], min_rows=4)[-1]
 
 
-def inserted(x_m, y_m, kind=CAR, turned_rad=0.0):
+def inserted(x_m, y_m, agent_type=CAR, turned_rad=0.0):
     # The grid's +y is the ego's +x, its +x the ego's right.
     return InsertedAgents(
         who=np.array([True]),
         position_m=np.array([[-y_m, x_m]], dtype=np.float32),
         turned_rad=np.array([turned_rad], dtype=np.float32),
-        kind=np.array([kind], dtype=np.int8),
-        size_lwh_m=np.array([SIZE[kind]], dtype=np.float32),
+        agent_type=np.array([agent_type], dtype=np.int8),
+        size_lwh_m=np.array([SIZE[agent_type]], dtype=np.float32),
     )
 
 
@@ -68,7 +68,7 @@ def test_newcomers_stand_on_nobody_and_vehicles_by_a_lane(
 def test_pedestrians_may_walk_close_together(begun, books):
     begin, population = begun
     insertion_mask = room_of(begin, books, lane_m=5.0)
-    population.kind[0, 1] = WALKER
+    population.agent_type[0, 1] = WALKER
     population.size_lwh_m[0, 1] = SIZE[WALKER]
 
     assert insertion_mask.allows(population, inserted(8.3, -2, WALKER)).all()
@@ -81,11 +81,11 @@ def test_nobody_enters_where_another_will_be_in_half_a_second(begun, books):
     insertion_mask = room_of(begin, books, lane_m=1e6)
     ahead = [inserted(x_m, -2) for x_m in (12.5, 17.3, 17.5)]
 
-    population.move[0, 1] = 0
+    population.motion_token[0, 1] = 0
     stands = [insertion_mask.allows(population, one).item() for one in ahead]
-    population.move[0, 1] = 5
+    population.motion_token[0, 1] = 5
     drives = [insertion_mask.allows(population, one).item() for one in ahead]
-    population.move[0, 1] = FIRST_MOTION_TOKEN
+    population.motion_token[0, 1] = FIRST_MOTION_TOKEN
     enters = [insertion_mask.allows(population, one).item() for one in ahead]
 
     assert stands == enters == [True, True, True]

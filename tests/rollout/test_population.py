@@ -31,7 +31,7 @@ def inserted(who, cell, heading=60, offset_m=(0.0, 0.0)):
         who=np.array(who),
         position_m=np.tile(position_m, (count, 1)),
         turned_rad=np.full(count, grid.heading_centre_rad[heading]),
-        kind=np.full(count, AgentType.CYCLIST, dtype=np.int8),
+        agent_type=np.full(count, AgentType.CYCLIST, dtype=np.int8),
         size_lwh_m=np.tile(np.array([2.0, 1.0, 1.7], dtype=np.float32), (count, 1)),
     )
 
@@ -89,13 +89,15 @@ def test_histories_of_two_lengths_do_not_mix(parked, start):
 
 def test_everyone_moves_by_the_move_of_their_row(parked, start, metre_moves):
     population = place_logged_agents([start(parked(1))], min_rows=3)[-1]
-    move = np.array([[5, 10, 20]])
+    motion_token = np.array([[5, 10, 20]])
 
-    after, path = advance_agents(population, move, np.zeros((1, 3), bool), metre_moves)
+    after, path = advance_agents(
+        population, motion_token, np.zeros((1, 3), bool), metre_moves
+    )
 
     np.testing.assert_allclose(after.pose[0, :2, 0], [5, 18], atol=1e-4)
     np.testing.assert_allclose(path[0, 0, :, 0], [1, 2, 3, 4, 5], atol=1e-4)
-    np.testing.assert_array_equal(after.move[0], [5, 10, NO_MOTION_TOKEN])
+    np.testing.assert_array_equal(after.motion_token[0], [5, 10, NO_MOTION_TOKEN])
     np.testing.assert_array_equal(after.pose[0, 2], 0)
 
 
@@ -103,11 +105,11 @@ def test_whoever_leaves_is_there_once_more_and_then_gone_for_good(
     parked, start, metre_moves, nobody
 ):
     population = place_logged_agents([start(parked(1))], min_rows=2)[-1]
-    move, _ = nobody(1, 2)
+    motion_token, _ = nobody(1, 2)
     leave = np.array([[False, True]])
 
-    removed, path = advance_agents(population, move, leave, metre_moves)
-    gone, after = advance_agents(removed, move, leave, metre_moves)
+    removed, path = advance_agents(population, motion_token, leave, metre_moves)
+    gone, after = advance_agents(removed, motion_token, leave, metre_moves)
 
     np.testing.assert_array_equal(removed.presence[0], [PRESENT, REMOVED])
     assert path[0, 1].any()
@@ -152,7 +154,7 @@ def test_a_newcomer_takes_the_first_free_row_with_a_life_of_its_own(parked, star
     np.testing.assert_array_equal(after.agent_number[0], [0, 1, 2, NOBODY])
     np.testing.assert_array_equal(after.num_agents_so_far, [3, 3])
     assert after.presence[0, 2] == Presence.INSERTED
-    assert after.move[0, 2] == FIRST_MOTION_TOKEN
+    assert after.motion_token[0, 2] == FIRST_MOTION_TOKEN
     assert not after.observed[0, 2]
     assert population.agent_number[0, 2] == NOBODY, (
         "the population it came from stays as it was"
@@ -163,9 +165,11 @@ def test_a_freed_row_is_used_again_by_another_life(
     parked, start, metre_moves, grid, nobody
 ):
     population = place_logged_agents([start(parked(1))], min_rows=2)[-1]
-    move, stay = nobody(1, 2)
-    removed, _ = advance_agents(population, move, np.array([[False, True]]), metre_moves)
-    gone, _ = advance_agents(removed, move, stay, metre_moves)
+    motion_token, stay = nobody(1, 2)
+    removed, _ = advance_agents(
+        population, motion_token, np.array([[False, True]]), metre_moves
+    )
+    gone, _ = advance_agents(removed, motion_token, stay, metre_moves)
 
     after, row = add_inserted(gone, inserted([True], grid.ego_cell - 5))
 

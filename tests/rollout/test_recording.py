@@ -36,7 +36,7 @@ def play(begin, vocabulary, grid, seconds, speed=5, leave_at=None, add_at=None):
                 population.agent_number,
                 np.int32(NOBODY),
             ),
-            kind=population.kind,
+            agent_type=population.agent_type,
             size_lwh_m=population.size_lwh_m,
         )
 
@@ -47,7 +47,7 @@ def car_ahead(grid):
         who=np.array([True]),
         position_m=grid.centre_m[ahead],
         turned_rad=grid.heading_centre_rad[60:61],
-        kind=np.array([AgentType.VEHICLE], dtype=np.int8),
+        agent_type=np.array([AgentType.VEHICLE], dtype=np.int8),
         size_lwh_m=np.array([[4.0, 2.0, 1.5]], dtype=np.float32),
     )
 
@@ -96,7 +96,7 @@ def test_a_newcomer_is_valid_from_the_step_after_its_entry(
     # The ego is at 10 m at step 20, the inserted agent 30 m ahead; a metre later, both
     # moved on.
     np.testing.assert_allclose(rollout.xyz_m[2, 21, 0], 41.0, atol=0.1)
-    assert rollout.kind[2] == AgentType.VEHICLE
+    assert rollout.agent_type[2] == AgentType.VEHICLE
     np.testing.assert_allclose(rollout.size_lwh_m[2], [4.0, 2.0, 1.5])
 
 
@@ -124,7 +124,7 @@ def test_a_batch_gives_each_start_its_own_rollout(parked, start, metre_moves, gr
                     "shown",
                     "removed",
                     "inserted_number",
-                    "kind",
+                    "agent_type",
                     "size_lwh_m",
                 )
             },

@@ -79,7 +79,7 @@ def test_errors_of_moves_do_not_add_up(session):
     for step in range(1, 6):
         driven.step(pose(-30 + 4.4 * step))
         gaps_m.append(driven.ego_pose[0, 0] - driven.population.pose[0, 0, 0])
-        moves.append(int(driven.population.move[0, 0]))
+        moves.append(int(driven.population.motion_token[0, 0]))
 
     assert moves == [4, 5, 4, 5, 4]
     np.testing.assert_allclose(gaps_m, [0.4, -0.2, 0.2, -0.4, 0.0], atol=1e-4)
@@ -283,8 +283,8 @@ def test_who_is_too_fast_for_every_way_takes_the_slowest(drive, start, simulator
     still = {"insert": False, "remove": False, "motion_top_k": 0, "max_motion_samples": 40}
 
     def ways_m(playing):
-        step, move = playing.stepper.motion_step, torch.arange(61)
-        fast = (move > 40) & (move % 20 >= 10)
+        step, motion_token = playing.stepper.motion_step, torch.arange(61)
+        fast = (motion_token > 40) & (motion_token % 20 >= 10)
 
         def heard(memory, token_step):
             said = step(memory, token_step)

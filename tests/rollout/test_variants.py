@@ -185,7 +185,9 @@ def keep_speed(playing):
 
     def again(memory, token_step):
         said = step(memory, token_step)
-        wanted = torch.nn.functional.one_hot(token_step.move.clamp(min=0), 61).float()
+        wanted = torch.nn.functional.one_hot(
+            token_step.motion_token.clamp(min=0), 61
+        ).float()
         said.packed.motion_logits.copy_(100 * said.packed.rows.pack(wanted))
         return said
 
@@ -208,7 +210,7 @@ def test_newcomers_are_kept_off_others_and_near_lanes(parked, start, simulator, 
         now = session.population
         entering = now.presence == Presence.INSERTED
         entered += entering.sum()
-        vehicles += (entering & (now.kind == AgentType.VEHICLE)).sum()
+        vehicles += (entering & (now.agent_type == AgentType.VEHICLE)).sum()
         for rollout, row in np.argwhere(entering):
             assert_has_room(now, rollout, row)
     assert entered > 20
@@ -219,9 +221,9 @@ def assert_has_room(now, rollout, row):
     others = (now.presence[rollout] != Presence.ABSENT) & (
         np.arange(now.agent_number.shape[1]) != row
     )
-    if now.kind[rollout, row] == AgentType.PEDESTRIAN:
-        others &= now.kind[rollout] != AgentType.PEDESTRIAN
-    elif now.kind[rollout, row] == AgentType.VEHICLE:
+    if now.agent_type[rollout, row] == AgentType.PEDESTRIAN:
+        others &= now.agent_type[rollout] != AgentType.PEDESTRIAN
+    elif now.agent_type[rollout, row] == AgentType.VEHICLE:
         assert abs(now.pose[rollout, row, 1]) < 6.1, "the lane is y = 0"
     overlap = boxes_overlap(
         now.pose[rollout, row][None],

@@ -40,7 +40,7 @@ def same():
         np.testing.assert_allclose(view_model.lights.xy_m, other.lights.xy_m, atol=0.006)
         for mine, read in zip(view_model.showings, other.showings, strict=True):
             assert (mine.name, mine.ego) == (read.name, read.ego)
-            for field in ("id", "kind", "role", "valid", "last_step"):
+            for field in ("id", "agent_type", "role", "valid", "last_step"):
                 np.testing.assert_array_equal(getattr(mine, field), getattr(read, field))
             np.testing.assert_allclose(mine.size_lw_m, read.size_lw_m, atol=0.006)
             away = (mine.pose - read.pose)[mine.valid]

@@ -71,7 +71,9 @@ def bin_traffic(
     measured: dict[bytes, list[tuple[np.ndarray, np.ndarray]]] = {}
     bins = []
     for protocol in PROTOCOLS:
-        boxes = own if as_logged else simulated_boxes(protocol, traffic.motion.kind, own)
+        boxes = (
+            own if as_logged else simulated_boxes(protocol, traffic.motion.agent_type, own)
+        )
         key = boxes.tobytes()
         if key not in measured:
             measured[key] = _measure(with_boxes(traffic, boxes), edges)

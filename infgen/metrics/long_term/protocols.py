@@ -163,10 +163,10 @@ PROTOCOLS = (PAPER, CORRECTED)
 
 
 def simulated_boxes(
-    protocol: Protocol, kind: np.ndarray, size_lwh_m: Float32[np.ndarray, "agent 3"]
+    protocol: Protocol, agent_type: np.ndarray, size_lwh_m: Float32[np.ndarray, "agent 3"]
 ) -> Float32[np.ndarray, "agent 3"]:
     """Boxes that a protocol gives simulated agents; heights are always their own."""
     if protocol.boxes_lw_m is None:
         return size_lwh_m
-    fixed_lw_m = np.array(protocol.boxes_lw_m, dtype=np.float32)[kind]
+    fixed_lw_m = np.array(protocol.boxes_lw_m, dtype=np.float32)[agent_type]
     return np.concatenate([fixed_lw_m, size_lwh_m[:, 2:]], axis=1)

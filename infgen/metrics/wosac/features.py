@@ -83,7 +83,7 @@ def measure(
         traffic_light_violation=_red_lights(log, motion, evaluated)[..., steps],
         average_displacement_error=_displacement_m(log.motion, motion, evaluated),
         valid=motion.valid[:, evaluated, steps],
-        vehicle=motion.kind[evaluated] == AgentType.VEHICLE,
+        vehicle=motion.agent_type[evaluated] == AgentType.VEHICLE,
     )
 
 

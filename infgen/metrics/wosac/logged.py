@@ -33,7 +33,7 @@ class LoggedScene:
     Attributes:
         scenario_id: Id of the log.
         id: Track ids.
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         x_m: Box centres.
         y_m: Box centres.
         z_m: Box centres.
@@ -54,7 +54,7 @@ class LoggedScene:
 
     scenario_id: str
     id: Int32[np.ndarray, " agent"]
-    kind: Int8[np.ndarray, " agent"]
+    agent_type: Int8[np.ndarray, " agent"]
     x_m: Float32[np.ndarray, "agent 91"]
     y_m: Float32[np.ndarray, "agent 91"]
     z_m: Float32[np.ndarray, "agent 91"]
@@ -105,7 +105,7 @@ class LoggedScene:
             z_m=self.z_m[None, rows],
             heading_rad=self.heading_rad[None, rows],
             size_lwh_m=self.size_lwh_m[rows],
-            kind=self.kind[rows],
+            agent_type=self.agent_type[rows],
             valid=self.valid[None, rows],
         )
 
@@ -140,7 +140,7 @@ def from_scene(scene: Scene) -> LoggedScene:
     return LoggedScene(
         scenario_id=scene.scenario_id,
         id=tracks.id,
-        kind=tracks.agent_type,
+        agent_type=tracks.agent_type,
         x_m=np.ascontiguousarray(xyz_m[..., 0]),
         y_m=np.ascontiguousarray(xyz_m[..., 1]),
         z_m=np.ascontiguousarray(xyz_m[..., 2]),

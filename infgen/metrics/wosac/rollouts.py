@@ -110,7 +110,7 @@ def played(log: LoggedScene, rollouts: Rollouts) -> Motion:
         z_m=join(log.z_m, rollouts.z_m),
         heading_rad=join(log.heading_rad, rollouts.heading_rad),
         size_lwh_m=log.size_lwh_m[rows],
-        kind=log.kind[rows],
+        agent_type=log.agent_type[rows],
         valid=join(log.valid, np.ones(rollouts.x_m.shape, dtype=bool)),
     )
 
@@ -131,7 +131,7 @@ def generated(log: LoggedScene, rollouts: Rollouts) -> Iterator[Motion]:
             z_m=rollouts.z_m[one : one + 1, order],
             heading_rad=rollouts.heading_rad[one : one + 1, order],
             size_lwh_m=log.size_lwh_m[rows] if sizes is None else sizes[one, order],
-            kind=log.kind[rows],
+            agent_type=log.agent_type[rows],
             valid=np.ones((1, len(rows), LOG_STEPS), dtype=bool),
         )
 

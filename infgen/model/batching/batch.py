@@ -61,14 +61,14 @@ class Agents:
     """All agents of all scenes, as ``SceneTokens`` has them; padding is ABSENT.
 
     Attributes:
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         size_lwh_m: Boxes.
         near: Whether the agent has a motion loss.
         pose: x, y, heading at each token's end.
-        move: Row of the kind's vocabulary that led here, ``FIRST_MOTION_TOKEN`` or
-            ``NO_MOTION_TOKEN``.
-        label: The move to learn for the same half second. It differs from ``move`` only
-            where agents are led off their ways, and then leads back.
+        motion_token: Row of the agent type's vocabulary that led here,
+            ``FIRST_MOTION_TOKEN`` or ``NO_MOTION_TOKEN``.
+        label: The motion token to learn for the same half second. It differs from
+            ``motion_token`` only where agents are led off their ways, and then leads back.
         presence: ``Presence``.
         observed: Whether the log shows the agent throughout the token.
         pattern: Bit i: whether the log itself shows it at step i + 1 of the token.
@@ -78,11 +78,11 @@ class Agents:
         told: Whether the log goes on long enough to know the removals at this token.
     """
 
-    kind: Int64[Tensor, "scene agent"]
+    agent_type: Int64[Tensor, "scene agent"]
     size_lwh_m: Float32[Tensor, "scene agent 3"]
     near: Bool[Tensor, "scene agent"]
     pose: Float32[Tensor, "scene token agent 3"]
-    move: Int64[Tensor, "scene token agent"]
+    motion_token: Int64[Tensor, "scene token agent"]
     label: Int64[Tensor, "scene token agent"]
     presence: Int64[Tensor, "scene token agent"]
     observed: Bool[Tensor, "scene token agent"]
@@ -98,7 +98,7 @@ class Agents:
 
 
 @dataclass(frozen=True, slots=True)
-class Roads:
+class MapTokens:
     """The maps of all scenes.
 
     Attributes:
@@ -158,7 +158,7 @@ class Details:
         token: When.
         turn: Inserted agents of this turn and later are hidden as well.
         cell: Where.
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         size_lwh_m: Its box.
         heading: Heading bin relative to the ego.
         offset_m: Position less the cell's centre, in the ego's grid frame.
@@ -170,7 +170,7 @@ class Details:
     token: Int64[Tensor, "scene detail"]
     turn: Int64[Tensor, "scene detail"]
     cell: Int64[Tensor, "scene detail"]
-    kind: Int64[Tensor, "scene detail"]
+    agent_type: Int64[Tensor, "scene detail"]
     size_lwh_m: Float32[Tensor, "scene detail 3"]
     heading: Int64[Tensor, "scene detail"]
     offset_m: Float32[Tensor, "scene detail 2"]
@@ -182,7 +182,7 @@ class Batch:
 
     scenario_ids: tuple[str, ...]
     agents: Agents
-    roads: Roads
+    roads: MapTokens
     entries: Insertions
     details: Details
 
@@ -239,17 +239,17 @@ def collate(
     return Batch(
         scenario_ids=tuple(record.scenario_id for record in records),
         agents=pad([scene[0] for scene in scenes], Agents),
-        roads=pad([scene[1] for scene in scenes], Roads),
+        roads=pad([scene[1] for scene in scenes], MapTokens),
         entries=pad([scene[2] for scene in scenes], Insertions),
         details=pad([scene[3] for scene in scenes], Details),
     )
 
 
-def collate_roads(
+def collate_maps(
     records: Sequence[SceneTokens],
     max_map_tokens: int,
     lights: Sequence[LoggedSignals | None] | None = None,
-) -> Roads:
+) -> MapTokens:
     """Put only the maps of scenes side by side, with nothing hidden.
 
     Args:
@@ -270,7 +270,7 @@ def collate_roads(
         arrays["light"] = _lights(record.map_polyline[window.roads], known.polyline)
         arrays["shown"] = hold_last_signals(known.shown, tokens, tokens + 1)
         maps.append(arrays)
-    return _last_shown(pad(maps, Roads), maps)
+    return _last_shown(pad(maps, MapTokens), maps)
 
 
 def to_device(batch: T, device: torch.device) -> T:
@@ -314,11 +314,11 @@ def _keyed(key: str) -> np.random.Generator:
 
 def _agents(window: SceneWindow, turn: np.ndarray) -> Arrays:
     return {
-        "kind": window.kind,
+        "agent_type": window.agent_type,
         "size_lwh_m": window.size_lwh_m,
         "near": window.near,
         "pose": window.pose.swapaxes(0, 1),
-        "move": window.move.T,
+        "motion_token": window.motion_token.T,
         "label": window.label.T,
         "presence": window.presence.T,
         "observed": window.observed.T,
@@ -348,7 +348,7 @@ def _roads(window: SceneWindow, token: np.ndarray, picked: np.ndarray) -> Arrays
     }
 
 
-def _last_shown(roads: Roads, maps: Sequence[Arrays]) -> Roads:
+def _last_shown(roads: MapTokens, maps: Sequence[Arrays]) -> MapTokens:
     """Let what a scene's lights show last go on where another scene's are known longer."""
     for row, one in enumerate(maps):
         lights, tokens = one["shown"].shape

@@ -23,12 +23,13 @@ class SceneWindow:
     Attributes:
         record: The whole scene.
         after: Token steps that the log goes on for afterwards.
-        label: The move to learn for each token: ``move`` until agents are led astray.
+        label: The motion token to learn for each token: ``motion_token`` until agents are
+            led astray.
         roads: Rows of the record's map tokens that are kept, ascending.
         shown: ``SignalClass`` of each of the record's lights at each token's end, or what
             it showed when it was last looked at, ``REMEMBERED``.
-        kind, size_lwh_m, near, pose, move, presence, observed, pattern, cell: As in the
-            record.
+        agent_type, size_lwh_m, near, pose, motion_token, presence, observed, pattern, cell:
+            As in the record.
         entry_row: Row of each inserted agent whose agent is kept ...
         insertion_token: ... its token, ascending from 0 ...
         insertion_cell: ... and its cell.
@@ -38,11 +39,11 @@ class SceneWindow:
     after: int
     roads: Int64[np.ndarray, " road"]
     shown: Int8[np.ndarray, "light token"]
-    kind: Int8[np.ndarray, " agent"]
+    agent_type: Int8[np.ndarray, " agent"]
     size_lwh_m: Float32[np.ndarray, "agent 3"]
     near: Bool[np.ndarray, " agent"]
     pose: Float32[np.ndarray, "agent token 3"]
-    move: Int16[np.ndarray, "agent token"]
+    motion_token: Int16[np.ndarray, "agent token"]
     label: Int16[np.ndarray, "agent token"]
     presence: Int8[np.ndarray, "agent token"]
     observed: Bool[np.ndarray, "agent token"]
@@ -58,11 +59,11 @@ def cut_window(
 ) -> SceneWindow:
     """Take ``tokens`` token steps from ``start`` on, and what is nearest to the ego."""
     stop = min(start + tokens, record.num_tokens)
-    presence, observed, move = _begin_at(record, start, stop)
+    presence, observed, motion_token = _begin_at(record, start, stop)
     visible = observed | (presence == Presence.INSERTED)
     pose, pattern = record.pose[:, start:stop], record.pattern[:, start:stop]
     rows = _nearest_agents(pose, visible, record.ego)[:max_agents]
-    roads = _nearest_roads(record.map_pose, pose[record.ego], max_map_tokens)
+    roads = _nearest_map_tokens(record.map_pose, pose[record.ego], max_map_tokens)
 
     row_of = np.full(record.num_agents, -1, dtype=np.int64)
     row_of[rows] = np.arange(len(rows))
@@ -74,12 +75,12 @@ def cut_window(
         after=record.num_tokens - stop,
         roads=roads,
         shown=record.signal_state[:, start:stop],
-        kind=record.agent_type[rows],
+        agent_type=record.agent_type[rows],
         size_lwh_m=record.size_lwh_m[rows],
         near=record.near[rows],
         pose=pose[rows],
-        move=move[rows],
-        label=move[rows],
+        motion_token=motion_token[rows],
+        label=motion_token[rows],
         presence=presence[rows],
         observed=observed[rows],
         pattern=np.where(presence == Presence.ABSENT, np.uint8(0), pattern)[rows],
@@ -99,7 +100,7 @@ def perturb(
     ego's too; but an inserted agent is lost to none for it, and none is won.
     """
     strays = perturb_motion(
-        window.kind, window.pose, window.move, window.observed, noise, random
+        window.agent_type, window.pose, window.motion_token, window.observed, noise, random
     )
     cell = encode_cell(to_grid(strays.pose[..., :2], strays.pose[0]), grid)
     entering = window.presence == Presence.INSERTED
@@ -109,7 +110,7 @@ def perturb(
     return replace(
         window,
         pose=strays.pose,
-        move=strays.move,
+        motion_token=strays.motion_token,
         label=strays.label,
         cell=cell,
         insertion_cell=cell[window.entry_row, window.insertion_token],
@@ -141,15 +142,15 @@ def hide_until_near(
 
     came = np.zeros_like(inside)
     came[:, 1:] = np.logical_or.accumulate(inside, axis=1)[:, :-1]
-    presence, observed, move = _enter_late(
-        (window.presence, window.observed, window.move), far, window.observed & came
+    presence, observed, motion_token = _enter_late(
+        (window.presence, window.observed, window.motion_token), far, window.observed & came
     )
     changed = replace(
         window,
         presence=presence,
         observed=observed,
-        move=move,
-        label=move,
+        motion_token=motion_token,
+        label=motion_token,
         pattern=np.where(presence == Presence.ABSENT, np.uint8(0), window.pattern),
     )
     return _with_entries(changed, far, settings.insertion_order)
@@ -173,12 +174,12 @@ def _begin_at(
     """
     presence = record.presence[:, start:stop]
     observed = record.observed[:, start:stop]
-    move = record.motion_token[:, start:stop]
+    motion_token = record.motion_token[:, start:stop]
     if start == 0:
-        return presence, observed, move
+        return presence, observed, motion_token
     before = record.presence[:, start - 1]
     running = np.isin(before, (Presence.PRESENT, Presence.INSERTED))
-    return _enter_late((presence, observed, move), running, observed)
+    return _enter_late((presence, observed, motion_token), running, observed)
 
 
 def _enter_late(
@@ -188,7 +189,7 @@ def _enter_late(
 
     Who never is, or is to leave then, is not there at all: it would have no second token.
     """
-    presence, observed, move = (values.copy() for values in life)
+    presence, observed, motion_token = (values.copy() for values in life)
     columns = np.arange(presence.shape[1])
     first = np.where(able.any(axis=1), able.argmax(axis=1), len(columns))
     leaves = presence[np.arange(len(first)), first.clip(max=len(columns) - 1)]
@@ -197,12 +198,12 @@ def _enter_late(
     unseen = who[:, None] & (columns < first[:, None]) | gone[:, None]
     presence[unseen], observed[unseen] = Presence.ABSENT, False
     enters = (who & ~gone)[:, None] & (columns == first[:, None])
-    presence[enters], observed[enters], move[enters] = (
+    presence[enters], observed[enters], motion_token[enters] = (
         Presence.INSERTED,
         False,
         FIRST_MOTION_TOKEN,
     )
-    return presence, observed, move
+    return presence, observed, motion_token
 
 
 def _with_entries(window: SceneWindow, who: np.ndarray, order: str) -> SceneWindow:
@@ -230,7 +231,7 @@ def _nearest_agents(pose: np.ndarray, visible: np.ndarray, ego: int) -> np.ndarr
     return order[visible[order].any(axis=1) | (order == ego)]
 
 
-def _nearest_roads(map_pose: np.ndarray, path: np.ndarray, limit: int) -> np.ndarray:
+def _nearest_map_tokens(map_pose: np.ndarray, path: np.ndarray, limit: int) -> np.ndarray:
     """Rows, ascending, of the map tokens nearest to the ego's path."""
     if len(map_pose) <= limit:
         return np.arange(len(map_pose))

@@ -81,7 +81,7 @@ def detail_arrays(
         "token": tokens,
         "turn": np.concatenate([turn, np.zeros(few, dtype=np.int64)]),
         "cell": cell,
-        "kind": window.kind[rows],
+        "agent_type": window.agent_type[rows],
         "size_lwh_m": window.size_lwh_m[rows],
         "heading": heading,
         "offset_m": offset_m,

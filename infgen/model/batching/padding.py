@@ -16,7 +16,7 @@ NOBODY = -1
 """Agent of an empty slot."""
 
 _PADDING = {
-    "move": NO_MOTION_TOKEN,
+    "motion_token": NO_MOTION_TOKEN,
     "label": NO_MOTION_TOKEN,
     "cell": NO_CELL,
     "turn": -1,

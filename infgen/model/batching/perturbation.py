@@ -1,12 +1,13 @@
-"""Perturbation on tokens to learn from, and the moves that lead back (SPEC 2.3, 1.3).
+"""Perturbation of tokens to learn from, and motion tokens that lead back (SPEC 2.3, 1.3).
 
 Who only ever sees logs never sees what its own small errors lead to. So agents are led off
-their ways a little: at each token step an agent takes not the move that ends nearest to
-where it should be, but one of the few nearest, and goes on from where that leads. What is
-to be learned is always the nearest, from where the agent has come to. As every draw is near
-to the true pose, errors never add up: agents stray as far as a few neighbouring moves are
-apart. Who stands is left alone: it would learn to tremble, and that nobody who has begun to
-move goes on.
+their ways a little: at each token step an agent takes not the motion token that ends
+nearest to where it should be, but one of the few nearest, and goes on from where that
+leads. What is to be learned is always the nearest, from where the agent has come to. As
+every draw is near
+to the true pose, errors never add up: agents stray as far as a few neighbouring motion
+tokens are apart. Who stands is left alone: it would learn to tremble, and that nobody who
+has begun to move goes on.
 
 Small errors that last do add up: who turns into a road a few degrees off is metres beside
 it two seconds later. So some drivers drift: for seconds they are led beside their ways,
@@ -34,8 +35,8 @@ from infgen.tokens.motion_tokens import (
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 FARTHEST_M = 1.0
-"""No draw leads farther from where an agent should be: where moves are rare, the second
-nearest may end metres away ..."""
+"""No draw leads farther from where an agent should be: where motion tokens are rare, the
+second nearest may end metres away ..."""
 FARTHEST_SHARE = 1 / 8
 """... nor farther than this share of the agent's way in the token step."""
 
@@ -54,31 +55,32 @@ class Perturbation:
     """How tokens are disturbed.
 
     Attributes:
-        table: The moves.
+        table: The motion tokens.
         moves: How many moves each is drawn from, all equally likely; 0 for none disturbed.
-        share: Of the moves that are drawn; the others are the nearest.
-        drift: Share of the agents that drift while they are on the move.
-        near_roads: For each map shape those that it is drawn from, itself the first.
+        share: Of the motion tokens that are drawn; the others are the nearest.
+        drift: Share of the agents that drift while they are on the motion token.
+        near_map_tokens: For each map shape those that it is drawn from, itself the first.
     """
 
     table: MatchTable
     moves: int
     share: float
     drift: float
-    near_roads: Int16[np.ndarray, "road near"]
+    near_map_tokens: Int16[np.ndarray, "road near"]
 
 
 class PerturbedMotion(NamedTuple):
     """Agents off their ways: fields [agent, token] as in ``SceneTokens``.
 
     Attributes:
-        move: The moves taken ...
+        motion_token: The motion tokens taken ...
         pose: ... where they lead ...
-        label: ... and the moves that would have led nearest to where agents should be.
+        label: ... and the motion tokens that would have led nearest to where agents should
+            be.
         off: Where an agent is not where it should be.
     """
 
-    move: np.ndarray
+    motion_token: np.ndarray
     pose: np.ndarray
     label: np.ndarray
     off: np.ndarray
@@ -103,59 +105,63 @@ def make_perturbation(
         moves=max(moves, 1) if settings.lateral_drift_share else moves,
         share=settings.motion_noise_share,
         drift=settings.lateral_drift_share,
-        near_roads=_near_roads(roads, max(1, settings.map_noise_neighbours)),
+        near_map_tokens=_near_map_tokens(roads, max(1, settings.map_noise_neighbours)),
     )
 
 
 def perturb_motion(
-    kind: Int8[np.ndarray, " agent"],
+    agent_type: Int8[np.ndarray, " agent"],
     pose: Float32[np.ndarray, "agent token 3"],
-    move: Int16[np.ndarray, "agent token"],
+    motion_token: Int16[np.ndarray, "agent token"],
     moving: Bool[np.ndarray, "agent token"],
     noise: Perturbation,
     random: np.random.Generator,
 ) -> PerturbedMotion:
-    """Walk agents anew along moves that are drawn.
+    """Walk agents anew along motion tokens that are drawn.
 
     Args:
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         pose: Where each agent should be at each token's end.
-        move: What led it there.
-        moving: Tokens at which it goes by moves that may be drawn, none of them the first.
-            At all others it is where it should be, and starts from there.
+        motion_token: What led it there.
+        moving: Tokens at which it goes by motion tokens that may be drawn, none of them the
+            first. At all others it is where it should be, and starts from there.
         noise: How to draw.
         random: Source of the draws.
     """
     turn = random.integers(noise.moves, size=moving.shape)
     turn[random.random(moving.shape) >= noise.share] = 0
-    strays = PerturbedMotion(move.copy(), pose.copy(), move.copy(), np.zeros_like(moving))
+    strays = PerturbedMotion(
+        motion_token.copy(), pose.copy(), motion_token.copy(), np.zeros_like(moving)
+    )
     pushes = _pushes(moving.shape, noise.drift, random)
-    aside_m = np.zeros(len(kind))
+    aside_m = np.zeros(len(agent_type))
     for token in range(1, moving.shape[1]):
         rows = np.flatnonzero(moving[:, token])
         before, wanted = strays.pose[rows, token - 1], pose[rows, token]
         way_m = np.hypot(*(wanted - pose[rows, token - 1])[:, :2].T)
-        was_m, aside_m = aside_m, np.zeros(len(kind))
+        was_m, aside_m = aside_m, np.zeros(len(agent_type))
         aside_m[rows] = _drifted(was_m[rows], way_m, pushes[rows, token])
         led = _drift_target(wanted, way_m, was_m[rows], aside_m[rows])
 
-        few = nearest_k_motion_tokens(led, before, kind[rows], noise.table, noise.moves)
+        few = nearest_k_motion_tokens(
+            led, before, agent_type[rows], noise.table, noise.moves
+        )
         nearest, taken = few[:, 0].copy(), few[np.arange(len(rows)), turn[rows, token]]
-        ends = advance(before, kind[rows], taken, noise.table.vocabulary)
+        ends = advance(before, agent_type[rows], taken, noise.table.vocabulary)
         away_m = np.hypot(*(ends - led)[:, :2].T)
         far = np.flatnonzero(away_m > np.minimum(FARTHEST_M, FARTHEST_SHARE * way_m))
         taken[far] = nearest[far]
         ends[far] = advance(
-            before[far], kind[rows[far]], taken[far], noise.table.vocabulary
+            before[far], agent_type[rows[far]], taken[far], noise.table.vocabulary
         )
         back = np.flatnonzero(aside_m[rows])  # To these, the nearest is on the drift.
         nearest[back] = nearest_motion_tokens(
-            wanted[back], before[back], kind[rows[back]], noise.table
+            wanted[back], before[back], agent_type[rows[back]], noise.table
         )
 
         # Agents at their logged poses with logged tokens keep these bit for bit.
-        off = strays.off[rows, token - 1] | (taken != move[rows, token])
-        strays.label[rows, token], strays.move[rows, token] = nearest, taken
+        off = strays.off[rows, token - 1] | (taken != motion_token[rows, token])
+        strays.label[rows, token], strays.motion_token[rows, token] = nearest, taken
         strays.pose[rows, token] = np.where(off[:, None], ends, wanted)
         strays.off[rows, token] = off
     return strays
@@ -204,11 +210,13 @@ def perturb_map(
     random: np.random.Generator,
 ) -> Int16[np.ndarray, " road"]:
     """Draw each map token's shape from those near to it, but for the ``fixed``."""
-    turn = random.integers(noise.near_roads.shape[1], size=token.shape)
-    return np.where(fixed, token, noise.near_roads[token, turn])
+    turn = random.integers(noise.near_map_tokens.shape[1], size=token.shape)
+    return np.where(fixed, token, noise.near_map_tokens[token, turn])
 
 
-def _near_roads(vocabulary: MapVocabulary, count: int) -> Int16[np.ndarray, "road near"]:
+def _near_map_tokens(
+    vocabulary: MapVocabulary, count: int
+) -> Int16[np.ndarray, "road near"]:
     """Return for each shape the nearest, as pieces are matched, itself the first."""
     points_m = vocabulary.sample_m.reshape(vocabulary.num_map_tokens, -1)
     square_m2 = ((points_m[:, None] - points_m) ** 2).sum(axis=-1)

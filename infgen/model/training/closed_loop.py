@@ -1,9 +1,10 @@
 """Closed-loop fine-tuning: scenes simulated by the network itself, to learn from (CatK).
 
-CatK (SPEC 7.1): at every token step each agent takes, of the moves that the network finds
-most likely, the one that ends nearest to where the log says the agent is. So the scene
-stays near the log, and all that is seen of it is the network's own doing. What is to be
-learned is the move of all that leads nearest to the log from where the agent has come to.
+CatK (SPEC 7.1): at every token step each agent takes, of the motion tokens that the network
+finds most likely, the one that ends nearest to where the log says the agent is. So the
+scene stays near the log, and all that is seen of it is the network's own doing. What is to
+be learned is the motion token of all that leads nearest to the log from where the agent has
+come to.
 
 Where the log says an agent is means its quantised pose, as batches hold it.
 """
@@ -41,7 +42,7 @@ def close_loop(network: Network, batch: Batch, top: int) -> Batch:
     Args:
         network: The network; its mode (training or not) is kept.
         batch: Scenes as logged, without noise, on the network's device.
-        top: Most likely moves that each is chosen from.
+        top: Most likely motion tokens that each is chosen from.
 
     Returns:
         The batch to learn from, with other poses, moves, labels and cells.
@@ -51,7 +52,7 @@ def close_loop(network: Network, batch: Batch, top: int) -> Batch:
     """
     if top < 1:
         raise ValueError(
-            f"no move is among the {top} most likely moves; expected 1 or more"
+            f"no motion_token is among the {top} most likely moves; expected 1 or more"
         )
     learning = network.training
     try:
@@ -75,13 +76,13 @@ def _play(network: Network, batch: Batch, top: int) -> tuple[Agents, Tensor]:
         MotionTokenEnds.of(vocabulary, device),
         min(top, vocabulary.num_motion_tokens),
     )
-    scenes, tokens, rows = logged.move.shape
+    scenes, tokens, rows = logged.motion_token.shape
     memory = stepper.begin(batch.roads, torch.arange(scenes, device=device), rows)
     off = torch.zeros_like(logged.observed)
     played = replace(
         logged,
         pose=logged.pose.clone(),
-        move=logged.move.clone(),
+        motion_token=logged.motion_token.clone(),
         label=logged.label.clone(),
         cell=logged.cell.clone(),
     )
@@ -104,26 +105,26 @@ def _move(
     """Write the next motion token of all agents seen at both steps, and its end pose."""
     who = logged.observed[:, token] & logged.visible[:, token - 1]  # [scene, agent]
     before, true = played.pose[:, token - 1][who], logged.pose[:, token][who]
-    kind = logged.kind[who]
+    agent_type = logged.agent_type[who]
     wanted = to_local(true, before)
     likely = logits[who].topk(top).indices.sort().values
-    taken = nearest_of(wanted, kind, likely, ends)
+    taken = nearest_of(wanted, agent_type, likely, ends)
 
     # Agents at their logged poses with logged tokens keep these bit for bit.
-    strays = off[:, token - 1][who] | (taken != logged.move[:, token][who])
-    led = to_world(ends.pose[kind, taken], before)
+    strays = off[:, token - 1][who] | (taken != logged.motion_token[:, token][who])
+    led = to_world(ends.pose[agent_type, taken], before)
     off[:, token][who] = strays
-    played.move[:, token][who] = taken
-    played.label[:, token][who] = nearest(wanted, kind, ends)
+    played.motion_token[:, token][who] = taken
+    played.label[:, token][who] = nearest(wanted, agent_type, ends)
     played.pose[:, token][who] = torch.where(strays[:, None], led, true)
 
 
 def _column(agents: Agents, token: int) -> TokenStep:
     return TokenStep(
-        kind=agents.kind,
+        agent_type=agents.agent_type,
         size_lwh_m=agents.size_lwh_m,
         pose=agents.pose[:, token],
-        move=agents.move[:, token],
+        motion_token=agents.motion_token[:, token],
         presence=agents.presence[:, token],
         observed=agents.observed[:, token],
         cell=agents.cell[:, token],

@@ -16,7 +16,7 @@ BIN_EDGES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 @torch.no_grad()
 def motion_surprise(outputs: Outputs, batch: Batch) -> Float32[Tensor, "2"]:
-    """Sum the negative log-likelihoods of the next moves, and count them.
+    """Sum the negative log-likelihoods of the next motion tokens, and count them.
 
     Without label smoothing and weights: the exponential of their mean is the perplexity.
     """

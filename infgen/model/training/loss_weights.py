@@ -7,7 +7,7 @@ can divide every part by the weights of the whole before any of it is computed.
 import torch
 from torch import Tensor
 
-from infgen.model.batching.batch import Batch, Roads
+from infgen.model.batching.batch import Batch, MapTokens
 from infgen.model.training.losses import motion_mask, pattern_mask, stay_mask
 from infgen.model.training_settings import TrainSettings
 from infgen.tokens.scene_tokens import Presence
@@ -58,7 +58,7 @@ def _decided(batch: Batch) -> Tensor:
     return torch.where(entries.asked, (entries.count + 1).clamp(max=slots), 0).sum()
 
 
-def _hidden(roads: Roads) -> Tensor:
+def _hidden(roads: MapTokens) -> Tensor:
     """Which map tokens are predicted [scene, road]: hidden ones after one that is not."""
     wanted = roads.real & roads.picked & roads.follows
     wanted[:, 1:] &= ~roads.picked[:, :-1]

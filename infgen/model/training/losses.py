@@ -16,9 +16,9 @@ from infgen.model.batching.batch import Agents, Batch
 from infgen.model.logits import (
     DetailOutputs,
     InsertionOutputs,
+    MapOutputs,
     MotionOutputs,
     Outputs,
-    RoadOutputs,
 )
 from infgen.model.neighbours import grid_place
 from infgen.model.network import EGO
@@ -115,11 +115,11 @@ def figures(terms: Mapping[str, Term]) -> dict[str, float]:
 
 
 def motion_mask(agents: Agents) -> Tensor:
-    """Tell which tokens [scene, token, agent] have a supervised next move (SPEC 3.5).
+    """Tell which tokens [scene, token, agent] have a supervised next one (SPEC 3.5).
 
-    The next move must be known. A inserted agent's first one is always supervised. Later
-    ones ask for the token before and the one itself to be observed, so that nothing is
-    learned at the edges of a gap; entering counts as observed for the token that follows
+    The next motion token must be known. An inserted agent's first one is always supervised.
+    Later ones ask for the token before and the one itself to be observed, so that nothing
+    is learned at the edges of a gap; entering counts as observed for the token that follows
     it.
     """
     entering = agents.presence == Presence.INSERTED
@@ -158,10 +158,10 @@ def _before(values: Tensor) -> Tensor:
 
 
 def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> Term:
-    """Next move of every agent; a inserted agent's first one counts more."""
+    """Next motion token of every agent; an inserted agent's first one counts more."""
     rows = outputs.rows
     mask = rows.pack(motion_mask(agents))
-    weight = torch.ones(agents.move.shape, device=mask.device)
+    weight = torch.ones(agents.motion_token.shape, device=mask.device)
     entering = agents.presence[:, 1:] == Presence.INSERTED
     weight[:, 1:][entering] = settings.first_motion_weight  # At token 0 nobody comes in.
     target = rows.pack(_next(agents.label, -1))
@@ -217,7 +217,7 @@ def _details(outputs: DetailOutputs, batch: Batch) -> Terms:
     size_log_m = pack(details.size_lwh_m).clamp(min=0.05).log()
     terms = {
         "agent_type": _choice(
-            outputs.agent_type_logits[real], pack(details.kind)[real], 0.0
+            outputs.agent_type_logits[real], pack(details.agent_type)[real], 0.0
         ),
         "size": _distance((outputs.size_log_m - size_log_m)[real]),
     }
@@ -239,7 +239,7 @@ def _turns(rows: Rows, batch: Batch) -> Tensor:
     return own_rad - heading_rad[scene, token, EGO]
 
 
-def _roads(outputs: RoadOutputs, smoothing: float) -> Term:
+def _roads(outputs: MapOutputs, smoothing: float) -> Term:
     return _choice(outputs.logits, outputs.token, smoothing)
 
 

@@ -16,12 +16,12 @@ MARGIN_M = 3.0
 
 def repeat(
     before: Population,
-    move: Int64[np.ndarray, "rollout row"],
+    motion_token: Int64[np.ndarray, "rollout row"],
     vocabulary: MotionVocabulary,
     times: int,
 ) -> Float32[np.ndarray, "rollout row time 3"]:
     """Poses at ``COMPARED_STEPS`` if every agent repeats its motion token."""
-    steps = vocabulary.path[before.kind, move][
+    steps = vocabulary.path[before.agent_type, motion_token][
         :, :, COMPARED_STEPS
     ]  # [rollout, row, time, 3]
     pose, found = before.pose, []
@@ -75,7 +75,7 @@ def _near(
         gap_m = np.linalg.norm(xy_m[:, :, None] - xy_m[:, None], axis=-1)
         near |= gap_m < reach_m[:, :, None] + reach_m[:, None] + MARGIN_M
     near &= there[:, :, None] & there[:, None]
-    pedestrian = before.kind == AgentType.PEDESTRIAN
+    pedestrian = before.agent_type == AgentType.PEDESTRIAN
     near &= ~(pedestrian[:, :, None] & pedestrian[:, None])
     rows = there.shape[1]
     near &= np.triu(np.ones((rows, rows), dtype=bool), 1)

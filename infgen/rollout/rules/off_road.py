@@ -135,7 +135,7 @@ def find_off_road(
         scene: Map of each rollout.
     """
     departs = np.zeros(which.shape, dtype=bool)
-    vehicle = which & (before.kind == AgentType.VEHICLE)
+    vehicle = which & (before.agent_type == AgentType.VEHICLE)
     path = np.concatenate([before.pose[:, :, None], poses], axis=2)
     for at, edge in enumerate(road_edge_tiles):
         rollout, row = np.nonzero(vehicle & (scene == at)[:, None])

@@ -40,7 +40,7 @@ class MotionCheck:
     def rejects(
         self,
         before: Population,
-        move: Int64[np.ndarray, "rollout row"],
+        motion_token: Int64[np.ndarray, "rollout row"],
         drawn: Bool[np.ndarray, "rollout row"],
         *,
         road: bool,
@@ -51,7 +51,7 @@ class MotionCheck:
 
         Args:
             before: All agents at the beginning of the token step.
-            move: Motion token of every agent.
+            motion_token: Motion token of every agent.
             drawn: Rows sampled since the last check: only these are checked for
                 off-road, and only rollouts that have some for collisions.
             road: Whether to check for off-road.
@@ -67,29 +67,29 @@ class MotionCheck:
         few = before.take(some).without_free_rows()
         rows = few.agent_number.shape[1]
         hits[some, :rows], departs[some, :rows] = self._rejects(
-            few, move[some, :rows], drawn[some, :rows], self.scene[some], road=road
+            few, motion_token[some, :rows], drawn[some, :rows], self.scene[some], road=road
         )
         return hits, departs
 
     def _rejects(
         self,
         before: Population,
-        move: Int64[np.ndarray, "rollout row"],
+        motion_token: Int64[np.ndarray, "rollout row"],
         drawn: Bool[np.ndarray, "rollout row"],
         scene: Int64[np.ndarray, " rollout"],
         *,
         road: bool,
     ) -> tuple[Bool[np.ndarray, "rollout row"], Bool[np.ndarray, "rollout row"]]:
         there = (before.presence != Presence.ABSENT) & (before.presence != Presence.REMOVED)
-        moving = there & ~self.vocabulary.stationary[before.kind, move]
+        moving = there & ~self.vocabulary.stationary[before.agent_type, motion_token]
         road = road and bool(self.road_edge_tiles)
         times = max(CLEAR_AHEAD, *ROAD_AHEAD) if road else CLEAR_AHEAD
-        poses = repeat(before, move, self.vocabulary, times)
+        poses = repeat(before, motion_token, self.vocabulary, times)
         soon = poses[:, :, : CLEAR_AHEAD * len(COMPARED_STEPS)]
         hits = find_collisions(before, there, soon) & moving
         if not road:
             return hits, np.zeros_like(hits)
-        moments = len(COMPARED_STEPS) * self._look_ahead_tokens(before, move)
+        moments = len(COMPARED_STEPS) * self._look_ahead_tokens(before, motion_token)
         asked = moving & drawn
         return hits, find_off_road(
             before, asked, poses, moments, self.road_edge_tiles, scene
@@ -98,29 +98,29 @@ class MotionCheck:
     def is_slower(
         self,
         before: Population,
-        move: Int64[np.ndarray, "rollout row"],
+        motion_token: Int64[np.ndarray, "rollout row"],
         other: Int64[np.ndarray, "rollout row"],
     ) -> Bool[np.ndarray, "rollout row"]:
         """Tell which motion tokens are shorter than others."""
-        return self._length_m(before, move) < self._length_m(before, other)
+        return self._length_m(before, motion_token) < self._length_m(before, other)
 
     def is_fast(
-        self, before: Population, move: Int64[np.ndarray, "rollout row"]
+        self, before: Population, motion_token: Int64[np.ndarray, "rollout row"]
     ) -> Bool[np.ndarray, "rollout row"]:
         """Tell which vehicles cannot stop within the least look-ahead."""
-        return self._look_ahead_tokens(before, move) > ROAD_AHEAD[0]
+        return self._look_ahead_tokens(before, motion_token) > ROAD_AHEAD[0]
 
     def _length_m(
-        self, before: Population, move: Int64[np.ndarray, "rollout row"]
+        self, before: Population, motion_token: Int64[np.ndarray, "rollout row"]
     ) -> Float32[np.ndarray, "rollout row"]:
-        step_m: np.ndarray = self.vocabulary.end_pose[before.kind, move, :2]
+        step_m: np.ndarray = self.vocabulary.end_pose[before.agent_type, motion_token, :2]
         return np.linalg.norm(step_m, axis=-1)
 
     def _look_ahead_tokens(
-        self, before: Population, move: Int64[np.ndarray, "rollout row"]
+        self, before: Population, motion_token: Int64[np.ndarray, "rollout row"]
     ) -> Int64[np.ndarray, "rollout row"]:
         """Token steps that each vehicle needs to stop, within ``ROAD_AHEAD``."""
-        stops_s = self._length_m(before, move) / CLOCK.token_s / (2 * BRAKES_MPS2)
+        stops_s = self._length_m(before, motion_token) / CLOCK.token_s / (2 * BRAKES_MPS2)
         return np.ceil(stops_s / CLOCK.token_s).clip(*ROAD_AHEAD).astype(np.int64)
 
 

@@ -66,7 +66,9 @@ class StallRule:
         """
         self._remember(everyone, token)
         stood = token - self._since
-        vehicle = (everyone.kind == AgentType.VEHICLE) & (everyone.agent_number != NOBODY)
+        vehicle = (everyone.agent_type == AgentType.VEHICLE) & (
+            everyone.agent_number != NOBODY
+        )
         vehicle &= everyone.presence != Presence.REMOVED
         new = vehicle & (stood == self._tokens)
         self._in_lane[new] = self._are_in_lane(everyone.pose[new], np.nonzero(new)[0])

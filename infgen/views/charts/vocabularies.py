@@ -25,7 +25,7 @@ _LOOKS = {
 
 def vocabulary_charts(
     motion: MotionVocabulary,
-    motion_origin: Int8[np.ndarray, "3 move"],
+    motion_origin: Int8[np.ndarray, "3 motion_token"],
     roads: MapVocabulary,
     road_origin: Int8[np.ndarray, " road"],
 ) -> tuple[Sequence[Chart], Chart]:

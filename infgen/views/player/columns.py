@@ -51,13 +51,15 @@ def unpack_columns(text: str) -> tuple[Mapping[str, Any], dict[str, np.ndarray]]
     except (ValueError, zlib.error, struct.error) as error:
         raise PayloadError(f"no payload: {error}") from error
     columns = {}
-    for name, kind, count in header["columns"]:
-        size = np.dtype(kind).itemsize * count
+    for name, agent_type, count in header["columns"]:
+        size = np.dtype(agent_type).itemsize * count
         planes = np.frombuffer(data[at : at + size], np.uint8)
         if len(planes) < size:
             raise PayloadError(f"column {name} is cut short")
         values = np.ascontiguousarray(planes.reshape(-1, count or 1).T).reshape(-1)
-        columns[name] = values.view(np.dtype(kind).newbyteorder("<")).astype(kind)
+        columns[name] = values.view(np.dtype(agent_type).newbyteorder("<")).astype(
+            agent_type
+        )
         at += size
     return header["about"], columns
 

@@ -89,7 +89,7 @@ function readShowing(each, columns, prefix, about) {
   const showing = {
     ...each,
     id: own("id"),
-    kind: own("kind"),
+    kind: own("agent_type"),
     role: own("role"),
     length: metres("length"),
     width: metres("width"),

@@ -106,7 +106,7 @@ def _showing_columns(showing: Showing) -> dict[str, np.ndarray]:
     size_cm = np.rint(showing.size_lw_m * PER_M).astype(np.int16)
     return {
         "id": showing.id,
-        "kind": showing.kind,
+        "agent_type": showing.agent_type,
         "role": showing.role,
         "length": size_cm[:, 0],
         "width": size_cm[:, 1],
@@ -140,7 +140,7 @@ def _read_showing(
         name=about["name"],
         ego=about["ego"],
         id=own["id"],
-        kind=own["kind"],
+        agent_type=own["agent_type"],
         role=own["role"],
         size_lw_m=(size_cm / PER_M).astype(np.float32),
         pose=pose,

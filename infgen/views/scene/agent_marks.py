@@ -29,8 +29,10 @@ class AgentMarks:
     def __init__(self, showing: Showing) -> None:
         self.showing = showing
         self.shapes = [
-            shape_of(int(kind), *size)
-            for kind, size in zip(showing.kind, showing.size_lw_m.tolist(), strict=True)
+            shape_of(int(agent_type), *size)
+            for agent_type, size in zip(
+                showing.agent_type, showing.size_lw_m.tolist(), strict=True
+            )
         ]
         self._colours = [_ROLES[Role(role)] for role in showing.role.tolist()]
 
@@ -87,7 +89,7 @@ class AgentMarks:
         view: View,
         theme: Theme,
     ) -> Iterator[Mark]:
-        """Draw one agent, the ego's ring or a inserted agent's dot included."""
+        """Draw one agent, the ego's ring or an inserted agent's dot included."""
         shape, alpha = self.shapes[row], float(moment.alpha[row])
         length_m, width_m = self.showing.size_lw_m[row].tolist()
         longest_px = max(length_m, width_m) * view.scale

@@ -101,8 +101,10 @@ class Lights:
 def draw_map(road_map: RoadMap) -> DrawnMap:
     """Sort a map's features by their looks, and leave out points on straight stretches."""
     looks = [
-        look_of(int(kind), int(type_))
-        for kind, type_ in zip(road_map.feature_type, road_map.feature_subtype, strict=True)
+        look_of(int(agent_type), int(type_))
+        for agent_type, type_ in zip(
+            road_map.feature_type, road_map.feature_subtype, strict=True
+        )
     ]
     lines = [
         (look, bool(road_map.interpolating[row]), thin(part, TOLERANCE_M))
@@ -144,15 +146,15 @@ def zebra(
     return list(stripes.astype(np.float32))
 
 
-def look_of(kind: int, type_: int) -> RoadLook | None:
+def look_of(agent_type: int, type_: int) -> RoadLook | None:
     """Return what a feature looks like; None for kinds that are not drawn."""
-    if kind == FeatureType.LANE:
+    if agent_type == FeatureType.LANE:
         return _LANES.get(LaneType(type_), RoadLook.LANE)
-    if kind == FeatureType.ROAD_LINE:
+    if agent_type == FeatureType.ROAD_LINE:
         return _LINES.get(RoadLineType(type_), RoadLook.WHITE_BROKEN)
-    if kind == FeatureType.ROAD_EDGE:
+    if agent_type == FeatureType.ROAD_EDGE:
         return _EDGES.get(RoadEdgeType(type_), RoadLook.EDGE)
-    return _PLAIN.get(FeatureType(kind))
+    return _PLAIN.get(FeatureType(agent_type))
 
 
 def thin(

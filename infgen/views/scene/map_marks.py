@@ -49,10 +49,10 @@ def light_marks(lights: Lights, time: float, view: View, theme: Theme) -> Iterat
     for row in np.flatnonzero(state != SignalClass.NO_SIGNAL).tolist():
         place = view.to_px(lights.xy_m[row : row + 1])
         frame = turned(float(lights.heading_rad[row]))
-        kind = SignalClass(state[row])
-        outline = _light_outline(kind, size) @ frame + place
-        colour = getattr(theme, _SIGNALS[kind])
-        if kind is SignalClass.UNKNOWN:
+        agent_type = SignalClass(state[row])
+        outline = _light_outline(agent_type, size) @ frame + place
+        colour = getattr(theme, _SIGNALS[agent_type])
+        if agent_type is SignalClass.UNKNOWN:
             yield Mark(outline, None, colour, LIGHTS.ring * size, alpha)
         else:
             yield Mark(outline, colour, None, alpha=alpha)
@@ -112,10 +112,10 @@ def dashes(
         )
 
 
-def _light_outline(kind: SignalClass, size: float) -> np.ndarray:
-    if kind is SignalClass.STOP:
+def _light_outline(agent_type: SignalClass, size: float) -> np.ndarray:
+    if agent_type is SignalClass.STOP:
         thick, half = LIGHTS.bar_thick * size / 2, LIGHTS.bar_half * size
         return np.array([(thick, half), (-thick, half), (-thick, -half), (thick, -half)])
-    if kind is SignalClass.CAUTION:
+    if agent_type is SignalClass.CAUTION:
         return disc((0.0, 0.0), LIGHTS.diamond * size, 4)
     return disc((0.0, 0.0), size)

@@ -128,12 +128,12 @@ def _roads(road_map: RoadMap, centre_m: Float32[np.ndarray, "2"]) -> str:
     near = np.asarray((np.abs(points_px - VIEW_PX / 2) < VIEW_PX * 0.6).all(axis=1))
     paths: dict[str, list[str]] = {look: [] for look in _LOOKS.values()}
     for feature in range(road_map.num_features):
-        kind = FeatureType(road_map.feature_type[feature])
+        agent_type = FeatureType(road_map.feature_type[feature])
         part = slice(*road_map.point_offsets[feature : feature + 2].tolist())
-        if kind in _LOOKS and near[part].any():
+        if agent_type in _LOOKS and near[part].any():
             # An outline cut short would be another outline.
-            keep = near[part] | (_LOOKS[kind] == "zebra")
-            paths[_LOOKS[kind]] += _lines(points_px[part], keep)
+            keep = near[part] | (_LOOKS[agent_type] == "zebra")
+            paths[_LOOKS[agent_type]] += _lines(points_px[part], keep)
     return "".join(
         f'<path class="{look}" d="{"".join(lines)}"/>'
         for look, lines in paths.items()

@@ -30,16 +30,16 @@ class Shape(NamedTuple):
     dot: tuple[float, float]
 
 
-def shape_of(kind: int, length_m: float, width_m: float) -> Shape:
+def shape_of(agent_type: int, length_m: float, width_m: float) -> Shape:
     """Return what an agent looks like."""
     none, dot = np.zeros((0, 2)), (0.0, AGENTS.dot * width_m)
-    if kind == AgentType.VEHICLE:
+    if agent_type == AgentType.VEHICLE:
         back = -AGENTS.dot_back * length_m
         return Shape(_car(length_m, width_m), _screen(length_m, width_m), (back, dot[1]))
-    if kind == AgentType.PEDESTRIAN:
+    if agent_type == AgentType.PEDESTRIAN:
         return Shape(_walker(max(length_m, width_m) / 2), none, dot)
     half = max(width_m, length_m / 2) / 2
-    if kind == AgentType.CYCLIST:
+    if agent_type == AgentType.CYCLIST:
         corners = [(length_m / 2, 0.0), (-length_m / 2, half), (-length_m / 4, 0.0)]
         return Shape(np.array([*corners, (-length_m / 2, -half)]), none, dot)
     diamond = [(length_m / 2, 0), (0, width_m / 2), (-length_m / 2, 0), (0, -width_m / 2)]

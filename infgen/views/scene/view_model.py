@@ -33,7 +33,7 @@ class Showing:
         name: ``log``, or ``rollout 3``.
         ego: Row of the recording car.
         id: Track ids.
-        kind: ``AgentType``.
+        agent_type: ``AgentType``.
         role: ``Role``; in the log ``INSERTED`` are those first seen after now.
         size_lw_m: One box per agent.
         pose: x, y, heading; where ``valid`` is False it means nothing.
@@ -44,7 +44,7 @@ class Showing:
     name: str
     ego: int
     id: Int32[np.ndarray, " agent"]
-    kind: Int8[np.ndarray, " agent"]
+    agent_type: Int8[np.ndarray, " agent"]
     role: Int8[np.ndarray, " agent"]
     size_lw_m: Float32[np.ndarray, "agent 2"]
     pose: Float32[np.ndarray, "agent step 3"]
@@ -150,7 +150,7 @@ def show_rollout(rollout: Rollout) -> Showing:
         f"rollout {rollout.index}",
         rollout.ego,
         rollout.id,
-        rollout.kind,
+        rollout.agent_type,
         role,
         rollout.size_lwh_m[:, :2],
         pose,
@@ -162,7 +162,7 @@ def _showing(
     name: str,
     ego: int,
     id_: np.ndarray,
-    kind: np.ndarray,
+    agent_type: np.ndarray,
     role: np.ndarray,
     size_lw_m: np.ndarray,
     pose: np.ndarray,
@@ -178,7 +178,7 @@ def _showing(
         name=name,
         ego=int(np.searchsorted(rows, ego)),
         id=id_[rows],
-        kind=kind[rows],
+        agent_type=agent_type[rows],
         role=role[rows],
         size_lw_m=size_lw_m[rows],
         pose=pose[rows],

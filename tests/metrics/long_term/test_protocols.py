@@ -70,13 +70,13 @@ def test_protocols_are_those_that_results_were_published_with():
 
 def test_the_papers_boxes_depend_on_the_kind_alone_and_keep_heights():
     own = np.array([[5.0, 2.0, 1.5], [0.8, 0.8, 1.7], [1.8, 0.7, 1.6]], dtype=np.float32)
-    kind = np.array([0, 1, 2], dtype=np.int8)
+    agent_type = np.array([0, 1, 2], dtype=np.int8)
 
-    paper = simulated_boxes(PAPER, kind, own)
+    paper = simulated_boxes(PAPER, agent_type, own)
 
     expected = [[4.3, 1.8, 1.5], [0.5, 0.5, 1.7], [1.9, 0.5, 1.6]]
     np.testing.assert_allclose(paper, expected, rtol=1e-6)
-    assert simulated_boxes(CORRECTED, kind, own) is own
+    assert simulated_boxes(CORRECTED, agent_type, own) is own
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS, ids=lambda protocol: protocol.name)

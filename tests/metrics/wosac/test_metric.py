@@ -226,7 +226,7 @@ def our_rollout(log, index=0, lives=True):
         now=10,
         ego=0,
         id=log.id[rows],
-        kind=log.kind[rows],
+        agent_type=log.agent_type[rows],
         size_lwh_m=log.size_lwh_m[rows],
         xyz_m=np.stack([paths[name] for name in AXES[:3]], axis=-1),
         heading_rad=paths["heading_rad"],

@@ -125,7 +125,7 @@ def test_each_rollout_is_judged_by_itself():
         z_m=np.repeat(motion.z_m, 2, axis=0),
         heading_rad=np.repeat(motion.heading_rad, 2, axis=0),
         size_lwh_m=motion.size_lwh_m,
-        kind=motion.kind,
+        agent_type=motion.agent_type,
         valid=np.repeat(motion.valid, 2, axis=0),
     )
 

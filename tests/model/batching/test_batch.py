@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from infgen.config import TokenSettings, TrainSettings
-from infgen.model.batching.batch import collate, collate_roads, to_device
+from infgen.model.batching.batch import collate, collate_maps, to_device
 from infgen.model.batching.crop import cut_window, hide_until_near
 from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.batching.padding import NOBODY
@@ -58,7 +58,7 @@ def test_only_the_nearest_agents_are_kept_the_ego_always(record, limits):
 
     few = collate([scene], replace(limits, agents=3), 0).agents
 
-    assert few.kind.shape == (1, 3)
+    assert few.agent_type.shape == (1, 3)
     assert torch.equal(few.pose, whole.pose[:, :, :3])
 
 
@@ -97,7 +97,7 @@ def test_padding_is_absent_and_unreal(record, limits):
 
     assert not batch.agents.visible[0, 4:].any()
     assert not batch.agents.visible[0, :, 3:].any()
-    assert (batch.agents.move[0, 4:] == NO_MOTION_TOKEN).all()
+    assert (batch.agents.motion_token[0, 4:] == NO_MOTION_TOKEN).all()
     assert batch.roads.real.sum(dim=1).tolist() == [10, 60]
     assert not batch.entries.asked[0, 4:].any()
 
@@ -117,7 +117,7 @@ def test_patterns_are_those_of_the_scene_and_0_for_who_is_absent(record, limits)
 def test_moves_are_learned_as_they_were_made(record, limits):
     agents = collate([record(3, agents=12, tokens=9), record(4)], limits, 0).agents
 
-    assert torch.equal(agents.label, agents.move)
+    assert torch.equal(agents.label, agents.motion_token)
 
 
 def test_newcomers_take_turns_from_near_to_far(record, limits):
@@ -183,9 +183,9 @@ def noise(vocabularies):
 
 def with_a_gap(scene):
     """The scene with row 1 unseen for two tokens, then going on."""
-    observed, move = scene.observed.copy(), scene.motion_token.copy()
-    observed[1, 3:5], move[1, 3:5] = False, NO_MOTION_TOKEN
-    return replace(scene, observed=observed, motion_token=move)
+    observed, motion_token = scene.observed.copy(), scene.motion_token.copy()
+    observed[1, 3:5], motion_token[1, 3:5] = False, NO_MOTION_TOKEN
+    return replace(scene, observed=observed, motion_token=motion_token)
 
 
 @pytest.fixture(scope="module")
@@ -219,10 +219,10 @@ def test_noise_changes_only_what_agents_do_and_where_they_are(pair):
         if not torch.equal(getattr(part, field.name), getattr(other, field.name))
     }
     told = {"Insertions.cell", "Details.cell", "Details.heading", "Details.offset_m"}
-    asked = {"Details.agent", "Details.token", "Details.kind", "Details.size_lwh_m"}
-    agents = {"Agents.pose", "Agents.move", "Agents.label", "Agents.cell"}
-    assert agents | {"Details.offset_m", "Roads.token"} <= changed
-    assert changed <= agents | told | asked | {"Roads.token"}
+    asked = {"Details.agent", "Details.token", "Details.agent_type", "Details.size_lwh_m"}
+    agents = {"Agents.pose", "Agents.motion_token", "Agents.label", "Agents.cell"}
+    assert agents | {"Details.offset_m", "MapTokens.token"} <= changed
+    assert changed <= agents | told | asked | {"MapTokens.token"}
 
 
 def test_noise_moves_the_ego_but_nobody_who_is_absent_entering_or_unseen(pair):
@@ -230,7 +230,7 @@ def test_noise_moves_the_ego_but_nobody_who_is_absent_entering_or_unseen(pair):
     still = ~plain.agents.observed
     ego = plain.agents.observed[:, :, 0]
 
-    for name in ("pose", "move", "label"):
+    for name in ("pose", "motion_token", "label"):
         one, two = getattr(plain.agents, name), getattr(noisy.agents, name)
         assert torch.equal(one[still], two[still]), name
         assert not torch.equal(one[:, :, 0][ego], two[:, :, 0][ego]), name
@@ -242,13 +242,13 @@ def test_noisy_agents_go_where_their_moves_lead_and_learn_to_come_back(pair, voc
     vocabulary, _ = vocabularies()
     table = make_match_table(vocabulary)
     scene, token, row = noisy.agents.observed.nonzero(as_tuple=True)
-    kind = noisy.agents.kind[scene, row].numpy().astype(np.int8)
+    agent_type = noisy.agents.agent_type[scene, row].numpy().astype(np.int8)
     before = noisy.agents.pose[scene, token - 1, row].numpy()
     wanted = plain.agents.pose[scene, token, row].numpy()
 
-    move = noisy.agents.move[scene, token, row].numpy().astype(np.int16)
-    ends = advance(before, kind, move, vocabulary)
-    label = nearest_motion_tokens(wanted, before, kind, table)
+    motion_token = noisy.agents.motion_token[scene, token, row].numpy().astype(np.int16)
+    ends = advance(before, agent_type, motion_token, vocabulary)
+    label = nearest_motion_tokens(wanted, before, agent_type, table)
 
     np.testing.assert_allclose(noisy.agents.pose[scene, token, row], ends, atol=1e-4)
     np.testing.assert_array_equal(noisy.agents.label[scene, token, row].numpy(), label)
@@ -291,9 +291,9 @@ def test_noise_draws_what_is_its_own_and_by_draw_and_scene(record, limits, noise
 
     pairs = zip(tensors(one), tensors(two), strict=True)
     assert all(torch.equal(a, b) for (_, a), (_, b) in pairs)
-    own = alone.agents.move[0]
-    assert torch.equal(own, one.agents.move[1, : own.shape[0], : own.shape[1]])
-    assert not torch.equal(one.agents.move, other.agents.move)
+    own = alone.agents.motion_token[0]
+    assert torch.equal(own, one.agents.motion_token[1, : own.shape[0], : own.shape[1]])
+    assert not torch.equal(one.agents.motion_token, other.agents.motion_token)
     assert torch.equal(one.roads.picked, plain.roads.picked)
 
 
@@ -373,7 +373,7 @@ def test_who_is_there_when_a_window_begins_enters_then(window):
     row = row_in(part, scene, 1)
 
     assert part.presence[row, 0] == Presence.INSERTED
-    assert part.move[row, 0] == FIRST_MOTION_TOKEN
+    assert part.motion_token[row, 0] == FIRST_MOTION_TOKEN
     assert not part.observed[row, 0]
     assert (part.presence[row, 1:] == Presence.PRESENT).all()
     np.testing.assert_array_equal(part.pose[row], scene.pose[1, 3:])
@@ -440,7 +440,7 @@ def test_who_is_beyond_the_rim_at_first_enters_once_it_has_come_within(coming):
     # Within at the end of token 2, so observed within from token 3 on.
     assert part.presence[near].tolist() == [0, 0, 0, 2, 1, 1, 1, 1]
     assert part.observed[near].tolist() == [False] * 4 + [True] * 4
-    assert part.move[near, 3] == part.label[near, 3] == FIRST_MOTION_TOKEN
+    assert part.motion_token[near, 3] == part.label[near, 3] == FIRST_MOTION_TOKEN
     assert not part.presence[never].any()
     assert not part.presence[leaver].any()  # It would enter as it leaves.
     assert part.presence[late].tolist() == [0] * 6 + [2, 1]
@@ -465,7 +465,7 @@ def test_nobody_is_hidden_without_a_rim_or_within_it_or_after_the_history(
 ):
     part, _ = hidden(coming, known, enter_m)
 
-    for name in ("presence", "observed", "move", "label", "pattern", "entry_row"):
+    for name in ("presence", "observed", "motion_token", "label", "pattern", "entry_row"):
         np.testing.assert_array_equal(getattr(part, name), getattr(coming[1], name))
 
 
@@ -483,7 +483,7 @@ def test_in_half_of_the_scenes_the_rim_is_bare(coming, limits):
 def test_maps_alone_are_whole_and_hide_nothing(record):
     scenes = [record(0, roads=7), record(1, roads=5)]
 
-    roads = collate_roads(scenes, 100)
+    roads = collate_maps(scenes, 100)
 
     assert roads.real.sum(dim=1).tolist() == [7, 5]
     assert not roads.picked.any()
@@ -492,7 +492,7 @@ def test_maps_alone_are_whole_and_hide_nothing(record):
 def test_lights_of_maps_alone_are_seen_as_long_as_they_are_known_then_remembered(record):
     scenes = [record(0, tokens=7), record(1, tokens=9)]
 
-    shown = collate_roads(scenes, 100).shown.numpy()
+    shown = collate_maps(scenes, 100).shown.numpy()
 
     for at, scene in enumerate(scenes):
         state = scene.signal_state

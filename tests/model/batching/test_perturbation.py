@@ -47,12 +47,12 @@ def noise_of(vocabulary, moves, share=1.0, drift=0.0):
 
 
 def five_metre_drives(vocabulary, agents=400, tokens=18):
-    kind, pose, move, moving = metre_drives(agents, tokens)
+    agent_type, pose, motion_token, moving = metre_drives(agents, tokens)
     pose[..., 0] *= 5
     straight = np.hypot(vocabulary.end_pose[0, :, 0] - 5, vocabulary.end_pose[0, :, 1])
     straight += np.abs(vocabulary.end_pose[0, :, 2])
-    move[:, 1:] = straight.argmin()
-    return kind, pose, move, moving
+    motion_token[:, 1:] = straight.argmin()
+    return agent_type, pose, motion_token, moving
 
 
 def metre_drives(agents=4, tokens=18):
@@ -60,28 +60,35 @@ def metre_drives(agents=4, tokens=18):
     pose = np.zeros((agents, tokens, 3), np.float32)
     pose[..., 0] = np.arange(tokens)
     pose[..., 1] = 5.0 * np.arange(agents)[:, None]
-    move = np.full((agents, tokens), 10, np.int16)
-    move[:, 0] = NO_MOTION_TOKEN
+    motion_token = np.full((agents, tokens), 10, np.int16)
+    motion_token[:, 0] = NO_MOTION_TOKEN
     moving = np.ones((agents, tokens), bool)
     moving[:, 0] = False
-    return np.zeros(agents, np.int8), pose, move, moving
+    return np.zeros(agents, np.int8), pose, motion_token, moving
 
 
 def random_drives(vocabulary, seed, agents=20, tokens=10):
     """Agents of all kinds on random moves, with gaps after which they start elsewhere."""
     random = np.random.default_rng(seed)
-    kind = random.integers(3, size=agents).astype(np.int8)
-    move = random.integers(vocabulary.num_motion_tokens, size=(agents, tokens)).astype(
-        np.int16
-    )
+    agent_type = random.integers(3, size=agents).astype(np.int8)
+    motion_token = random.integers(
+        vocabulary.num_motion_tokens, size=(agents, tokens)
+    ).astype(np.int16)
     moving = random.random((agents, tokens)) < 0.8
     moving[:, 0] = False
     pose = random.normal(size=(agents, tokens, 3)).astype(np.float32)
     for token in range(1, tokens):
         rows = np.flatnonzero(moving[:, token])
-        ends = advance(pose[rows, token - 1], kind[rows], move[rows, token], vocabulary)
+        ends = advance(
+            pose[rows, token - 1], agent_type[rows], motion_token[rows, token], vocabulary
+        )
         pose[rows, token] = ends
-    return kind, pose, np.where(moving, move, NO_MOTION_TOKEN).astype(np.int16), moving
+    return (
+        agent_type,
+        pose,
+        np.where(moving, motion_token, NO_MOTION_TOKEN).astype(np.int16),
+        moving,
+    )
 
 
 def stray(drives, noise, seed=0):
@@ -109,7 +116,7 @@ def test_the_move_to_learn_makes_good_what_the_last_one_missed():
     wanted = 10 + np.rint(10 * missed_m)
     np.testing.assert_array_equal(strays.label[:, 1:], wanted)
     assert set(np.unique(strays.label[:, 1:])) == {9, 10, 11}
-    assert (strays.move != strays.label).any()
+    assert (strays.motion_token != strays.label).any()
 
 
 @given(st.integers(0, 2**32), st.sampled_from([1, 2, 5, 31]))
@@ -117,14 +124,16 @@ def test_the_move_to_learn_makes_good_what_the_last_one_missed():
 def test_poses_follow_moves_and_labels_are_the_nearest_moves(seed, few):
     vocabulary = straight_moves()
     noise = noise_of(vocabulary, few)
-    kind, pose, move, moving = random_drives(vocabulary, seed)
+    agent_type, pose, motion_token, moving = random_drives(vocabulary, seed)
 
-    strays = perturb_motion(kind, pose, move, moving, noise, np.random.default_rng(seed))
+    strays = perturb_motion(
+        agent_type, pose, motion_token, moving, noise, np.random.default_rng(seed)
+    )
 
     for token in range(1, pose.shape[1]):
         rows = np.flatnonzero(moving[:, token])
-        before, kinds = strays.pose[rows, token - 1], kind[rows]
-        ends = advance(before, kinds, strays.move[rows, token], vocabulary)
+        before, kinds = strays.pose[rows, token - 1], agent_type[rows]
+        ends = advance(before, kinds, strays.motion_token[rows, token], vocabulary)
         np.testing.assert_allclose(strays.pose[rows, token], ends, atol=1e-5)
         best = nearest_motion_tokens(pose[rows, token], before, kinds, noise.table)
         np.testing.assert_array_equal(strays.label[rows, token], best)
@@ -133,17 +142,17 @@ def test_poses_follow_moves_and_labels_are_the_nearest_moves(seed, few):
 @given(st.integers(0, 2**32))
 @settings(max_examples=25)
 def test_who_makes_no_move_is_where_it_should_be_and_starts_from_there(seed):
-    drives = _, pose, move, moving = random_drives(straight_moves(), seed)
+    drives = _, pose, motion_token, moving = random_drives(straight_moves(), seed)
 
     strays = stray(drives, noise_of(straight_moves(), 5))
 
     np.testing.assert_array_equal(strays.pose[~moving], pose[~moving])
-    np.testing.assert_array_equal(strays.move[~moving], move[~moving])
-    np.testing.assert_array_equal(strays.label[~moving], move[~moving])
+    np.testing.assert_array_equal(strays.motion_token[~moving], motion_token[~moving])
+    np.testing.assert_array_equal(strays.label[~moving], motion_token[~moving])
     assert not strays.off[~moving].any()
     first = moving.copy()
     first[:, 1:] &= ~moving[:, :-1]
-    np.testing.assert_array_equal(strays.label[first], move[first])
+    np.testing.assert_array_equal(strays.label[first], motion_token[first])
 
 
 @pytest.mark.parametrize(("moves", "share"), [(1, 1.0), (5, 0.0)])
@@ -162,7 +171,7 @@ def test_only_a_share_of_the_moves_is_drawn():
 
     strays = stray(drives, noise_of(straight_moves(), 3, share=0.5))
 
-    drawn = (strays.move != strays.label)[:, 1:].mean()
+    drawn = (strays.motion_token != strays.label)[:, 1:].mean()
     assert 0.30 < drawn < 0.37  # Half of two in three: one in three is the nearest.
 
 
@@ -174,17 +183,17 @@ def test_moves_that_end_far_off_are_not_taken():
 
     strays = stray(drives, noise_of(vocabulary, 3))
 
-    np.testing.assert_array_equal(strays.move, drives[2])
+    np.testing.assert_array_equal(strays.motion_token, drives[2])
 
 
 @pytest.mark.parametrize(("way_m", "off_m"), [(0, 0), (1.8, 0), (3, 0.3), (30, 0.9)])
 def test_the_slow_stray_less_and_who_stands_not_at_all(way_m, off_m):
-    kind, pose, move, moving = metre_drives(agents=20, tokens=4)
+    agent_type, pose, motion_token, moving = metre_drives(agents=20, tokens=4)
     pose[..., 0] *= way_m
     vocabulary = straight_moves(step_m=0.3, count=120)
-    move[:, 1:] = round(way_m / 0.3)
+    motion_token[:, 1:] = round(way_m / 0.3)
 
-    strays = stray((kind, pose, move, moving), noise_of(vocabulary, 20))
+    strays = stray((agent_type, pose, motion_token, moving), noise_of(vocabulary, 20))
 
     farthest_m = np.abs(strays.pose[..., 0] - pose[..., 0]).max()
     assert farthest_m == pytest.approx(off_m, abs=1e-3)
@@ -229,13 +238,13 @@ def test_equal_draws_lead_equally_astray_and_others_otherwise():
     one, two, other = (stray(drives, noise, seed) for seed in (1, 1, 2))
 
     assert all((a == b).all() for a, b in zip(one, two, strict=True))
-    assert (one.move != other.move).any()
+    assert (one.motion_token != other.motion_token).any()
 
 
 def test_nobody_is_led_nowhere():
     strays = stray(metre_drives(agents=0), noise_of(straight_moves(), 5))
 
-    assert strays.move.shape == (0, 18)
+    assert strays.motion_token.shape == (0, 18)
 
 
 def test_settings_that_ask_for_no_noise_make_none(metre_moves, bent_roads):
@@ -248,10 +257,10 @@ def test_road_tokens_are_drawn_from_the_nearest_shapes(metre_moves, bent_roads):
     )
 
     # Arcs that end 0, 5, 10, 20, 40 degrees to the left, then 5, 10, 20, 40 to the right.
-    near = [set(row) for row in noise.near_roads.tolist()]
+    near = [set(row) for row in noise.near_map_tokens.tolist()]
     assert near[0] == {0, 1, 5}
     assert near[4] == {4, 3, 2}
-    np.testing.assert_array_equal(noise.near_roads[:, 0], np.arange(9))
+    np.testing.assert_array_equal(noise.near_map_tokens[:, 0], np.arange(9))
     assert noise.moves == 0
 
 
@@ -269,7 +278,9 @@ def test_road_tokens_that_are_fixed_stay_and_others_become_what_is_near(
 
     np.testing.assert_array_equal(drawn[fixed], token[fixed])
     assert 0.25 < (drawn == token)[~fixed].mean() < 0.42
-    assert all(new in noise.near_roads[old] for old, new in zip(token, drawn, strict=True))
+    assert all(
+        new in noise.near_map_tokens[old] for old, new in zip(token, drawn, strict=True)
+    )
 
 
 def test_shapes_that_are_alike_stand_for_themselves_first(metre_moves):
@@ -278,7 +289,7 @@ def test_shapes_that_are_alike_stand_for_themselves_first(metre_moves):
 
     noise = make_perturbation(TrainSettings(map_noise_neighbours=1), metre_moves, twins)
 
-    assert noise.near_roads.tolist() == [[0], [1]]
+    assert noise.near_map_tokens.tolist() == [[0], [1]]
 
 
 def test_of_more_tokens_than_the_codebook_has_all_are_drawn_from(metre_moves, bent_roads):
@@ -289,7 +300,10 @@ def test_of_more_tokens_than_the_codebook_has_all_are_drawn_from(metre_moves, be
     )
 
     assert noise.moves == metre_moves.num_motion_tokens
-    assert noise.near_roads.shape == (bent_roads.num_map_tokens, bent_roads.num_map_tokens)
+    assert noise.near_map_tokens.shape == (
+        bent_roads.num_map_tokens,
+        bent_roads.num_map_tokens,
+    )
 
 
 @pytest.mark.parametrize(

@@ -31,9 +31,9 @@ def tensors(batch):
 
 def with_a_gap(scene):
     """The scene with row 1 unseen for two tokens, then going on."""
-    observed, move = scene.observed.copy(), scene.motion_token.copy()
-    observed[1, 3:5], move[1, 3:5] = False, NO_MOTION_TOKEN
-    return replace(scene, observed=observed, motion_token=move)
+    observed, motion_token = scene.observed.copy(), scene.motion_token.copy()
+    observed[1, 3:5], motion_token[1, 3:5] = False, NO_MOTION_TOKEN
+    return replace(scene, observed=observed, motion_token=motion_token)
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +54,12 @@ def blurred(logged):
     agents = logged.agents
     made = torch.zeros_like(agents.observed)
     made[moves_made(logged)] = True
-    move = torch.where(made, NUM_MOVES, agents.move)
+    motion_token = torch.where(made, NUM_MOVES, agents.motion_token)
     noise = torch.randn(agents.pose.shape, generator=torch.Generator().manual_seed(0))
     blur = noise * torch.tensor([0.1, 0.1, 0.03]) * agents.observed[..., None]
-    return replace(logged, agents=replace(agents, pose=agents.pose + blur, move=move))
+    return replace(
+        logged, agents=replace(agents, pose=agents.pose + blur, motion_token=motion_token)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -90,21 +92,21 @@ def test_with_all_moves_to_choose_from_agents_follow_the_log(
 ):
     table = make_match_table(vocabularies()[0])
     agents, truth = close_loop(network, blurred, 10_000).agents, blurred.agents
-    kind = truth.kind.numpy().astype(np.int8).ravel()
+    agent_type = truth.agent_type.numpy().astype(np.int8).ravel()
 
     pose = truth.pose[:, 0].numpy().reshape(-1, 3)
     for token in range(1, truth.pose.shape[1]):
         target = truth.pose[:, token].numpy().reshape(-1, 3)
-        led, pose = follow(target, pose, kind, table)
+        led, pose = follow(target, pose, agent_type, table)
         made = truth.observed[:, token] & truth.visible[:, token - 1]
         made = made.numpy().ravel()
         np.testing.assert_array_equal(
-            agents.move[:, token].numpy().ravel()[made], led[made]
+            agents.motion_token[:, token].numpy().ravel()[made], led[made]
         )
         found = agents.pose[:, token].numpy().reshape(-1, 3)
         np.testing.assert_allclose(found[made], pose[made], atol=1e-4)
         pose = np.where(made[:, None], pose, target)
-    assert torch.equal(agents.label, agents.move)
+    assert torch.equal(agents.label, agents.motion_token)
 
 
 @pytest.mark.parametrize("top", [1, 3])
@@ -118,11 +120,11 @@ def test_each_move_is_the_nearest_of_the_networks_most_likely(
         motion = network(played).motion
     logits = motion.rows.spread(motion.motion_logits)[scene, token - 1, row]
     likely = logits.topk(top).indices.numpy()
-    kind = played.agents.kind[scene, row].numpy().astype(np.int8)
+    agent_type = played.agents.agent_type[scene, row].numpy().astype(np.int8)
     before = played.agents.pose[scene, token - 1, row].numpy()
     truth = logged.agents.pose[scene, token, row].numpy()
 
-    found = played.agents.move[scene, token, row].numpy()
+    found = played.agents.motion_token[scene, token, row].numpy()
 
     for at, choice in enumerate(likely):
         few = replace(
@@ -132,7 +134,7 @@ def test_each_move_is_the_nearest_of_the_networks_most_likely(
         )
         one = slice(at, at + 1)
         best = nearest_motion_tokens(
-            truth[one], before[one], kind[one], make_match_table(few)
+            truth[one], before[one], agent_type[one], make_match_table(few)
         )
         assert found[at] == np.sort(choice)[best[0]]
 
@@ -141,21 +143,26 @@ def test_poses_follow_moves_and_labels_lead_back_to_the_log(logged, played, voca
     vocabulary = vocabularies()[0]
     scene, token, row = moves_made(played)
     agents = played.agents
-    kind = agents.kind[scene, row].numpy().astype(np.int8)
+    agent_type = agents.agent_type[scene, row].numpy().astype(np.int8)
     before = agents.pose[scene, token - 1, row].numpy()
     truth = logged.agents.pose[scene, token, row].numpy()
 
-    def end(move):
-        return advance(before, kind, move.numpy().astype(np.int16), vocabulary)
+    def end(motion_token):
+        return advance(
+            before, agent_type, motion_token.numpy().astype(np.int16), vocabulary
+        )
 
-    move, label = agents.move[scene, token, row], agents.label[scene, token, row]
-    np.testing.assert_allclose(agents.pose[scene, token, row], end(move), atol=1e-4)
-    best = nearest_motion_tokens(truth, before, kind, make_match_table(vocabulary))
+    motion_token, label = (
+        agents.motion_token[scene, token, row],
+        agents.label[scene, token, row],
+    )
+    np.testing.assert_allclose(agents.pose[scene, token, row], end(motion_token), atol=1e-4)
+    best = nearest_motion_tokens(truth, before, agent_type, make_match_table(vocabulary))
     np.testing.assert_array_equal(label, best)
-    away_m = np.linalg.norm((end(move) - truth)[:, :2], axis=1)
+    away_m = np.linalg.norm((end(motion_token) - truth)[:, :2], axis=1)
     after_m = np.linalg.norm((end(label) - truth)[:, :2], axis=1)
     assert after_m.mean() < away_m.mean()
-    assert (move != label).any()
+    assert (motion_token != label).any()
 
 
 def test_who_comes_goes_and_is_not_seen_is_the_logs(logged, played):
@@ -164,10 +171,10 @@ def test_who_comes_goes_and_is_not_seen_is_the_logs(logged, played):
         for (name, one), (_, two) in zip(tensors(logged), tensors(played), strict=True)
         if not torch.equal(one, two)
     }
-    assert {"Agents.pose", "Agents.move", "Agents.label", "Agents.cell"} <= changed
+    assert {"Agents.pose", "Agents.motion_token", "Agents.label", "Agents.cell"} <= changed
     assert changed <= {
         "Agents.pose",
-        "Agents.move",
+        "Agents.motion_token",
         "Agents.label",
         "Agents.cell",
         "Insertions.cell",
@@ -176,7 +183,7 @@ def test_who_comes_goes_and_is_not_seen_is_the_logs(logged, played):
         "Details.offset_m",
     }
     still = ~logged.agents.observed
-    for name in ("pose", "move", "label"):
+    for name in ("pose", "motion_token", "label"):
         one, two = getattr(logged.agents, name), getattr(played.agents, name)
         assert torch.equal(one[still], two[still]), name
 
@@ -188,7 +195,7 @@ def test_who_was_not_seen_goes_on_from_the_log(logged, played):
 
     assert back.any()
     assert torch.equal(agents.pose[back], played.agents.pose[back])
-    assert torch.equal(agents.move[back], played.agents.move[back])
+    assert torch.equal(agents.motion_token[back], played.agents.motion_token[back])
 
 
 def test_cells_are_those_of_the_played_ego(logged, played, grid_settings):
@@ -242,7 +249,7 @@ def test_the_network_is_left_as_it_was_and_nothing_has_a_gradient(
 
 def test_a_network_that_fails_is_left_in_its_mode_too(new_network, logged):
     network, agents = new_network().train(), logged.agents
-    unheard_of = replace(logged, agents=replace(agents, kind=agents.kind + 99))
+    unheard_of = replace(logged, agents=replace(agents, agent_type=agents.agent_type + 99))
 
     with pytest.raises(IndexError):
         close_loop(network, unheard_of, 3)

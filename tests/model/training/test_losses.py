@@ -24,10 +24,10 @@ LETTERS = {
 def agents_of(record, limits, life, near=True):
     """The ego and one agent whose life is spelt out, token by token."""
     scene = record(0, agents=2, tokens=len(life), lives=[(0, len(life) - 1)])
-    presence, observed, move = (
+    presence, observed, motion_token = (
         np.array([LETTERS[letter][i] for letter in life]) for i in range(3)
     )
-    change = {"presence": presence, "observed": observed, "motion_token": move}
+    change = {"presence": presence, "observed": observed, "motion_token": motion_token}
     arrays = {name: getattr(scene, name).copy() for name in change}
     for name, values in change.items():
         arrays[name][1] = values
@@ -180,9 +180,9 @@ def test_the_first_move_of_a_newcomer_counts_three_times(network, record, limits
     assert float(terms["motion"].count) == 4
     assert float(terms["motion"].weight) == 3 + 3
     logits = outputs.motion.rows.spread(outputs.motion.motion_logits)[0].log_softmax(-1)
-    move = batch.agents.move[0]
-    ego = sum(-float(logits[k, 0, move[k + 1, 0]]) for k in range(3))
-    inserted = -float(logits[2, 1, move[3, 1]])
+    motion_token = batch.agents.motion_token[0]
+    ego = sum(-float(logits[k, 0, motion_token[k + 1, 0]]) for k in range(3))
+    inserted = -float(logits[2, 1, motion_token[3, 1]])
     assert float(terms["motion"].mean) == pytest.approx((ego + 3 * inserted) / 6, rel=1e-5)
 
 
@@ -191,7 +191,9 @@ def test_label_smoothing_has_its_floor(network, record, limits):
     batch, outputs, _ = terms_of(network, [record(1)], limits, settings)
     moves = outputs.motion.motion_logits.shape[-1]
     agents = batch.agents
-    target = outputs.motion.rows.pack(torch.roll(agents.move, -1, dims=1)).clamp(min=0)
+    target = outputs.motion.rows.pack(torch.roll(agents.motion_token, -1, dims=1)).clamp(
+        min=0
+    )
     best = torch.full((len(target), moves), math.log(0.1 / moves))
     best.scatter_(1, target[:, None], math.log(0.9 + 0.1 / moves))
 

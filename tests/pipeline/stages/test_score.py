@@ -88,7 +88,7 @@ def as_rollout(scene: Scene, index: int = 0, shift_m: float = 0.0, steps=None) -
         now=scene.now,
         ego=int(np.flatnonzero(rows == scene.ego)[0]),
         id=tracks.id[rows],
-        kind=tracks.agent_type[rows],
+        agent_type=tracks.agent_type[rows],
         size_lwh_m=tracks.size_lwh_m[rows, scene.now],
         xyz_m=xyz_m[:, cut],
         heading_rad=tracks.heading_rad[rows][:, cut],

@@ -13,17 +13,17 @@ from infgen.tokens.scene_tokens import Presence
 CAR, WALKER = AgentType.VEHICLE, AgentType.PEDESTRIAN
 
 
-def everyone(*poses, kind=CAR) -> Population:
+def everyone(*poses, agent_type=CAR) -> Population:
     """A population of one rollout at some poses."""
     one = (1, len(poses))
     size_lwh_m = np.empty((*one, 3), dtype=np.float32)
     size_lwh_m[:] = 4.0, 2.0, 1.5
     return Population(
         agent_number=np.zeros(one, dtype=np.int32),
-        kind=np.full(one, kind, dtype=np.int8),
+        agent_type=np.full(one, agent_type, dtype=np.int8),
         size_lwh_m=size_lwh_m,
         pose=np.array([poses], dtype=np.float32),
-        move=np.zeros(one, dtype=np.int16),
+        motion_token=np.zeros(one, dtype=np.int16),
         presence=np.full(one, Presence.PRESENT, dtype=np.int8),
         observed=np.ones(one, dtype=bool),
         num_agents_so_far=np.zeros(1, dtype=np.int32),
@@ -83,12 +83,12 @@ def test_who_is_gone_is_in_nobodys_way():
 
 
 def test_walkers_pass_through_each_other_but_not_through_cars():
-    walkers = everyone((0, 0, 0), (10, 0, 0), kind=WALKER)
-    mixed = walkers.kind.copy()
+    walkers = everyone((0, 0, 0), (10, 0, 0), agent_type=WALKER)
+    mixed = walkers.agent_type.copy()
     mixed[0, 1] = CAR
 
     assert hits(walkers, 8.0, 0.0) == [False, False]
-    assert hits(replace(walkers, kind=mixed), 8.0, 0.0) == [True, False]
+    assert hits(replace(walkers, agent_type=mixed), 8.0, 0.0) == [True, False]
 
 
 def test_who_is_alone_hits_nobody():

@@ -94,9 +94,9 @@ def test_without_lanes_edges_decide():
     assert off_m(RoadEdgeTiles(scene_of([edge])), (0, -2), (0, 2)) == [2, -2]
 
 
-def departs(y_m, heading_rad, metres, kind=CAR, moments=2):
+def departs(y_m, heading_rad, metres, agent_type=CAR, moments=2):
     """A car 4 m long and 2 m wide at (0, y) goes straight on."""
-    population = everyone((0, y_m, heading_rad), kind=kind)
+    population = everyone((0, y_m, heading_rad), agent_type=agent_type)
     found = find_off_road(
         population,
         np.ones((1, 1), dtype=bool),
@@ -131,9 +131,9 @@ def test_nobody_is_looked_at_for_longer_than_asked():
     assert not departs(0.0, -np.pi / 2, 1.2, moments=1)
 
 
-@pytest.mark.parametrize("kind", [WALKER, RIDER])
-def test_only_vehicles_are_kept(kind):
-    assert not departs(0.0, -np.pi / 2, 5.0, kind)
+@pytest.mark.parametrize("agent_type", [WALKER, RIDER])
+def test_only_vehicles_are_kept(agent_type):
+    assert not departs(0.0, -np.pi / 2, 5.0, agent_type)
 
 
 def test_everyone_is_held_against_the_map_of_its_own_rollout_if_asked_about():

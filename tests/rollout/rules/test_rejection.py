@@ -27,10 +27,10 @@ def test_a_car_looks_as_far_ahead_as_it_needs_to_stop(
 ):
     one_map = np.zeros(1, dtype=np.int64)
     motion_check = MotionCheck(metre_moves, [RoadEdgeTiles(street())], one_map)
-    move, drawn = np.array([[move_m]]), np.ones((1, 1), dtype=bool)
+    motion_token, drawn = np.array([[move_m]]), np.ones((1, 1), dtype=bool)
 
     hits, departs = motion_check.rejects(
-        everyone((-50, 0, heading_rad)), move, drawn, road=True
+        everyone((-50, 0, heading_rad)), motion_token, drawn, road=True
     )
 
     assert (hits.item(), departs.item()) == (False, found)

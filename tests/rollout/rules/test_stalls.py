@@ -32,8 +32,8 @@ def ask(remembers, population, tokens):
     return [remembers.stalled(population, token).tolist()[0] for token in tokens]
 
 
-def stalls(pose, kind=CAR, lines=NO_LINES, token=LONG):
-    population = everyone(pose, kind=kind)
+def stalls(pose, agent_type=CAR, lines=NO_LINES, token=LONG):
+    population = everyone(pose, agent_type=agent_type)
     return ask(stall_rule(lines), population, range(token + 1))[-1][0]
 
 
@@ -57,9 +57,9 @@ def test_only_in_a_lane_that_leads_its_way(pose, found):
     assert stalls(pose) is found
 
 
-@pytest.mark.parametrize("kind", [WALKER, RIDER])
-def test_only_vehicles_do(kind):
-    assert not stalls((0, 0, 0), kind)
+@pytest.mark.parametrize("agent_type", [WALKER, RIDER])
+def test_only_vehicles_do(agent_type):
+    assert not stalls((0, 0, 0), agent_type)
 
 
 def test_who_only_trembled_has_stood_and_who_got_farther_has_not():
@@ -135,8 +135,8 @@ def never_sets_off(simulator, metre_moves, **settings):
 
     def still(memory, token_step):
         said = step(memory, token_step)
-        kind = said.packed.rows.pack(token_step.kind.long())
-        said.packed.motion_logits[:] += 50.0 * standing[kind]
+        agent_type = said.packed.rows.pack(token_step.agent_type.long())
+        said.packed.motion_logits[:] += 50.0 * standing[agent_type]
         return said
 
     playing.stepper.motion_step = still

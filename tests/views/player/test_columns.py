@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from infgen.views.player.columns import PayloadError, pack_columns, unpack_columns
 
 COLUMN = st.sampled_from([np.int8, np.int16, np.int32]).flatmap(
-    lambda kind: arrays(kind, st.integers(0, 20))
+    lambda agent_type: arrays(agent_type, st.integers(0, 20))
 )
 
 

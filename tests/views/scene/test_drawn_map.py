@@ -80,7 +80,7 @@ def test_a_crosswalk_with_more_corners_stays_whole():
 
 
 @pytest.mark.parametrize(
-    ("kind", "type_", "look"),
+    ("agent_type", "type_", "look"),
     [
         (FeatureType.LANE, LaneType.UNDEFINED, RoadLook.LANE),
         (FeatureType.LANE, LaneType.BIKE_LANE, RoadLook.BIKE_LANE),
@@ -91,8 +91,8 @@ def test_a_crosswalk_with_more_corners_stays_whole():
         (FeatureType.STOP_SIGN, 0, RoadLook.STOP_SIGN),
     ],
 )
-def test_features_look_like_what_they_are(kind, type_, look):
-    assert look_of(kind, type_) is look
+def test_features_look_like_what_they_are(agent_type, type_, look):
+    assert look_of(agent_type, type_) is look
 
 
 def test_every_kind_and_type_has_a_look():
@@ -101,9 +101,9 @@ def test_every_kind_and_type_has_a_look():
         FeatureType.ROAD_LINE: RoadLineType,
         FeatureType.ROAD_EDGE: RoadEdgeType,
     }
-    for kind in FeatureType:
-        for type_ in types.get(kind, [0]):
-            assert look_of(kind, type_) is not None
+    for agent_type in FeatureType:
+        for type_ in types.get(agent_type, [0]):
+            assert look_of(agent_type, type_) is not None
 
 
 def test_lines_lie_from_the_bottom_up(build_map):

@@ -41,11 +41,13 @@ def test_the_view_shows_fifty_two_metres_around_the_ego(drive):
     assert view.centre_m == pytest.approx((20.0, 0.0))
 
 
-@pytest.mark.parametrize("kind", AgentType)
-def test_a_shape_fills_its_box_and_points_ahead(kind):
-    body = shape_of(kind, 4.0, 2.0).body
+@pytest.mark.parametrize("agent_type", AgentType)
+def test_a_shape_fills_its_box_and_points_ahead(agent_type):
+    body = shape_of(agent_type, 4.0, 2.0).body
 
-    wide = 4.0 if kind == AgentType.PEDESTRIAN else 2.0  # A disc, drawn with 16 corners.
+    wide = (
+        4.0 if agent_type == AgentType.PEDESTRIAN else 2.0
+    )  # A disc, drawn with 16 corners.
     assert np.ptp(body[:, 1]) == pytest.approx(wide, rel=0.02)
     assert body[:, 0].max() >= 2.0 - 1e-9
     assert abs(body[body[:, 0].argmax(), 1]) <= 1.0

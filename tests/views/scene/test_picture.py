@@ -43,7 +43,7 @@ def rollout(drive):
         now=scene.now,
         ego=0,
         id=np.arange(3, dtype=np.int32),
-        kind=np.zeros(3, np.int8),
+        agent_type=np.zeros(3, np.int8),
         size_lwh_m=tracks.size_lwh_m[rows, scene.now],
         xyz_m=xyz_m,
         heading_rad=tracks.heading_rad[rows],

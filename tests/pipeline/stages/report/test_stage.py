@@ -25,8 +25,8 @@ from pipeline.engine.atomic import write_json
 from pipeline.engine.stage import FinishedUnit, Stage
 from pipeline.stages import reference, score
 from pipeline.stages.reference_files import read_counts
-from pipeline.stages.report.passport import times
 from pipeline.stages.report import stage as report
+from pipeline.stages.report.passport import times
 from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
 from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.zarr_store import write_records
@@ -93,7 +93,7 @@ def cruise(scene: Scene, index: int) -> Rollout:
         now=scene.now,
         ego=int(np.flatnonzero(rows == scene.ego)[0]),
         id=np.append(tracks.id[rows[:-1]], tracks.id.max() + 1).astype(np.int32),
-        kind=tracks.agent_type[rows],
+        agent_type=tracks.agent_type[rows],
         size_lwh_m=tracks.size_lwh_m[rows, scene.now],
         xyz_m=np.where(valid[..., None], xyz_m, 0).astype(np.float32),
         heading_rad=np.where(valid, heading_rad, 0).astype(np.float32),

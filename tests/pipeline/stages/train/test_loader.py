@@ -80,7 +80,7 @@ def test_noise_is_the_same_whoever_makes_it_and_never_in_held_out_scenes(
         assert torch.equal(logged.presence, parts[0].agents.presence)
         assert not torch.equal(logged.label, parts[0].agents.label)
     (validation_split,) = validation_batches(setup.validation_split, setup.limits, 9, 0, 9)
-    assert torch.equal(validation_split.agents.label, validation_split.agents.move)
+    assert torch.equal(validation_split.agents.label, validation_split.agents.motion_token)
 
 
 @pytest.mark.parametrize("workers", [0, 1])
