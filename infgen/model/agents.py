@@ -159,7 +159,7 @@ def _last_motion(agents: AgentRows) -> Tensor:
     away_m = agents.pose[:, :2] - agents.before[:, :2]
     length_m = away_m.square().sum(dim=-1).sqrt()
     turned_rad = direction(away_m, agents.pose[:, 2])
-    entering = agents.presence == Presence.INSERTED
+    entering = agents.presence == int(Presence.INSERTED)
     length_m = torch.where(agents.known, length_m, UNKNOWN_M)
     length_m = torch.where(entering, ENTERING_M, length_m)
     turned_rad = torch.where(agents.known & ~entering, turned_rad, 0.0)

@@ -126,7 +126,7 @@ class Stepper:
         motion = self.network.motion
         visible = token_step.visible
         rows = Rows.where(visible)
-        memory.visible &= (token_step.presence != Presence.INSERTED)[..., None]
+        memory.visible &= (token_step.presence != int(Presence.INSERTED))[..., None]
         x = self._embed(*memory.last(), token_step, rows)
         sight = self._context(memory, token_step, rows)
         x = x if sight.light is None else x + sight.light
@@ -270,7 +270,7 @@ class Stepper:
         if cell_features is None:
             return None
         row = torch.arange(token_step.presence.numel(), device=token_step.pose.device)
-        there = token_step.visible & (token_step.presence != Presence.INSERTED)
+        there = token_step.visible & (token_step.presence != int(Presence.INSERTED))
         features = entries.raw.flatten(0, 1)
         lying = CellSources(
             features, row.view_as(token_step.presence), token_step.pose, there

@@ -38,7 +38,7 @@ class TokenStep:
     @property
     def visible(self) -> Bool[Tensor, "rollout row"]:
         """Rows that others see: observed, or just inserted."""
-        return self.observed | (self.presence == Presence.INSERTED)
+        return self.observed | (self.presence == int(Presence.INSERTED))
 
     def take(self, rollouts: Int64[Tensor, " kept"]) -> "TokenStep":
         """Go on with some rollouts only."""

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from infgen.clock import CLOCK
 from infgen.geometry import wrap_angle
-from infgen.model.batching.batch import MapTokens, collate_maps
+from infgen.model.batching.batch import MapTokens, collate_maps, to_device
 from infgen.model.relations import Rows
 from infgen.model.signal_features import StopLines
 from infgen.model.step_memory import StepMemory
@@ -384,8 +384,10 @@ def _start(
     """Encode every map once, however many rollouts of it there are."""
     maps, scene = number_maps(starts)
     histories = [start.history for start in maps]
+    # The stall rule, which runs on the host, keeps the maps that are given.
+    here = to_device(roads, simulator.device)
     memory = simulator.stepper.begin(
-        roads, simulator.tensor(scene), first.agent_number.shape[1]
+        here, simulator.tensor(scene), first.agent_number.shape[1]
     )
     settings, insertion_mask = simulator.settings, None
     if settings.insertion_mask:

@@ -88,6 +88,5 @@ def _restore_optimiser(training: TrainingState, tensors: dict[str, Tensor]) -> N
     for key, value in tensors.items():
         name, what = key.rsplit("/", 1)
         parameter = parameters[name]
-        # The count of steps stays on the CPU, as the optimiser itself keeps it.
-        kept = value if what == "step" else value.to(parameter.device)
-        training.optimiser.state[parameter][what] = kept
+        # Fused AdamW keeps the count of steps on the device, too.
+        training.optimiser.state[parameter][what] = value.to(parameter.device)

@@ -94,7 +94,7 @@ class Agents:
     @property
     def visible(self) -> Bool[Tensor, "scene token agent"]:
         """Whether others can see the agent: it is observed, or just entering."""
-        return self.observed | (self.presence == Presence.INSERTED)
+        return self.observed | (self.presence == int(Presence.INSERTED))
 
 
 @dataclass(frozen=True, slots=True)

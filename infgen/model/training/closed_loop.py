@@ -136,7 +136,7 @@ def _cells(played: Agents, logged: Agents, off: Tensor, token: int, grid: Grid) 
     pose, old = played.pose[:, token].numpy(force=True), logged.cell[:, token]
     found = encode_cell(to_grid(pose[..., :2], pose[:, EGO, None]), grid)
     new = torch.from_numpy(found).to(old)
-    entering = logged.presence[:, token] == Presence.INSERTED
+    entering = logged.presence[:, token] == int(Presence.INSERTED)
     lost = entering & ((old == NO_CELL) | (new == NO_CELL))
     told = logged.visible[:, token] & (off[:, token] | off[:, token, EGO, None])
     return torch.where(told & ~lost, new, old)

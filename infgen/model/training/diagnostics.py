@@ -40,7 +40,7 @@ def decisions(outputs: Outputs, batch: Batch) -> dict[str, tuple[Tensor, Tensor]
     rows, remove_logit = outputs.motion.rows, outputs.motion.remove_logit
     if remove_logit is not None:
         mask = rows.pack(stay_mask(batch.agents))
-        leaves = rows.pack(batch.agents.presence.roll(-1, dims=1) == Presence.REMOVED)
+        leaves = rows.pack(batch.agents.presence.roll(-1, dims=1) == int(Presence.REMOVED))
         found["keep"] = (remove_logit[mask].sigmoid(), leaves[mask])
     if outputs.entries is not None:
         asked, add_logit = outputs.entries.rows, outputs.entries.add_logit

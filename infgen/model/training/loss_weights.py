@@ -46,7 +46,7 @@ def supervised(batch: Batch, settings: TrainSettings) -> Tensor:
 def _motion(batch: Batch, settings: TrainSettings) -> Tensor:
     """Weights of motion tokens; the first one of an inserted agent counts more."""
     mask = motion_mask(batch.agents)
-    first = batch.agents.presence == Presence.INSERTED
+    first = batch.agents.presence == int(Presence.INSERTED)
     first[:, 0] = False
     return mask.sum() + (settings.first_motion_weight - 1) * (mask & first).sum()
 

@@ -122,7 +122,7 @@ def motion_mask(agents: Agents) -> Tensor:
     is learned at the edges of a gap; entering counts as observed for the token that follows
     it.
     """
-    entering = agents.presence == Presence.INSERTED
+    entering = agents.presence == int(Presence.INSERTED)
     there = agents.observed
     known = _next(agents.label, -1) >= 0
     mask = known & _next(there, False)
@@ -144,8 +144,8 @@ def stay_mask(agents: Agents) -> Tensor:
 def pattern_mask(agents: Agents) -> Tensor:
     """Tell which tokens [scene, token, agent] the agent goes on living after."""
     following = _next(agents.presence, int(Presence.ABSENT))
-    goes_on = (following == Presence.PRESENT) | (following == Presence.REMOVED)
-    return agents.visible & (agents.presence != Presence.REMOVED) & goes_on
+    goes_on = (following == int(Presence.PRESENT)) | (following == int(Presence.REMOVED))
+    return agents.visible & (agents.presence != int(Presence.REMOVED)) & goes_on
 
 
 def _next(values: Tensor, last: int | bool) -> Tensor:
@@ -162,7 +162,7 @@ def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> 
     rows = outputs.rows
     mask = rows.pack(motion_mask(agents))
     weight = torch.ones(agents.motion_token.shape, device=mask.device)
-    entering = agents.presence[:, 1:] == Presence.INSERTED
+    entering = agents.presence[:, 1:] == int(Presence.INSERTED)
     weight[:, 1:][entering] = settings.first_motion_weight  # At token 0 nobody comes in.
     target = rows.pack(_next(agents.label, -1))
     return _choice(
@@ -176,7 +176,7 @@ def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> 
 def _stay(rows: Rows, remove_logit: Tensor, agents: Agents) -> Term:
     mask = rows.pack(stay_mask(agents))
     following = rows.pack(_next(agents.presence, int(Presence.ABSENT)))
-    return _event(remove_logit[mask], following[mask] == Presence.REMOVED)
+    return _event(remove_logit[mask], following[mask] == int(Presence.REMOVED))
 
 
 def _pattern(rows: Rows, pattern_logits: Tensor, agents: Agents) -> Term:

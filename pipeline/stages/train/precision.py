@@ -28,7 +28,7 @@ class Pass:
         self._hidden_roads = settings.map_weight > 0
         self.bf16 = _wants_bf16(settings.precision, self._device)
         self._compiled: Callable[..., Outputs] | None = None
-        if _wants_compiled(settings.compile, self._device):
+        if settings.compile == "true":
             self._compiled = torch.compile(network, dynamic=True)
 
     @property
@@ -52,9 +52,11 @@ class Pass:
 
     def _forward(self, batch: Batch) -> Outputs:
         if self._compiled is not None:
+            from torch._dynamo.exc import TorchDynamoException  # noqa: PLC0415
+
             try:
                 return self._compiled(batch, hidden_roads=self._hidden_roads)
-            except RuntimeError as error:  # All of the compiler's errors are.
+            except TorchDynamoException as error:  # Not a GPU that is out of memory.
                 self._compiled = None
                 why = str(error).strip().splitlines()[0]
                 warnings.warn(f"going on without compiling: {why}", stacklevel=2)
@@ -72,6 +74,3 @@ def _wants_bf16(precision: str, device: torch.device) -> bool:
         return device.type == "cuda" and torch.cuda.is_bf16_supported()
     return precision == "bf16"
 
-
-def _wants_compiled(choice: str, device: torch.device) -> bool:
-    return device.type == "cuda" if choice == "auto" else choice == "true"

@@ -1,0 +1,233 @@
+"""What is done on the stand-in device, each in a process of its own.
+
+``python -m tests.standin.cases NAME [ARGUMENTS]`` prints what it found as one line of JSON.
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from pathlib import Path
+from typing import Any
+
+from tests.standin.device import StandIn, Tally, counted, set_up
+
+DEVICE = set_up()
+
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+
+from infgen.config import ModelSettings, RolloutSettings, TokenSettings, TrainSettings  # noqa: E402
+from infgen.model.stepping import Stepper  # noqa: E402
+from infgen.model.training.losses import losses  # noqa: E402
+from infgen.pretrained import builtin_weights  # noqa: E402
+from infgen.rollout.recording import Frame, RolloutStart  # noqa: E402
+from infgen.rollout.session import Session  # noqa: E402
+from infgen.rollout.simulator import Simulator  # noqa: E402
+from infgen.scene import Scene  # noqa: E402
+from infgen.sources.towns import builtin_records  # noqa: E402
+from infgen.sources.womd import iter_scenes  # noqa: E402
+from infgen.tokens.tokenizer import tokenize_scene  # noqa: E402
+from pipeline.stages.train import setup  # noqa: E402
+from pipeline.stages.train.loader import TokenScenes  # noqa: E402
+from pipeline.stages.train.optimizer_step import OptimizerStep, StepResult  # noqa: E402
+from pipeline.stages.train.process_group import ProcessGroup  # noqa: E402
+from pipeline.stages.train.setup import TrainingSetup  # noqa: E402
+from pipeline.stages.vocabulary import load_vocabularies  # noqa: E402
+from pipeline.storage.checkpoint import (  # noqa: E402
+    TrainingState,
+    load_checkpoint,
+    save_checkpoint,
+)
+from pipeline.storage.weights import load_network  # noqa: E402
+
+CPU = torch.device("cpu")
+RULES = {
+    "max_motion_samples": 8,
+    "reject_off_road": True,
+    "max_stall_s": 2.0,
+    "density_control": 1.0,
+}
+Found = dict[str, Any]
+
+
+def town() -> Scene:
+    """The first built-in scene held out."""
+    path = next(path for path in builtin_records() if "validation" in path.name)
+    scene = next(iter(iter_scenes(path)))
+    assert isinstance(scene, Scene)
+    return scene
+
+
+def session(device: torch.device, count: int, settings: dict[str, Any]) -> Session:
+    """Start rollouts of a town with the package's weights."""
+    network = load_network(builtin_weights()).to(device).eval()
+    how = RolloutSettings(**{"seconds": 4.0, "batch_rollouts": count, **settings})
+    simulator = Simulator(
+        Stepper(network),
+        network.motion_vocabulary(),
+        network.map_vocabulary(),
+        network.grid_settings,
+        how,
+        device,
+    )
+    scene = town()
+    history = tokenize_scene(
+        scene, simulator.vocabulary, simulator.roads, simulator.tokens, until=scene.now
+    )
+    starts = [RolloutStart(scene, history, at, how.seed) for at in range(count)]
+    return Session(simulator, starts)
+
+
+def same(one: Frame, other: Frame) -> bool:
+    """Whether two frames are equal, bit for bit."""
+    fields = one.__dataclass_fields__
+    return all(
+        np.array_equal(getattr(one, name), getattr(other, name)) for name in fields
+    )
+
+
+def rollout(mode: str, rules: str, steps: str = "3") -> Found:
+    """Token steps on both devices, and what one of them would cost."""
+    settings = {"mode": mode, **(RULES if rules == "rules" else {})}
+    plain = session(CPU, 3, settings)
+    with StandIn():
+        ours = session(DEVICE, 3, settings)
+        equal, tally = [], Tally()
+        for _ in range(int(steps)):
+            with counted() as tally:
+                frame = ours.step()
+            equal.append(same(frame, plain.step()))
+    return {"equal": equal, **costs(tally)}
+
+
+def costs(tally: Tally) -> Found:
+    """Counts of a tally, and its dearest lines."""
+    return {
+        "kernels": sum(tally.kernels.values()),
+        "waits": sum(tally.waits.values()),
+        "words": tally.words(),
+    }
+
+
+TINY = ModelSettings(
+    width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4,
+    dropout=0.0,
+)  # fmt: skip
+FEATURES = {
+    "cell_feature_width": 8,
+    "motion_feature_width": 8,
+    "ego_embedding": True,
+    "map_agent_lookahead_m": 10.0,
+    "map_agent_lateral_offset": True,
+    "signals_each_step": True,
+    "signal_ahead_m": 40.0,
+}
+VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "paper": ({}, {}),
+    "features": (FEATURES, {"motion_noise_neighbours": 5, "map_noise_neighbours": 3}),
+    "closed-loop": (FEATURES, {"closed_loop_top_k": 4}),
+    "accumulated": ({}, {"gradient_accumulation": 2}),
+    "smart": ({"insertion_and_removal": False}, {}),
+    "no-remove-token": ({"remove_token": False}, {}),
+    "no-position-token": ({"position_token": False}, {}),
+    "no-heading-token": ({"heading_token": False}, {}),
+    "patterns": ({"insertion_and_removal": False, "validity_pattern_tokens": True}, {}),
+}
+"""Settings of the model and of training, by name."""
+
+
+def course(shards: Path, name: str) -> TrainingSetup:
+    """What a training loop is given, for one variant."""
+    model, how = VARIANTS[name]
+    return TrainingSetup(
+        replace(TINY, **model),
+        TrainSettings(**{"batch_scenes": 2, "steps": 4, "warmup_steps": 1, **how}),
+        TokenSettings(grid_radius_m=60.0, grid_cell_m=4.0),
+        TokenScenes([shards / "training"]),
+        [],
+        shards,
+    )
+
+
+def begun(given: TrainingSetup, device: torch.device) -> TrainingState:
+    """Begin training on a device."""
+    setup.own_device = lambda: device
+    return setup.begin(given, *load_vocabularies(given.folder / "vocab"))
+
+
+def taken(given: TrainingSetup, state: TrainingState, steps: range) -> StepResult:
+    """Do some optimizer steps; return the last one's losses."""
+    parts = given.train.gradient_accumulation
+    stepper = OptimizerStep(state, given.train, ProcessGroup(), parts)
+    recipe = given.recipe(ProcessGroup())
+    for step in steps:
+        found = stepper.step(recipe[step], range(parts), step)
+    return found
+
+
+def training(shards: str, name: str) -> Found:
+    """Two optimizer steps on both devices."""
+    given = course(Path(shards), name)
+    plain = begun(given, CPU)
+    expected = taken(given, plain, range(2))
+    with StandIn():
+        state = begun(given, DEVICE)
+        taken(given, state, range(1))
+        with counted() as tally:
+            found = taken(given, state, range(1, 2))
+        ours = {key: float(term.loss) for key, term in found.terms.items()}
+        moved = {key: p.detach().cpu() for key, p in state.network.named_parameters()}
+    theirs = {key: float(term.loss) for key, term in expected.terms.items()}
+    apart = [
+        float((moved[key] - p.detach()).abs().max())
+        for key, p in plain.network.named_parameters()
+    ]
+    return {"ours": ours, "theirs": theirs, "apart": max(apart), **costs(tally)}
+
+
+def resuming(shards: str, folder: str) -> Found:
+    """Save, load, go on: as if training had never stopped."""
+    given = course(Path(shards), "paper")
+    with StandIn():
+        state = begun(given, DEVICE)
+        taken(given, state, range(2))
+        save_checkpoint(Path(folder), state, 2)
+        taken(given, state, range(2, 3))
+        resumed = begun(given, DEVICE)
+        step = load_checkpoint(Path(folder), resumed)
+        devices = {
+            str(value.device)
+            for each in resumed.optimiser.state.values()
+            for value in each.values()
+        }
+        taken(given, resumed, range(step, step + 1))
+        pairs = zip(state.network.parameters(), resumed.network.parameters(), strict=True)
+        equal = all(torch.equal(one, other) for one, other in pairs)
+    return {"devices": sorted(devices), "equal": equal, "step": step}
+
+
+def compiled(shards: str, name: str) -> Found:
+    """The network traced by the compiler, but not compiled, against the network itself."""
+    given = course(Path(shards), name)
+    network = begun(given, CPU).network
+    batch = given.recipe(ProcessGroup())[0][0]
+    traced = torch.compile(network, dynamic=True, backend="eager")
+    plain = losses(network(batch, hidden_roads=True), batch, given.train)
+    found = losses(traced(batch, hidden_roads=True), batch, given.train)
+    return {
+        "ours": {key: float(term.loss) for key, term in found.items()},
+        "theirs": {key: float(term.loss) for key, term in plain.items()},
+    }
+
+
+CASES: dict[str, Callable[..., Found]] = {
+    "compiled": compiled,
+    "resuming": resuming,
+    "rollout": rollout,
+    "training": training,
+}
+
+if __name__ == "__main__":
+    print(json.dumps(CASES[sys.argv[1]](*sys.argv[2:])))  # noqa: T201
