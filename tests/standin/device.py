@@ -20,6 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
+from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 NAME = "standin"
@@ -43,7 +44,8 @@ _WAITING = {
     "unique_consecutive", "unique_dim", "is_nonzero", "equal", "_linalg_check_errors", "bincount",
 }  # fmt: skip
 """Operations whose result the host needs before it can go on."""
-_FACTORIES = ("device",)
+_RESHAPING = {"squeeze_", "unsqueeze_", "t_", "transpose_", "swapaxes_", "as_strided_"}
+"""Operations that change a shape in place."""
 
 
 @dataclass
@@ -182,6 +184,8 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if wanted is not None:
         kwargs = {**kwargs, "device": torch.device("cpu")}
     _count(name, args)
+    if name in _RESHAPING:
+        return _reshape(func, args, kwargs)
     plain_args, plain = pytree.tree_map(_unwrap, (args, kwargs))
     found = func(*plain_args, **plain)
     if name in ("_local_scalar_dense", "equal", "is_nonzero", "item"):
@@ -192,6 +196,19 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     return pytree.tree_map(
         lambda x: _wrap(x, written) if isinstance(x, Tensor) else x, found
     )
+
+
+def _reshape(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    """Change the shape of a tensor in place: of its values, and of what it says of itself."""
+    func(_unwrap(args[0]), *args[1:], **kwargs)
+    with no_dispatch():
+        before = torch._C._meta_in_tls_dispatch_include()
+        torch._C._set_meta_in_tls_dispatch_include(True)
+        try:
+            func(*args, **kwargs)
+        finally:
+            torch._C._set_meta_in_tls_dispatch_include(before)
+    return args[0]
 
 
 def _unwrap(x: Any) -> Any:
