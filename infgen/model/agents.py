@@ -190,10 +190,9 @@ class MotionBlock(nn.Module):
 
     def __init__(self, settings: ModelSettings) -> None:
         super().__init__()
-        width, heads, dropout = settings.width, settings.heads, settings.dropout
-        self.past = Attention(width, heads, dropout, bipartite=False)
-        self.roads = Attention(width, heads, dropout, bipartite=True)
-        self.agents = Attention(width, heads, dropout, bipartite=False)
+        self.past = Attention(settings, bipartite=False)
+        self.roads = Attention(settings, bipartite=True)
+        self.agents = Attention(settings, bipartite=False)
 
     def forward(self, x_ND: Tensor, past: AttentionSources, sight: AgentContext) -> Tensor:
         """Update agents; ``past`` are they themselves at earlier tokens."""
@@ -210,20 +209,17 @@ class MotionStack(nn.Module):
         self, settings: ModelSettings, vocabulary: MotionVocabulary, token_s: float
     ) -> None:
         super().__init__()
-        width, bands = settings.width, settings.fourier_bands
+        width = settings.width
         window = settings.temporal_window_tokens
         far_m = MAX_SPEED_MPS * token_s * window
         self.settings = settings
-        self.past_relation = relation_embedding(far_m, bands, width, window)
+        self.past_relation = relation_embedding(far_m, settings, window)
         self.roads_relation = relation_embedding(
             settings.map_agent_radius_m + settings.map_agent_lookahead_m,
-            bands,
-            width,
+            settings,
             across=settings.map_agent_lateral_offset,
         )
-        self.agents_relation = relation_embedding(
-            settings.agent_agent_radius_m, bands, width
-        )
+        self.agents_relation = relation_embedding(settings.agent_agent_radius_m, settings)
         self.blocks = nn.ModuleList(
             MotionBlock(settings) for _ in range(settings.motion_blocks)
         )

@@ -26,9 +26,8 @@ class QueryBlock(nn.Module):
 
     def __init__(self, settings: ModelSettings) -> None:
         super().__init__()
-        width, heads, dropout = settings.width, settings.heads, settings.dropout
-        self.roads = Attention(width, heads, dropout, bipartite=True)
-        self.agents = Attention(width, heads, dropout, bipartite=True)
+        self.roads = Attention(settings, bipartite=True)
+        self.agents = Attention(settings, bipartite=True)
 
     def forward(
         self, x: Tensor, roads: AttentionSources, agents: AttentionSources
@@ -48,17 +47,15 @@ class CellStack(nn.Module):
 
     def __init__(self, settings: ModelSettings, grid: Grid) -> None:
         super().__init__()
-        width, bands = settings.width, settings.fourier_bands
+        width = settings.width
         self.settings = settings
         self.num_cells = grid.num_cells
         self.radius_m = grid.radius_m
         self.query = nn.Embedding(1, width)
         self.occupancy = mlp(grid.num_cells, width, width)
-        self.roads_relation = relation_embedding(
-            settings.position_query_radius_m, bands, width
-        )
+        self.roads_relation = relation_embedding(settings.position_query_radius_m, settings)
         self.agents_relation = relation_embedding(
-            settings.position_query_radius_m, bands, width
+            settings.position_query_radius_m, settings
         )
         self.blocks = nn.ModuleList(
             QueryBlock(settings) for _ in range(settings.scene_blocks)
@@ -148,19 +145,15 @@ class DetailStack(nn.Module):
 
     def __init__(self, settings: ModelSettings, grid: Grid) -> None:
         super().__init__()
-        width, bands = settings.width, settings.fourier_bands
+        width = settings.width
         self.settings = settings
         self.reach_m = OFFSET_REACH_STEPS * grid.step_m
         centre_m = torch.from_numpy(grid.centre_m.copy())
         self.register_buffer("centre_m", centre_m, persistent=False)
         self.query = nn.Embedding(1, width)
         self.cells = embedding_mlp(2, width)
-        self.roads_relation = relation_embedding(
-            settings.heading_query_radius_m, bands, width
-        )
-        self.agents_relation = relation_embedding(
-            settings.heading_query_radius_m, bands, width
-        )
+        self.roads_relation = relation_embedding(settings.heading_query_radius_m, settings)
+        self.agents_relation = relation_embedding(settings.heading_query_radius_m, settings)
         self.blocks = nn.ModuleList(
             QueryBlock(settings) for _ in range(settings.scene_blocks)
         )

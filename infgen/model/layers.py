@@ -1,7 +1,7 @@
 """Small parts the network is built from.
 
-Shape letters: N targets, S slots of one target, K neighbours of a target, D width, H heads,
-C width of one head, F scalars, P nodes of a table.
+Shape letters: N targets, S slots of one target, K neighbours of a target, D width, R width
+of relations, H heads, C width of one head, F scalars, P nodes of a table.
 """
 
 import math
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from infgen.model.neighbour_attention import Shared, attend_to_pairs
+from infgen.model.settings import ModelSettings
 
 FEED_FORWARD = 4
 """The feed-forward part is so many times as wide as the features."""
@@ -116,7 +117,7 @@ class AttentionSources:
     Attributes:
         features: Normed features of all sources [M, D].
         index: Row of each neighbour among them [N, K].
-        relation: Normed features of how neighbours stand to their target [N, K, D].
+        relation: Normed features of how neighbours stand to their target [N, K, R].
         present: Which neighbours there are: [N, K], or [N, S, K] if slots differ.
     """
 
@@ -153,20 +154,20 @@ class Attention(nn.Module):
     still passes the gate and the feed-forward.
     """
 
-    def __init__(self, width: int, heads: int, dropout: float, *, bipartite: bool) -> None:
+    def __init__(self, settings: ModelSettings, *, bipartite: bool) -> None:
         super().__init__()
-        if width % heads:
-            raise ValueError(f"width {width} does not divide into {heads} heads")
+        width, heads, dropout = settings.width, settings.heads, settings.dropout
+        relation_width = settings.relation_features
         self.heads = heads
         self.dropout = dropout
         self.norm_target = nn.LayerNorm(width)
         self.norm_source = nn.LayerNorm(width) if bipartite else None
-        self.norm_relation = nn.LayerNorm(width)
+        self.norm_relation = nn.LayerNorm(relation_width)
         self.query = nn.Linear(width, width)
         self.key = nn.Linear(width, width, bias=False)
         self.value = nn.Linear(width, width)
-        self.relation_key = nn.Linear(width, width, bias=False)
-        self.relation_value = nn.Linear(width, width, bias=False)
+        self.relation_key = nn.Linear(relation_width, width, bias=False)
+        self.relation_value = nn.Linear(relation_width, width, bias=False)
         self.gate = nn.Linear(2 * width, width)
         self.itself = nn.Linear(width, width)
         self.out = nn.Linear(width, width)
@@ -212,7 +213,7 @@ class Attention(nn.Module):
             self._kept(query.flatten(1, 2), hidden.shape[-1]),
         )
         from_source = looked.features.view(*heads, width)
-        from_relation = looked.relation.view(*heads, width)
+        from_relation = looked.relation.view(*heads, looked.relation.shape[-1])
         value = torch.einsum("nshd,hcd->nshc", from_source, source[1])
         value = value + torch.einsum("nshd,hcd->nshc", from_relation, relation[1])
         bias = self._value_bias().view(self.heads, -1)  # [H, C]
@@ -230,7 +231,7 @@ class Attention(nn.Module):
         return self.norm_target if self.norm_source is None else self.norm_source
 
     def _folded(self) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """Key and value weights [H, C, D] of source and relation, gains folded in."""
+        """Key and value weights [H, C, D or R] of source and relation, gains folded in."""
 
         def fold(linear: nn.Linear, norm: nn.LayerNorm) -> Tensor:
             return (linear.weight * norm.weight).view(self.heads, -1, len(norm.weight))

@@ -52,10 +52,9 @@ class MapEncoder(nn.Module):
         self.line_kind = nn.Embedding(len(PolylineType), width)
         looks = len(SignalClass) + (REMEMBERED if self.signals_each_step else 0)
         self.signal = nn.Embedding(looks, width)
-        self.relation = relation_embedding(self.radius_m, settings.fourier_bands, width)
+        self.relation = relation_embedding(self.radius_m, settings)
         self.blocks = nn.ModuleList(
-            Attention(width, settings.heads, settings.dropout, bipartite=False)
-            for _ in range(settings.map_blocks)
+            Attention(settings, bipartite=False) for _ in range(settings.map_blocks)
         )
         self.next_token = mlp(width, width, vocabulary.num_map_tokens)
 

@@ -30,7 +30,7 @@ class Shared:
     """A tensor that many layers read, and the one sum of their gradients.
 
     Attributes:
-        values: The tensor, without a gradient of its own [N, K, D].
+        values: The tensor, without a gradient of its own [N, K, R].
         ticket: Stands for it in the graph: it depends on every layer that reads the values
             through it, so their gradients are complete when its own arrives.
         pulled: Where layers add their gradients to.
@@ -83,7 +83,7 @@ class AttentionResult(NamedTuple):
 
     Attributes:
         features: Neighbours' features summed by weight [N, Q, D].
-        relation: Their relations summed by weight [N, Q, D].
+        relation: Their relations summed by weight [N, Q, R].
         weight: Sum of the weights [N, Q]: 1, but for dropout, or 0 without neighbours.
     """
 
@@ -105,10 +105,10 @@ def attend_to_pairs(
 
     Args:
         by_features: Queries for features [N, Q, D]; the score is the sum of both products.
-        by_relation: Queries for relations [N, Q, D].
+        by_relation: Queries for relations [N, Q, R].
         features: Of all sources [M, D].
         index: Row of each neighbour among them [N, K].
-        relation: Of the neighbours [N, K, D].
+        relation: Of the neighbours [N, K, R].
         hidden: Which neighbours there are not [N, Q, K], or [N, 1, K] for all queries.
         kept: Factor on each weight for dropout [N, Q, K], or None.
     """
@@ -161,7 +161,7 @@ class _Pairs(torch.autograd.Function):
         learns = any(ctx.needs_input_grad)
         weight = by_features.new_empty(shape if learns else (0, *shape[1:]))
         total = by_features.new_empty(shape[:2])
-        saw, related = torch.empty_like(by_features), torch.empty_like(by_features)
+        saw, related = torch.empty_like(by_features), torch.empty_like(by_relation)
         cover = _Cover.of(hidden, by_features)
         for part, near in _parts(features, index):
             score = torch.baddbmm(

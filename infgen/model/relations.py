@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from infgen.model.relation_tables import RelationEmbedding, Span
+from infgen.model.settings import ModelSettings
 
 BLOCK_PAIRS = 1 << 17
 """Distances held at once while neighbours are searched."""
@@ -217,8 +218,7 @@ def across(
 
 def relation_embedding(
     radius_m: float,
-    bands: int,
-    width: int,
+    settings: ModelSettings,
     past_tokens: int = 0,
     *,
     across: bool = False,
@@ -227,8 +227,7 @@ def relation_embedding(
 
     Args:
         radius_m: Largest distance that its table resolves.
-        bands: Frequencies per scalar.
-        width: Of the features.
+        settings: Frequencies per scalar, and the width of the features.
         past_tokens: If not 0, relations end in a time difference of -1 to so many tokens.
         across: Whether they end in ``across``.
     """
@@ -240,4 +239,4 @@ def relation_embedding(
         spans.append(Span(-float(past_tokens), 0.0, past_tokens + 1))
     if across:
         spans.append(Span(-radius_m, radius_m, 2 * nodes - 1))
-    return RelationEmbedding(spans, bands, width)
+    return RelationEmbedding(spans, settings.fourier_bands, settings.relation_features)

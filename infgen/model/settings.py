@@ -20,6 +20,9 @@ class ModelSettings:
     """Blocks of the motion stack."""
     scene_blocks: Count = 3
     """Blocks of the scene stack."""
+    relation_width: Count = 0
+    """Width of the features of relative poses, which cost most of all: there are as many
+    as pairs of neighbours; 0 for that of all other features, as in the paper."""
     fourier_bands: AtLeastOne = 64
     """Learned frequencies per scalar."""
     dropout: Share = 0.1
@@ -85,6 +88,11 @@ class ModelSettings:
     signal_ahead_m: NonNegative = 0.0
     """Every agent sees the signal of its own lane up to so far ahead, and how long it has
     shown that; 0 to see it only among all other map tokens."""
+
+    @property
+    def relation_features(self) -> int:
+        """Width of the features of relative poses."""
+        return self.relation_width or self.width
 
     @model_validator(mode="after")
     def _check(self) -> "ModelSettings":

@@ -56,7 +56,7 @@ class Insertions:
         known: ... and rows observed then [rollout, row].
         token_step: The agents so far.
         raw: Normed embeddings of all rows, zero in free rows [rollout, row, D].
-        relation: How all rows stand to the ego [rollout, row, D].
+        relation: How all rows stand to the ego [rollout, row, R].
         within: Which of them the ego's query sees [rollout, row].
         roads: Map tokens around the ego.
         cell_features: Features of the cells around it, if they are used

@@ -176,7 +176,9 @@ class Stepper:
             known=known,
             token_step=nobody,
             raw=raw,
-            relation=torch.zeros_like(raw),
+            relation=raw.new_zeros(
+                (rollouts, rows, self.network.settings.relation_features)
+            ),
             within=within,
             roads=roads,
             cell_features=None,

@@ -102,7 +102,7 @@ class TrainSettings:
     """`float32`; `bf16` for matrix products of half the bits (geometry and losses stay
     float32); `auto` is bf16 on a GPU that has it."""
     compile: Annotated[Literal["auto", "true", "false"], Text] = "auto"
-    """Whether to compile the network; `auto` does not, until it is measured to be faster."""
+    """Whether to compile the network; `auto` does not, until that is measured faster."""
     initial_weights: Annotated[str, NOT_IN_KEY] = ""  # Its fingerprint is a source.
     """Weights to start from: a folder, a key of stage `train`, or `builtin` for those of
     the package; empty for random ones."""

@@ -65,6 +65,7 @@ VARIANTS = {
         "map_agent_lookahead_m": 0.0,
         "map_agent_lateral_offset": False,
     },
+    "narrow relations": {"relation_width": 6},
     "smart with patterns": {
         "insertion_and_removal": False,
         "validity_pattern_tokens": True,

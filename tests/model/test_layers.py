@@ -18,8 +18,10 @@ from infgen.model.layers import (
     normed,
 )
 from infgen.model.neighbour_attention import Shared
+from infgen.model.settings import ModelSettings
 
 WIDTH, HEADS, SOURCES = 16, 2, 9
+SETTINGS = ModelSettings(width=WIDTH, heads=HEADS, dropout=0.0)
 
 
 def plain_attention(layer, target, seen, relation):
@@ -52,19 +54,20 @@ def plain_attention(layer, target, seen, relation):
     return target + layer.feed_forward(target)
 
 
-def make_layer(bipartite):
+def make_layer(bipartite, relation_width=0):
     torch.manual_seed(1)
-    layer = Attention(WIDTH, HEADS, 0.0, bipartite=bipartite)
+    settings = replace(SETTINGS, relation_width=relation_width)
+    layer = Attention(settings, bipartite=bipartite)
     for parameter in layer.parameters():
         parameter.data += 0.2 * torch.randn_like(parameter)
     return layer
 
 
-def make_seen(targets, slots, neighbours):
+def make_seen(targets, slots, neighbours, relation_width=WIDTH):
     torch.manual_seed(2)
     features = normed(torch.randn(SOURCES, WIDTH)).requires_grad_()
     index = torch.randint(SOURCES, (targets, neighbours))
-    relation = normed(torch.randn(targets, neighbours, WIDTH)).requires_grad_()
+    relation = normed(torch.randn(targets, neighbours, relation_width)).requires_grad_()
     present = torch.rand(targets, slots, neighbours) < 0.6
     present[0] = False  # One target sees nobody.
     return AttentionSources(features, index, Shared.of(relation), present), relation
@@ -72,8 +75,12 @@ def make_seen(targets, slots, neighbours):
 
 @pytest.mark.parametrize("bipartite", [False, True])
 @pytest.mark.parametrize("slots", [1, 3])
-def test_factorised_attention_is_the_plain_one_and_so_are_its_gradients(bipartite, slots):
-    layer, (seen, relation) = make_layer(bipartite), make_seen(5, slots, 7)
+@pytest.mark.parametrize("relation_width", [WIDTH, 6])
+def test_factorised_attention_is_the_plain_one_and_so_are_its_gradients(
+    bipartite, slots, relation_width
+):
+    layer = make_layer(bipartite, relation_width)
+    seen, relation = make_seen(5, slots, 7, relation_width)
     target = torch.randn(5, slots, WIDTH, requires_grad=True)
     inputs = [target, seen.features, relation, *layer.parameters()]
 
@@ -153,7 +160,7 @@ def test_what_is_not_present_does_not_matter_whatever_it_holds():
 
 def test_dropout_leaves_the_mean_of_what_is_seen():
     torch.manual_seed(0)
-    layer = Attention(WIDTH, HEADS, 0.5, bipartite=False).train()
+    layer = Attention(replace(SETTINGS, dropout=0.5), bipartite=False).train()
     seen, _ = make_seen(1, 1, 400)
     seen = replace(seen, present=torch.ones(1, 1, 400, dtype=torch.bool))
     target = torch.randn(1, 1, WIDTH)
@@ -163,13 +170,8 @@ def test_dropout_leaves_the_mean_of_what_is_seen():
     torch.testing.assert_close(noisy, layer.eval().look(target, seen), atol=0.05, rtol=0.0)
 
 
-def test_a_width_that_does_not_divide_into_heads_is_refused():
-    with pytest.raises(ValueError, match="width 10 does not divide into 4 heads"):
-        Attention(10, 4, 0.0, bipartite=False)
-
-
 def test_parameters_start_as_the_paper_has_them():
-    layer = Attention(128, 8, 0.1, bipartite=False)
+    layer = Attention(ModelSettings(), bipartite=False)
     layer.apply(initialise)
     embedding = FourierEmbedding(3, 64, 128)
     embedding.apply(initialise)

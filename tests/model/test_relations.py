@@ -17,6 +17,7 @@ from infgen.model.relations import (
     relations,
     within_radius,
 )
+from infgen.model.settings import ModelSettings
 
 
 def line(*x_m):
@@ -135,7 +136,7 @@ def test_across_is_how_far_off_a_lane_one_drives_wherever_the_lane_began():
 
 @pytest.mark.parametrize(("ahead_m", "seen"), [(0.0, {1, 2}), (6.0, {2, 3})])
 def test_who_looks_ahead_sees_what_lies_there_rather_than_behind(ahead_m, seen):
-    relation = relation_embedding(20.0, 2, 8)
+    relation = relation_embedding(20.0, ModelSettings(width=8, fourier_bands=2))
     reach = NeighbourSpec.of(20.0, 2, relation, ahead_m=ahead_m)
     facing = 2.0
     way = torch.tensor([math.cos(facing), math.sin(facing)])
