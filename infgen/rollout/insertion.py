@@ -1,6 +1,6 @@
 """Insertion of agents in one token step, one agent per query of the network."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.token_step import InsertionDetails, PositionOutputs
 from infgen.rollout.insertion_mask import InsertionMask
 from infgen.rollout.population import InsertedAgents, Population, add_inserted
-from infgen.rollout.random_streams import Purpose, Stream
+from infgen.rollout.random_streams import Purpose, Streams
 from infgen.rollout.sampling import choose, sample_event
 from infgen.rollout.simulator import Simulator
 from infgen.tokens.grid import Grid, decode_cell, decode_heading, encode_cell
@@ -37,7 +37,7 @@ class InsertionRequest:
     """
 
     simulator: Simulator
-    streams: Sequence[Stream]
+    streams: Streams
     insertion_mask: InsertionMask | None
     most: Int64[np.ndarray, " rollout"]
     wanted: Float64[np.ndarray, " rollout"] | None = None
@@ -63,7 +63,7 @@ class InsertionRequest:
         )
         return replace(
             self,
-            streams=[self.streams[at] for at in places],
+            streams=self.streams.take(places),
             insertion_mask=insertion_mask,
             most=self.most[places],
             wanted=None if self.wanted is None else self.wanted[places],

@@ -35,7 +35,7 @@ from infgen.rollout.population import (
     place_logged_agents,
     remove_beyond,
 )
-from infgen.rollout.random_streams import Purpose, Stream
+from infgen.rollout.random_streams import Purpose, Streams
 from infgen.rollout.recording import NOBODY, Frame, RolloutStart, number_maps
 from infgen.rollout.rules.density import DensityControl
 from infgen.rollout.rules.rejection import make_motion_check
@@ -69,7 +69,9 @@ class Session:
         """
         starts = [starts] if isinstance(starts, RolloutStart) else list(starts)
         self._simulator = simulator
-        self._streams = [Stream.of(s.seed, s.scene.scenario_id, s.index) for s in starts]
+        self._streams = Streams.of(
+            (start.seed, start.scene.scenario_id, start.index) for start in starts
+        )
         history = place_logged_agents(starts, simulator.settings.max_agents)
         roads = _collate_maps(starts)
         self._memory, self._asking = _start(
@@ -378,7 +380,7 @@ def _start(
     simulator: Simulator,
     roads: MapTokens,
     starts: Sequence[RolloutStart],
-    streams: Sequence[Stream],
+    streams: Streams,
     first: Population,
 ) -> tuple[StepMemory, InsertionRequest]:
     """Encode every map once, however many rollouts of it there are."""

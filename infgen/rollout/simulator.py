@@ -1,6 +1,5 @@
 """What plays rollouts: a network, the words it speaks, and how its choices are sampled."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,7 @@ from torch import Tensor
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import TokenStep
 from infgen.rollout.population import Population
-from infgen.rollout.random_streams import Purpose, Stream, draw_uniforms
+from infgen.rollout.random_streams import Purpose, Streams
 from infgen.rollout.settings import RolloutSettings
 from infgen.tokens.grid import Grid, make_grid
 from infgen.tokens.settings import TokenSettings
@@ -67,14 +66,14 @@ class Simulator:
 
     def draw_uniforms(
         self,
-        streams: Sequence[Stream],
+        streams: Streams,
         token: int,
         purpose: Purpose,
         count: int,
         turn: int = 0,
     ) -> Tensor:
         """Draw [rollout, count] uniform numbers on the network's device."""
-        return self.tensor(draw_uniforms(streams, token, purpose, count, turn))
+        return self.tensor(streams.uniform(token, purpose, count, turn))
 
     def token_step(self, population: Population) -> TokenStep:
         """Show a population to the network."""

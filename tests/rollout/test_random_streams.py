@@ -1,12 +1,16 @@
+import hashlib
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from infgen.rollout.random_streams import Purpose, Stream, draw_uniforms
+from infgen.rollout.random_streams import Purpose, Streams
 
 
 def test_the_same_arguments_always_give_the_same_numbers():
-    first = Stream.of(7, "abc", 3).uniform(5, Purpose.MOTION_TOKEN, 10)
-    again = Stream.of(7, "abc", 3).uniform(5, Purpose.MOTION_TOKEN, 10)
+    first = Streams.of([(7, "abc", 3)]).uniform(5, Purpose.MOTION_TOKEN, 10)
+    again = Streams.of([(7, "abc", 3)]).uniform(5, Purpose.MOTION_TOKEN, 10)
 
     np.testing.assert_array_equal(first, again)
 
@@ -25,31 +29,53 @@ def test_the_same_arguments_always_give_the_same_numbers():
 def test_every_part_of_the_key_changes_the_numbers(
     seed, scene, index, token, purpose, turn
 ):
-    known = Stream.of(7, "abc", 3).uniform(5, Purpose.MOTION_TOKEN, 100)
-    other = Stream.of(seed, scene, index).uniform(token, purpose, 100, turn)
+    known = Streams.of([(7, "abc", 3)]).uniform(5, Purpose.MOTION_TOKEN, 100)
+    other = Streams.of([(seed, scene, index)]).uniform(token, purpose, 100, turn)
 
     assert not np.isin(known, other).any()
 
 
 def test_a_longer_draw_starts_with_the_shorter_one():
-    stream = Stream.of(0, "abc", 0)
+    stream = Streams.of([(0, "abc", 0)])
 
     np.testing.assert_array_equal(
-        stream.uniform(1, Purpose.MOTION_TOKEN, 128)[:16],
+        stream.uniform(1, Purpose.MOTION_TOKEN, 128)[:, :16],
         stream.uniform(1, Purpose.MOTION_TOKEN, 16),
     )
 
 
 def test_draws_of_a_batch_are_those_of_its_members():
-    streams = [Stream.of(0, "abc", index) for index in range(3)]
+    names = [(0, "abc", index) for index in range(3)]
 
-    batch = draw_uniforms(streams, 4, Purpose.ADD, 2)
+    batch = Streams.of(names).uniform(4, Purpose.ADD, 2)
 
-    np.testing.assert_array_equal(batch[1], streams[1].uniform(4, Purpose.ADD, 2))
+    alone = Streams.of(names[1:2]).uniform(4, Purpose.ADD, 2)
+    np.testing.assert_array_equal(batch[1:2], alone)
+    np.testing.assert_array_equal(
+        Streams.of(names).take(np.array([1])).uniform(4, Purpose.ADD, 2), alone
+    )
+
+
+@given(
+    index=st.integers(0, 2**31),
+    token=st.integers(0, 2**31),
+    purpose=st.sampled_from(Purpose),
+    turn=st.integers(0, 2**31),
+    count=st.integers(1, 20),
+)
+def test_numbers_are_those_of_the_generator_of_numpy(index, token, purpose, turn, count):
+    digest = hashlib.sha256(f"7/abc/{index}".encode()).digest()[:16]
+    generator = np.random.Philox(
+        key=int.from_bytes(digest, "little"), counter=[0, turn, token, int(purpose)]
+    )
+
+    numbers = Streams.of([(7, "abc", index)]).uniform(token, purpose, count, turn)
+
+    np.testing.assert_array_equal(numbers[0], np.random.Generator(generator).random(count))
 
 
 def test_numbers_are_even():
-    numbers = Stream.of(0, "even", 0).uniform(0, Purpose.MOTION_TOKEN, 100_000)
+    numbers = Streams.of([(0, "even", 0)]).uniform(0, Purpose.MOTION_TOKEN, 100_000)
 
     counts, _ = np.histogram(numbers, bins=10, range=(0, 1))
     assert abs(counts - 10_000).max() < 500
