@@ -7,13 +7,13 @@ would find.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from infgen.model.relations import BLOCK_PAIRS, Neighbours, nearest_listed
+from infgen.model.relations import Neighbours, block_length, nearest_listed
 
 SIDE_M = 10.0
 """Of a square."""
@@ -31,6 +31,7 @@ class MapGrid:
         start: Where each square's tokens begin in ``order``; then their number.
         order: Tokens by square, those that are none last.
         xy_m: Where the tokens are, in their own order.
+        longest: Most tokens of so many consecutive squares, as far as it is known.
     """
 
     corner_m: Float32[Tensor, "scene 2"]
@@ -38,6 +39,7 @@ class MapGrid:
     start: Int64[Tensor, "scene bound"]
     order: Int64[Tensor, "scene road"]
     xy_m: Float32[Tensor, "scene road 2"]
+    longest: dict[int, int] = field(default_factory=dict)
 
     @classmethod
     @torch.no_grad()
@@ -85,7 +87,7 @@ class MapGrid:
             empty = scene.new_zeros((1, len(scene), 0))
             return Neighbours(empty, empty.bool())
         across = math.ceil(2 * radius_m / SIDE_M) + 1
-        block = max(1, BLOCK_PAIRS // (across * across * 4))
+        block = block_length(across * across * 4, xy_m.device)
 
         def listed(at: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             part = slice(at, at + block)
@@ -116,12 +118,25 @@ class MapGrid:
         begin = self.start[scene[:, None], first + torch.where(touched, left[:, None], 0)]
         end = self.start[scene[:, None], first + torch.where(touched, right[:, None], 0)]
         length = (end - begin) * touched
-        steps = torch.arange(
-            max(1, int(length.max())) if len(row) else 1, device=row.device
-        )
+        longest = self._longest(length, most)
+        steps = torch.arange(longest, device=row.device)
         there = steps < length[..., None]  # [target, row, step]
         at = torch.where(there, begin[..., None] + steps, 0).flatten(1)
         return self.order[scene[:, None], at], there.flatten(1)
+
+    def _longest(self, length: Tensor, squares: int) -> int:
+        """Most tokens of one row of so many squares, of those asked for or of the map.
+
+        On a CPU what is asked for is looked at. Elsewhere the host would wait for it at
+        each token step, so there it is the most that any row of any map has.
+        """
+        if length.device.type == "cpu":
+            return max(1, int(length.max())) if length.numel() else 1
+        if squares not in self.longest:
+            ends = self.start[:, min(squares, self.start.shape[1] - 1) :]
+            held = ends - self.start[:, : ends.shape[1]]
+            self.longest[squares] = max(1, int(held.max())) if held.numel() else 1
+        return self.longest[squares]
 
 
 def _squares(away_m: Tensor) -> Tensor:

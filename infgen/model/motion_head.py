@@ -59,12 +59,22 @@ class MotionHead(nn.Module):
     ) -> Tensor:
         """Logits [N, motion_token] of agents, by their features and those of ``table``."""
         wanted = self.wanted(x_ND)
+        if wanted.device.type != "cpu":
+            return self._of_all_types(wanted, agent_type, shapes)
         rows = [(agent_type == each).nonzero()[:, 0] for each in range(len(shapes))]
         parts = [
             torch.addmm(usual.to(wanted.dtype), wanted[row], shape.T)
             for row, shape, usual in zip(rows, shapes, self.usual, strict=True)
         ]
         return torch.cat(parts)[torch.cat(rows).argsort()]
+
+    def _of_all_types(self, wanted: Tensor, agent_type: Tensor, shapes: Tensor) -> Tensor:
+        """The same with three times the work, but without counting each type's agents."""
+        logits = torch.zeros((), dtype=wanted.dtype, device=wanted.device)
+        for each, (shape, usual) in enumerate(zip(shapes, self.usual, strict=True)):
+            own = torch.addmm(usual.to(wanted.dtype), wanted, shape.to(wanted.dtype).T)
+            logits = torch.where((agent_type == each)[:, None], own, logits)
+        return logits
 
 
 def _waves(

@@ -46,9 +46,24 @@ class RelationEmbedding(FourierEmbedding):
     simulation use the same tables, so there is no difference between the two.
     """
 
+    first: Tensor
+    gaps: Tensor
+    per_unit: Tensor
+    starts: Tensor
+
     def __init__(self, spans: Sequence[Span], bands: int, width: int) -> None:
         super().__init__(len(spans), bands, width)
         self.spans = tuple(spans)
+        gaps = torch.tensor([float(span.nodes - 1) for span in spans])
+        length = torch.tensor([span.last - span.first for span in spans])
+        starts = torch.tensor([0, *(span.nodes for span in spans[:-1])]).cumsum(0)
+        for name, values in (
+            ("first", torch.tensor([span.first for span in spans])),
+            ("gaps", gaps),
+            ("per_unit", gaps / length),
+            ("starts", starts),
+        ):
+            self.register_buffer(name, values, persistent=False)
 
     def table(self) -> Tensor:
         """Evaluate all scalars at their nodes: [P, D], one scalar after the other.
@@ -79,15 +94,10 @@ class RelationEmbedding(FourierEmbedding):
 
     def _places(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Say between which nodes relations [N, F] lie: nodes and their shares [N, 2 F]."""
-        first = values.new_tensor([span.first for span in self.spans])
-        gaps = values.new_tensor([span.nodes - 1 for span in self.spans])
-        length = values.new_tensor([span.last - span.first for span in self.spans])
-        position = ((values - first) * (gaps / length)).clamp(min=0).minimum(gaps)
-        lower = position.floor().minimum(gaps - 1)
+        position = ((values - self.first) * self.per_unit).clamp(min=0).minimum(self.gaps)
+        lower = position.floor().minimum(self.gaps - 1)
         share = position - lower
-
-        starts = torch.tensor([0, *(span.nodes for span in self.spans[:-1])])
-        node = lower.long() + starts.cumsum(0).to(values.device)
+        node = lower.long() + self.starts
         return torch.cat([node, node + 1], dim=-1), torch.cat([1 - share, share], dim=-1)
 
 

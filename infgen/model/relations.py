@@ -17,7 +17,9 @@ from infgen.model.relation_tables import RelationEmbedding, Span
 from infgen.model.settings import ModelSettings
 
 BLOCK_PAIRS = 1 << 17
-"""Distances held at once while neighbours are searched."""
+"""Distances held at once on a CPU while neighbours are searched: some of its cache ..."""
+DEVICE_BLOCK_PAIRS = 1 << 26
+"""... and elsewhere, where every block costs launches: some of the memory."""
 SQUARE_PER_M2 = 1024
 """Squared distances are compared in units of 1/1024 m2, so that rounding makes no order."""
 INDEX_BITS = 20
@@ -45,7 +47,7 @@ class Rows:
 
     @classmethod
     def where(cls, real: Bool[Tensor, "..."]) -> "Rows":
-        """Number the true places of a mask in order."""
+        """Number the true places of a mask in order; the host waits for their number."""
         at = real.flatten().nonzero()[:, 0]
         number = torch.zeros(real.numel(), dtype=torch.int64, device=real.device)
         number[at] = torch.arange(len(at), device=real.device)
@@ -92,7 +94,7 @@ def nearest(
         empty = empty.to(target_xy_m.device)
         return Neighbours(empty, empty.bool())
     allowed = allowed.expand(groups, targets, sources)
-    block = max(1, BLOCK_PAIRS // (groups * sources))
+    block = block_length(groups * sources, target_xy_m.device)
     parts = [
         _nearest_keys(
             target_xy_m[:, at : at + block],
@@ -103,7 +105,7 @@ def nearest(
         )
         for at in range(0, targets, block)
     ]
-    return _told(torch.cat(parts, dim=1))
+    return _decode_keys(torch.cat(parts, dim=1))
 
 
 @torch.no_grad()
@@ -130,15 +132,22 @@ def nearest_listed(
         key = square.mul_(1 << INDEX_BITS).add_(position).masked_fill_(hidden, _NOBODY)
         key = functional.pad(key, (0, max(0, count - key.shape[1])), value=_NOBODY)
         keys.append(key.topk(count, dim=-1, largest=False).values)
-    return _told(torch.cat(keys)[None])
+    return _decode_keys(torch.cat(keys)[None])
 
 
-def _told(key: Tensor) -> Neighbours:
+def block_length(pairs: int, device: torch.device) -> int:
+    """How many targets to search at once, by the pairs that each of them makes."""
+    held = BLOCK_PAIRS if device.type == "cpu" else DEVICE_BLOCK_PAIRS
+    return max(1, held // pairs)
+
+
+def _decode_keys(key: Tensor) -> Neighbours:
     """Decode keys [group, target, neighbour] to neighbour rows."""
     present = key < _NOBODY
-    # The rest would be padding for everyone.
-    most = int(present.sum(dim=-1).max()) if key.numel() else 0
-    key, present = key[..., :most], present[..., :most]
+    if key.device.type == "cpu":
+        # The rest would be padding for everyone. Elsewhere the host would wait to know.
+        most = int(present.sum(dim=-1).max()) if key.numel() else 0
+        key, present = key[..., :most], present[..., :most]
     index = torch.where(present, key & ((1 << INDEX_BITS) - 1), 0)
     return Neighbours(index, present)
 

@@ -121,11 +121,19 @@ class Stepper:
         )
 
     @torch.no_grad()
-    def motion_step(self, memory: StepMemory, token_step: TokenStep) -> MotionStep:
-        """Append a column to the past and say what follows it. Once per column."""
+    def motion_step(
+        self, memory: StepMemory, token_step: TokenStep, rows: Rows | None = None
+    ) -> MotionStep:
+        """Append a column to the past and say what follows it. Once per column.
+
+        Args:
+            memory: The past.
+            token_step: The column.
+            rows: Its visible rows; who knows them saves waiting for their number.
+        """
         motion = self.network.motion
         visible = token_step.visible
-        rows = Rows.where(visible)
+        rows = Rows.where(visible) if rows is None else rows
         memory.visible &= (token_step.presence != int(Presence.INSERTED))[..., None]
         x = self._embed(*memory.last(), token_step, rows)
         sight = self._context(memory, token_step, rows)
@@ -146,13 +154,18 @@ class Stepper:
         )
 
     @torch.no_grad()
-    def entry_begin(self, memory: StepMemory, token_step: TokenStep) -> Insertions:
+    def entry_begin(
+        self, memory: StepMemory, token_step: TokenStep, rows: Rows | None = None
+    ) -> Insertions:
         """Look at the map and the agents around the ego, before any inserted agent.
 
-        ``token_step`` must not have been given to ``motion_step`` yet.
+        Args:
+            memory: The past; ``motion_step`` has not been given the column yet.
+            token_step: The column.
+            rows: Its visible rows; who knows them saves waiting for their number.
         """
-        rollouts, rows = token_step.presence.shape
-        raw = memory.features.new_zeros((rollouts, rows, memory.features.shape[-1]))
+        rollouts, places = token_step.presence.shape
+        raw = memory.features.new_zeros((rollouts, places, memory.features.shape[-1]))
         ego_pose = token_step.pose[:, EGO, None]
         each = torch.arange(rollouts, device=raw.device)
         roads = find_map_neighbours(
@@ -177,19 +190,28 @@ class Stepper:
             token_step=nobody,
             raw=raw,
             relation=raw.new_zeros(
-                (rollouts, rows, self.network.settings.relation_features)
+                (rollouts, places, self.network.settings.relation_features)
             ),
             within=within,
             roads=roads,
             cell_features=None,
         )
-        entries = self.entry_add(empty, token_step)
+        entries = self.entry_add(empty, token_step, rows)
         return replace(entries, cell_features=self._cell_features(entries))
 
     @torch.no_grad()
-    def entry_add(self, entries: Insertions, token_step: TokenStep) -> Insertions:
-        """Go on with inserted agents as further visible rows of the same column."""
-        fresh = Rows.where(token_step.visible & ~entries.token_step.visible)
+    def entry_add(
+        self, entries: Insertions, token_step: TokenStep, fresh: Rows | None = None
+    ) -> Insertions:
+        """Go on with inserted agents as further visible rows of the same column.
+
+        Args:
+            entries: The column so far.
+            token_step: The column with the inserted agents.
+            fresh: Their rows; who knows them saves waiting for their number.
+        """
+        if fresh is None:
+            fresh = Rows.where(token_step.visible & ~entries.token_step.visible)
         came = fresh.spread(torch.ones(len(fresh.at), device=fresh.at.device)) > 0
         embedded = self._embed(entries.before, entries.known, token_step, fresh)
         raw = fresh.spread(normed(embedded))

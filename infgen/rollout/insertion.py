@@ -52,9 +52,9 @@ class InsertionRequest:
     def uniforms(self, token: int, turn: int, attempt: int = 0) -> UniformNumbers:
         """Return the uniform numbers of one insertion of each rollout."""
         # A longer draw starts with the shorter one: the first attempt is always the same.
-        return lambda purpose: self.simulator.draw_uniforms(
-            self.streams, token, purpose, attempt + 1, turn
-        )[:, attempt]
+        return lambda purpose: self.simulator.tensor(
+            self.streams.uniform(token, purpose, attempt + 1, turn)[:, attempt]
+        )
 
     def take(self, places: Int64[np.ndarray, " kept"]) -> "InsertionRequest":
         """Keep some rollouts only."""
@@ -115,8 +115,9 @@ class _ActiveRollouts:
         """Add the inserted agents to the population and to the input of the network."""
         simulator = self.request.simulator
         population, _ = add_inserted(self.population, inserted)
+        fresh = simulator.rows(population.visible & ~self.population.visible)
         entries = simulator.stepper.entry_add(
-            self.entries, simulator.token_step(population)
+            self.entries, simulator.token_step(population), fresh
         )
         return replace(self, entries=entries, population=population)
 
@@ -126,7 +127,9 @@ def insert_agents(
 ) -> Population:
     """Insert agents into every rollout until the network samples BEGIN MOTION."""
     simulator, everyone = request.simulator, np.arange(len(request.streams))
-    entries = simulator.stepper.entry_begin(memory, simulator.token_step(population))
+    entries = simulator.stepper.entry_begin(
+        memory, simulator.token_step(population), simulator.rows(population.visible)
+    )
     active = _ActiveRollouts(request, entries, population, everyone)
     for turn in range(simulator.settings.max_insertions):
         active, inserted = _insert_next(active, token, turn)

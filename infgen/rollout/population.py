@@ -56,6 +56,11 @@ class Population:
         """Agents of each rollout."""
         return (self.agent_number != NOBODY).sum(axis=1)
 
+    @property
+    def visible(self) -> Bool[np.ndarray, "rollout row"]:
+        """Rows that others see: observed, or just inserted."""
+        return self.observed | (self.presence == Presence.INSERTED)
+
     def cells(self, grid: Grid) -> Int16[np.ndarray, "rollout row"]:
         """Cell [rollout, row] of the ego's grid that holds each agent, or ``NO_CELL``."""
         ego_pose = self.pose[:, EGO_ROW, None]

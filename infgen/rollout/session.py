@@ -16,18 +16,17 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int64
-from torch import Tensor
+from jaxtyping import Bool, Float32
 
 from infgen.clock import CLOCK
 from infgen.geometry import wrap_angle
 from infgen.model.batching.batch import MapTokens, collate_maps, to_device
-from infgen.model.relations import Rows
 from infgen.model.signal_features import StopLines
 from infgen.model.step_memory import StepMemory
 from infgen.model.token_step import MotionStep
 from infgen.rollout.insertion import InsertionRequest, insert_agents
 from infgen.rollout.insertion_mask import make_insertion_mask
+from infgen.rollout.motion_sampler import Choices, MotionSampler
 from infgen.rollout.population import (
     EGO_ROW,
     Population,
@@ -35,12 +34,11 @@ from infgen.rollout.population import (
     place_logged_agents,
     remove_beyond,
 )
-from infgen.rollout.random_streams import Purpose, Streams
+from infgen.rollout.random_streams import Streams
 from infgen.rollout.recording import NOBODY, Frame, RolloutStart, number_maps
 from infgen.rollout.rules.density import DensityControl
 from infgen.rollout.rules.rejection import make_motion_check
 from infgen.rollout.rules.stalls import StallRule
-from infgen.rollout.sampling import choose, sample_event
 from infgen.rollout.simulator import Simulator
 from infgen.tokens.motion_tokens import follow, make_match_table
 from infgen.tokens.scene_tokens import Presence
@@ -78,16 +76,22 @@ class Session:
             simulator, roads, starts, self._streams, history[0]
         )
         self._density = _make_density_control(simulator, starts, history[-1])
-        self._stall_rule = _make_stall_rule(simulator, roads, starts)
         for population in history[:-1]:
-            simulator.stepper.motion_step(self._memory, simulator.token_step(population))
+            self._ask_motion(population)
         self.population = history[-1]
         self.token = starts[0].history.now
         self._table = make_match_table(simulator.vocabulary)
-        self._motion_check = make_motion_check(
-            starts, simulator.vocabulary, reject_off_road=simulator.settings.reject_off_road
+        self._sampler = MotionSampler(
+            simulator,
+            self._streams,
+            make_motion_check(
+                starts,
+                simulator.vocabulary,
+                reject_off_road=simulator.settings.reject_off_road,
+            ),
+            _make_stall_rule(simulator, roads, starts),
+            simulator.tensor(simulator.vocabulary.stationary),
         )
-        self._standing = simulator.tensor(simulator.vocabulary.stationary)
         self._driven_to: np.ndarray | None = None
 
     @property
@@ -111,8 +115,9 @@ class Session:
         simulator, token = self._simulator, self.token + 1
         path = None if ego_pose is None else self._ego_path(ego_pose)
         before = self._drive_ego(path)
-        said = simulator.stepper.motion_step(self._memory, simulator.token_step(before))
-        moved, paths = self._move(before, said, path, token)
+        said = self._ask_motion(before)
+        choices = self._sampler.sample(before, said, token)
+        moved, paths = self._move(before, choices, said, path)
         after = moved
         if simulator.inserts:
             after = insert_agents(self._query_network(moved), self._memory, moved, token)
@@ -122,7 +127,7 @@ class Session:
             token=token,
             agent_number=moved.agent_number,
             path=paths,
-            shown=self._sample_validity(before, moved, said, token),
+            shown=self._observed_steps(before, moved, choices),
             removed=moved.presence == Presence.REMOVED,
             inserted_number=np.where(
                 after.agent_number != moved.agent_number,
@@ -131,6 +136,13 @@ class Session:
             ),
             agent_type=after.agent_type,
             size_lwh_m=after.size_lwh_m,
+        )
+
+    def _ask_motion(self, population: Population) -> MotionStep:
+        """Show the network all agents; return what follows."""
+        simulator, visible = self._simulator, population.visible
+        return simulator.stepper.motion_step(
+            self._memory, simulator.token_step(population), simulator.rows(visible)
         )
 
     def _query_network(self, moved: Population) -> InsertionRequest:
@@ -174,171 +186,46 @@ class Session:
         return replace(self.population, pose=pose)
 
     def _move(
-        self, before: Population, said: MotionStep, ego_path: np.ndarray | None, token: int
+        self,
+        before: Population,
+        choices: Choices,
+        said: MotionStep,
+        path: np.ndarray | None,
     ) -> tuple[Population, np.ndarray]:
-        """Sample motion tokens and removals; replace those of egos that a caller drives."""
+        """Move every agent as sampled, the egos that a caller drives along their paths."""
         simulator, settings = self._simulator, self._simulator.settings
-        motion_token = self._sample_motion_tokens(before, said, token)
-        motion_token = self._release_stalled(before, said, token, motion_token)
-        if ego_path is not None:
-            target, pose = ego_path[:, -1], before.pose[:, EGO_ROW]
+        sampler, token = self._sampler, self.token + 1
+        motion_token = sampler.release_stalled(before, said, token, choices.motion_token)
+        driven = np.zeros(motion_token.shape, dtype=bool)
+        if path is not None:
+            target, pose = path[:, -1], before.pose[:, EGO_ROW]
             agent_type = before.agent_type[:, EGO_ROW]
             motion_token[:, EGO_ROW], _ = follow(target, pose, agent_type, self._table)
-        leave = self._sample_removals(said, token)
-        driven = np.zeros(motion_token.shape, dtype=bool)
-        driven[:, EGO_ROW] = ego_path is not None
-        motion_token = self._apply_rules(before, said, token, motion_token, driven)
-        moved, path = advance_agents(before, motion_token, leave, simulator.vocabulary)
+            driven[:, EGO_ROW] = True
+        motion_token = sampler.reject(before, said, token, motion_token, driven)
+        moved, paths = advance_agents(
+            before, motion_token, choices.remove, simulator.vocabulary
+        )
         if settings.removes and settings.removal_radius_m:
             moved = remove_beyond(before, moved, settings.removal_radius_m)
-        if ego_path is not None:
-            path = path.copy()  # The population goes on from the quantised pose.
-            path[:, EGO_ROW] = ego_path
-        return moved, path
+        if path is not None:
+            paths = paths.copy()  # The population goes on from the quantised pose.
+            paths[:, EGO_ROW] = path
+        return moved, paths
 
-    def _apply_rules(
-        self,
-        before: Population,
-        said: MotionStep,
-        token: int,
-        motion_token: Int64[np.ndarray, "rollout row"],
-        driven: Bool[np.ndarray, "rollout row"],
-    ) -> Int64[np.ndarray, "rollout row"]:
-        """Sample motion tokens again that lead to a collision or off the road."""
-        tries, again = self._simulator.settings.max_motion_samples, ~driven
-        check, slowest, changed = self._motion_check, motion_token.copy(), again
-        for attempt in range(1, tries):
-            # Where no token satisfies both checks, only collisions are checked.
-            road = attempt <= tries // 2
-            hits, departs = check.rejects(before, motion_token, changed, road=road)
-            again, steers = (hits | departs) & ~driven, departs & ~hits
-            slower = check.is_slower(before, motion_token, slowest)
-            slowest = np.where(slower & steers, motion_token, slowest)
-            changed = again  # Rows with another token than before, braking ones included.
-            if attempt == tries // 2:
-                # A vehicle too fast for all of its samples takes the slowest one.
-                brakes = steers & again & check.is_fast(before, motion_token)
-                motion_token = np.where(brakes, slowest, motion_token)
-                again = again & ~brakes
-            if not again.any():
-                break
-            motion_token = self._resample_rejected(
-                before, said, token, attempt, motion_token, again, steers
-            )
-        return motion_token
-
-    def _sample_motion_tokens(
-        self, before: Population, said: MotionStep, token: int
-    ) -> Int64[np.ndarray, "rollout row"]:
-        """Sample the motion token of every agent."""
-        packed = said.packed
-        agent_type = packed.rows.pack(self._simulator.tensor(before.agent_type).long())
-        uniforms = self._uniforms(packed.rows, token, Purpose.MOTION_TOKEN)
-        drawn = self._sample(packed.motion_logits, agent_type, uniforms)
-        return packed.rows.spread(drawn).cpu().numpy()
-
-    def _resample_rejected(
-        self,
-        before: Population,
-        said: MotionStep,
-        token: int,
-        attempt: int,
-        motion_token: Int64[np.ndarray, "rollout row"],
-        again: Bool[np.ndarray, "rollout row"],
-        steers: Bool[np.ndarray, "rollout row"],
-    ) -> Int64[np.ndarray, "rollout row"]:
-        """Sample the motion tokens of some rows again.
-
-        Args:
-            before: All agents at the beginning of the token step.
-            said: Logits of the network.
-            token: Index of the token step.
-            attempt: Number of the sample.
-            motion_token: Motion tokens so far.
-            again: Rows to sample again.
-            steers: Rows that must not take a token that stands still.
-        """
-        simulator, rows = self._simulator, said.packed.rows
-        which = rows.pack(simulator.tensor(again))
-        uniforms = self._uniforms(rows, token, Purpose.MOTION_TOKEN, attempt)[which]
-        agent_type = rows.pack(simulator.tensor(before.agent_type).long())[which]
-        drawn = rows.pack(simulator.tensor(motion_token))
-        stops = (
-            rows.pack(simulator.tensor(steers))[which, None] & self._standing[agent_type]
-        )
-        logits = said.packed.motion_logits[which].masked_fill(stops, -torch.inf)
-        drawn[which] = self._sample(logits, agent_type, uniforms)
-        return rows.spread(drawn).cpu().numpy()
-
-    def _release_stalled(
-        self,
-        before: Population,
-        said: MotionStep,
-        token: int,
-        motion_token: Int64[np.ndarray, "rollout row"],
-    ) -> Int64[np.ndarray, "rollout row"]:
-        """Sample a moving token for vehicles that have stalled in a lane."""
-        if self._stall_rule is None:
-            return motion_token
-        stalled = self._stall_rule.stalled(before, token - 1)
-        stalled &= self._simulator.vocabulary.stationary[before.agent_type, motion_token]
-        if not stalled.any():
-            return motion_token
-        # No other sample of this token step has this number.
-        attempt = self._simulator.settings.max_motion_samples
-        return self._resample_rejected(
-            before, said, token, attempt, motion_token, stalled, stalled
-        )
-
-    def _sample(self, logits: Tensor, agent_type: Tensor, uniforms: Tensor) -> Tensor:
-        """Sample motion tokens; tokens that stand still have a nucleus of their own.
-
-        A vehicle that seldom sets off then still does.
-        """
-        settings = self._simulator.settings
-        return choose(
-            logits,
-            uniforms,
-            settings.motion_top_k,
-            nucleus=settings.motion_top_p,
-            temperature=settings.motion_temperature,
-            apart=self._standing[agent_type] if settings.motion_top_p < 1 else None,
-        )
-
-    def _sample_removals(
-        self, said: MotionStep, token: int
-    ) -> Bool[np.ndarray, "rollout row"]:
-        settings, packed = self._simulator.settings, said.packed
-        if packed.remove_logit is None or not settings.removes:
-            return np.zeros(self.population.agent_number.shape, dtype=bool)
-        uniforms = self._uniforms(packed.rows, token, Purpose.LEAVE)
-        leave = sample_event(packed.remove_logit, uniforms, settings.remove_bias)
-        return packed.rows.spread(leave).cpu().numpy()
-
-    def _uniforms(
-        self, rows: Rows, token: int, purpose: Purpose, attempt: int = 0
-    ) -> Tensor:
-        """Draw a uniform number per row; it does not depend on the other rows."""
-        each, draw = self.population.agent_number.shape[1], self._simulator.draw_uniforms
-        return rows.pack(draw(self._streams, token, purpose, each, attempt))
-
-    def _sample_validity(
-        self, before: Population, moved: Population, said: MotionStep, token: int
+    def _observed_steps(
+        self, before: Population, moved: Population, choices: Choices
     ) -> Bool[np.ndarray, "rollout row 5"]:
-        """Sample at which of the five steps each agent is observed.
+        """Tell at which of the five steps each agent is observed.
 
         The ego is observed at all of them, an inserted agent at its first and a removed
         agent at its last, so that recorded entries and exits are exact.
         """
         steps = CLOCK.steps_per_token
         shown = np.ones((*moved.agent_number.shape, steps), dtype=bool)
-        packed = said.packed
-        if packed.pattern_logits is None or not self._simulator.settings.validity_patterns:
+        if choices.pattern is None:
             return shown
-        uniforms = self._uniforms(packed.rows, token, Purpose.PATTERN)
-        drawn = choose(packed.pattern_logits, uniforms)
-        pattern = packed.rows.spread(drawn).cpu().numpy()
-        shown &= (pattern[..., None] >> np.arange(steps) & 1).astype(bool)
+        shown &= (choices.pattern[..., None] >> np.arange(steps) & 1).astype(bool)
         shown[:, EGO_ROW] = True
         shown[..., 0] |= before.presence == Presence.INSERTED
         shown[..., -1] |= moved.presence == Presence.REMOVED

@@ -4,12 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
+from infgen.model.relations import Rows
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import TokenStep
 from infgen.rollout.population import Population
-from infgen.rollout.random_streams import Purpose, Streams
 from infgen.rollout.settings import RolloutSettings
 from infgen.tokens.grid import Grid, make_grid
 from infgen.tokens.settings import TokenSettings
@@ -61,19 +62,29 @@ class Simulator:
         return ", ".join(["motion", *words]) if words else "motion only"
 
     def tensor(self, values: np.ndarray) -> Tensor:
-        """Bring an array to the network's device."""
-        return torch.from_numpy(values).to(self.device)
+        """Bring an array to the network's device; the host does not wait for that."""
+        values = torch.from_numpy(values)
+        if self.device.type == "cpu":
+            return values
+        return values.pin_memory().to(self.device, non_blocking=True)
 
-    def draw_uniforms(
-        self,
-        streams: Streams,
-        token: int,
-        purpose: Purpose,
-        count: int,
-        turn: int = 0,
-    ) -> Tensor:
-        """Draw [rollout, count] uniform numbers on the network's device."""
-        return self.tensor(streams.uniform(token, purpose, count, turn))
+    def fetch(self, *tensors: Tensor) -> list[np.ndarray]:
+        """Bring tensors to the host, all in one copy: the host waits once."""
+        if self.device.type == "cpu":
+            return [each.numpy() for each in tensors]
+        parts = [each.contiguous().view(torch.uint8).flatten() for each in tensors]
+        held = torch.cat(parts).cpu().split([len(part) for part in parts])
+        return [
+            part.clone().view(each.dtype).view(each.shape).numpy()
+            for part, each in zip(held, tensors, strict=True)
+        ]
+
+    def rows(self, chosen: Bool[np.ndarray, "rollout row"]) -> Rows:
+        """Number the chosen rows in order, as ``Rows.where``, without waiting."""
+        at = np.flatnonzero(chosen)
+        number = np.zeros(chosen.shape, dtype=np.int64)
+        number.flat[at] = np.arange(len(at))
+        return Rows(self.tensor(at), self.tensor(number))
 
     def token_step(self, population: Population) -> TokenStep:
         """Show a population to the network."""

@@ -58,8 +58,8 @@ class Listening(Stepper):
         self.queries: list[RequestOptions] = []
         self.details: list[RequestOptions] = []
 
-    def motion_step(self, memory, token_step):
-        said = super().motion_step(memory, token_step)
+    def motion_step(self, memory, token_step, rows=None):
+        said = super().motion_step(memory, token_step, rows)
         self.columns.append(token_step)
         self.motion.append(said)
         return said

@@ -97,8 +97,8 @@ def test_the_same_holds_for_variants(starts, listening, model, settings):
 class Forgetful(Listening):
     """Loses the oldest column that it should remember."""
 
-    def motion_step(self, memory, token_step):
-        said = super().motion_step(memory, token_step)
+    def motion_step(self, memory, token_step, rows=None):
+        said = super().motion_step(memory, token_step, rows)
         memory.visible[:, :, memory.columns % memory.window] = False
         return said
 
@@ -106,8 +106,8 @@ class Forgetful(Listening):
 class Mixed(Listening):
     """Takes what one agent was for what its neighbour was."""
 
-    def motion_step(self, memory, token_step):
-        said = super().motion_step(memory, token_step)
+    def motion_step(self, memory, token_step, rows=None):
+        said = super().motion_step(memory, token_step, rows)
         memory.features = memory.features.roll(1, dims=2)
         return said
 
@@ -115,8 +115,8 @@ class Mixed(Listening):
 class Blind(Listening):
     """Asks for inserted agents without seeing those before."""
 
-    def entry_add(self, entries, token_step):
-        seen = super().entry_add(entries, token_step)
+    def entry_add(self, entries, token_step, fresh=None):
+        seen = super().entry_add(entries, token_step, fresh)
         inserted = (token_step.presence == Presence.INSERTED).any()
         return replace(seen, within=entries.within) if inserted else seen
 

@@ -42,8 +42,8 @@ def play(simulator, start):
         session = Session(playing, replace(start(scene), lights=lights))
         step, said = playing.stepper.motion_step, []
 
-        def heard(memory, token_step):
-            said.append(step(memory, token_step))
+        def heard(memory, token_step, rows):
+            said.append(step(memory, token_step, rows))
             return said[-1]
 
         playing.stepper.motion_step = heard

@@ -286,8 +286,8 @@ def test_who_is_too_fast_for_every_way_takes_the_slowest(drive, start, simulator
         step, motion_token = playing.stepper.motion_step, torch.arange(61)
         fast = (motion_token > 40) & (motion_token % 20 >= 10)
 
-        def heard(memory, token_step):
-            said = step(memory, token_step)
+        def heard(memory, token_step, rows):
+            said = step(memory, token_step, rows)
             said.packed.motion_logits.masked_fill_(~fast, -torch.inf)
             return said
 

@@ -183,8 +183,8 @@ def keep_speed(playing):
     """Let everyone repeat the move that led to where it is."""
     step = playing.stepper.motion_step
 
-    def again(memory, token_step):
-        said = step(memory, token_step)
+    def again(memory, token_step, rows):
+        said = step(memory, token_step, rows)
         wanted = torch.nn.functional.one_hot(
             token_step.motion_token.clamp(min=0), 61
         ).float()

@@ -83,9 +83,7 @@ def session(device: torch.device, count: int, settings: dict[str, Any]) -> Sessi
 def same(one: Frame, other: Frame) -> bool:
     """Whether two frames are equal, bit for bit."""
     fields = one.__dataclass_fields__
-    return all(
-        np.array_equal(getattr(one, name), getattr(other, name)) for name in fields
-    )
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in fields)
 
 
 def rollout(mode: str, rules: str, steps: str = "3") -> Found:

@@ -254,7 +254,7 @@ def _to_copy(func: Any, args: Any, kwargs: dict[str, Any], ours: list[Any]) -> A
     value = _unwrap(args[0])
     plain = {name: each for name, each in kwargs.items() if name != "device"}
     if source != target:
-        blocking = not (kwargs.get("non_blocking") and (source or value.is_pinned()))
+        blocking = not (kwargs.get("non_blocking") and (source or _is_pinned(value)))
         if not (source or target) or blocking:
             _STATE.tally.waits[_line()] += 1
         _STATE.tally.copies[_line()] += 1
@@ -285,7 +285,9 @@ def _count(name: str, args: Any) -> None:
     if name in _WAITING:
         _STATE.tally.waits[line] += 1
     if name in ("index", "index_put", "index_put_", "_index_put_impl_"):
-        masks = [x for x in args[1] if x is not None and x.dtype in (torch.bool, torch.uint8)]
+        masks = [
+            x for x in args[1] if x is not None and x.dtype in (torch.bool, torch.uint8)
+        ]
         _STATE.tally.waits[line] += len(masks)  # A mask becomes indices: how many?
     if name == "repeat_interleave":
         _STATE.tally.waits[line] += 1
@@ -337,6 +339,7 @@ def set_up() -> torch.device:
     torch.as_tensor = _made(torch.as_tensor)
     Tensor.new_tensor = _new_tensor  # type: ignore[method-assign]
     Tensor.numpy = _numpy(Tensor.numpy)  # type: ignore[method-assign]
+    Tensor.pin_memory = _pin_memory  # type: ignore[method-assign]
     Tensor.tolist = _tolist(Tensor.tolist)  # type: ignore[method-assign]
     return torch.device(NAME, 0)
 
@@ -352,7 +355,9 @@ def _made(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return constructor
 
 
-def _new_tensor(self: Tensor, data: Any, *, dtype: Any = None, device: Any = None) -> Tensor:
+def _new_tensor(
+    self: Tensor, data: Any, *, dtype: Any = None, device: Any = None
+) -> Tensor:
     return torch.tensor(data, dtype=dtype or self.dtype, device=device or self.device)
 
 
@@ -360,11 +365,24 @@ def _numpy(plain: Callable[..., Any]) -> Callable[..., Any]:
     def numpy(self: Tensor, *, force: bool = False) -> Any:
         if isinstance(self, StandInTensor):
             if not force:
-                raise TypeError(f"numpy() of a tensor on {self.device}; expected .cpu() first")
+                raise TypeError(
+                    f"numpy() of a tensor on {self.device}; expected .cpu() first"
+                )
             return plain(self.detach().cpu())
         return plain(self, force=force)
 
     return numpy
+
+
+def _pin_memory(self: Tensor) -> Tensor:
+    """Return a tensor from which copies to the device need no waiting."""
+    pinned = self.clone()
+    pinned.pinned = True  # type: ignore[attr-defined]
+    return pinned
+
+
+def _is_pinned(value: Tensor) -> bool:
+    return getattr(value, "pinned", False)
 
 
 def _tolist(plain: Callable[..., Any]) -> Callable[..., Any]:

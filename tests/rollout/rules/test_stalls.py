@@ -133,8 +133,8 @@ def never_sets_off(simulator, metre_moves, **settings):
     )
     step, standing = playing.stepper.motion_step, playing.tensor(metre_moves.stationary)
 
-    def still(memory, token_step):
-        said = step(memory, token_step)
+    def still(memory, token_step, rows):
+        said = step(memory, token_step, rows)
         agent_type = said.packed.rows.pack(token_step.agent_type.long())
         said.packed.motion_logits[:] += 50.0 * standing[agent_type]
         return said
