@@ -112,11 +112,13 @@ class CellFeatures(nn.Module):
         xy_m = grid_place(lying.pose, ego_pose[:, None])
         at = xy_m / self.step_m + last / 2  # column, row
         inside = lying.present & (at > 0).all(dim=-1) & (at < last).all(dim=-1)
-        query, thing = inside.nonzero(as_tuple=True)
+        query, thing, counts = _chosen(inside)
         at = at[query, thing]
         turned_rad = lying.pose[query, thing, 2] - ego_pose[query, 2]
         features = gather(project(lying.features), lying.row[query, thing])
         features = functional.relu(features + self.turned(_unit(turned_rad)))
+        if counts is not None:
+            features, at = features * counts, at.clamp(0, last)
 
         lower = at.floor().clamp(max=last - 1)
         share = at - lower
@@ -170,6 +172,21 @@ class HeadingFeatures(nn.Module):
         return (first[..., None] == bins) * (1 - share[..., None]) + (
             second[..., None] == bins
         ) * share[..., None]
+
+
+def _chosen(inside: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Indices of the true places of a mask, and what they count for; None for all alike.
+
+    Only a CPU looks which they are: elsewhere the host would wait, so there all places are
+    taken, and those that are false count nothing.
+    """
+    if inside.device.type == "cpu":
+        query, thing = inside.nonzero(as_tuple=True)
+        return query, thing, None
+    things = inside.shape[1]
+    place = torch.arange(inside.numel(), device=inside.device)
+    counts = inside.flatten()[:, None].to(torch.float32)
+    return place // things, place % things, counts
 
 
 def _unit(angle_rad: Tensor) -> Tensor:

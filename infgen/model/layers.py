@@ -5,7 +5,9 @@ of relations, H heads, C width of one head, F scalars, P nodes of a table.
 """
 
 import math
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -143,6 +145,24 @@ class AttentionSources:
         )
 
 
+class _Folded(NamedTuple):
+    """Weights of an attention layer with the gains and biases of its norms folded in.
+
+    Attributes:
+        key: For features [H, C, D].
+        value: For features [H, C, D].
+        relation_key: For relations [H, C, R].
+        relation_value: For relations [H, C, R].
+        value_bias: What biases add to every value [H, C]; in keys they cancel out.
+    """
+
+    key: Tensor
+    value: Tensor
+    relation_key: Tensor
+    relation_value: Tensor
+    value_bias: Tensor
+
+
 class Attention(nn.Module):
     """Let targets look at their neighbours; gated update and feed-forward (SPEC 4.1).
 
@@ -180,6 +200,12 @@ class Attention(nn.Module):
             nn.Linear(FEED_FORWARD * width, width),
             nn.LayerNorm(width),
         )
+        self._kept_fold: tuple[Hashable, _Folded] | None = None
+
+    def train(self, mode: bool = True) -> "Attention":
+        """Switch between training and evaluation; forget what was made of the weights."""
+        self._kept_fold = None
+        return super().train(mode)
 
     def forward(self, target: Tensor, seen: AttentionSources) -> Tensor:
         """Update targets [N, D], or [N, S, D] whose slots share their neighbours."""
@@ -198,14 +224,14 @@ class Attention(nn.Module):
         targets, slots, width = normal_NSD.shape
         heads = (targets, slots, self.heads)
         query = self.query(normal_NSD).view(*heads, width // self.heads)
-        source, relation = self._folded()
+        weights = self._folded()
         query = query * query.shape[-1] ** -0.5
         hidden = ~seen.present
         if slots > 1:
             hidden = hidden[:, :, None].expand(*heads, -1).flatten(1, 2)
         looked = attend_to_pairs(
-            _per_head(query, source[0]),
-            _per_head(query, relation[0]),
+            _per_head(query, weights.key),
+            _per_head(query, weights.relation_key),
             seen.features,
             seen.index,
             seen.relation,
@@ -214,10 +240,11 @@ class Attention(nn.Module):
         )
         from_source = looked.features.view(*heads, width)
         from_relation = looked.relation.view(*heads, looked.relation.shape[-1])
-        value = torch.einsum("nshd,hcd->nshc", from_source, source[1])
-        value = value + torch.einsum("nshd,hcd->nshc", from_relation, relation[1])
-        bias = self._value_bias().view(self.heads, -1)  # [H, C]
-        return (value + looked.weight.view(*heads, 1) * bias).flatten(2)
+        value = torch.einsum("nshd,hcd->nshc", from_source, weights.value)
+        value = value + torch.einsum(
+            "nshd,hcd->nshc", from_relation, weights.relation_value
+        )
+        return (value + looked.weight.view(*heads, 1) * weights.value_bias).flatten(2)
 
     def _kept(self, query_NQC: Tensor, neighbours: int) -> Tensor | None:
         """Factors of dropout on the weights of pairs, if there is any."""
@@ -230,22 +257,33 @@ class Attention(nn.Module):
         """Norm of the neighbours' features: the targets' own unless they differ."""
         return self.norm_target if self.norm_source is None else self.norm_source
 
-    def _folded(self) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """Key and value weights [H, C, D or R] of source and relation, gains folded in."""
+    def _folded(self) -> _Folded:
+        """Fold the norms into the weights: in evaluation once, until the weights change."""
+        if self.training or torch.is_grad_enabled():
+            return self._fold()
+        # Fused optimizers write without a new version, but only in training.
+        parts = [self.key, self.value, self.relation_key, self.relation_value]
+        weights = [part.weight for part in (*parts, self.source_norm(), self.norm_relation)]
+        device = weights[0].device
+        versions = tuple((id(each), each._version) for each in weights)
+        now = (device, torch.is_autocast_enabled(device.type), versions)
+        if self._kept_fold is None or self._kept_fold[0] != now:
+            self._kept_fold = now, self._fold()
+        return self._kept_fold[1]
 
+    def _fold(self) -> _Folded:
         def fold(linear: nn.Linear, norm: nn.LayerNorm) -> Tensor:
             return (linear.weight * norm.weight).view(self.heads, -1, len(norm.weight))
 
         source, relation = self.source_norm(), self.norm_relation
-        return (
-            (fold(self.key, source), fold(self.value, source)),
-            (fold(self.relation_key, relation), fold(self.relation_value, relation)),
+        bias = self.value(source.bias) + self.relation_value(relation.bias)
+        return _Folded(
+            key=fold(self.key, source),
+            value=fold(self.value, source),
+            relation_key=fold(self.relation_key, relation),
+            relation_value=fold(self.relation_value, relation),
+            value_bias=bias.view(self.heads, -1),
         )
-
-    def _value_bias(self) -> Tensor:
-        """What biases add to every value [D]; what they add to keys cancels out."""
-        bias: Tensor = self.value(self.source_norm().bias)
-        return bias + self.relation_value(self.norm_relation.bias)
 
 
 def _per_head(query_NSHC: Tensor, weight_HCD: Tensor) -> Tensor:

@@ -205,3 +205,22 @@ def test_normed_features_have_mean_zero_and_variance_one():
     torch.testing.assert_close(x.mean(-1), torch.zeros(4), atol=1e-5, rtol=0.0)
     torch.testing.assert_close(x.var(-1, correction=0), torch.ones(4), atol=1e-4, rtol=0.0)
     assert functional.mse_loss(x, x) == 0
+
+
+def test_weights_are_folded_anew_when_they_change():
+    layer, (seen, _) = make_layer(True).eval(), make_seen(5, 1, 7)
+    target = torch.randn(5, WIDTH)
+    other = make_layer(True)
+    other.relation_value.weight.data.mul_(2)
+
+    with torch.no_grad():
+        before = layer(target, seen)
+        layer.load_state_dict(other.state_dict())
+        after = layer(target, seen)
+        layer.train()
+        layer.relation_value.weight.data.div_(2)  # As fused optimizers: no new version.
+        back = layer.eval()(target, seen)
+
+    torch.testing.assert_close(after, other(target, seen), atol=0, rtol=0)
+    assert not torch.equal(before, after)
+    torch.testing.assert_close(back, before, atol=0, rtol=0)
