@@ -153,11 +153,9 @@ def _insert_next(
     bias = simulator.tensor(active.request.add_bias(active.population))
     add = sample_event(query.add_logit, uniforms(Purpose.ADD), bias)
     # A batch has as many rows as its most crowded scene needs: free rows are no limit.
-    wanted = add.cpu().numpy() & (active.population.num_agents < active.request.most)
-    active, query = (
-        active.take(wanted),
-        query.take(simulator.tensor(np.flatnonzero(wanted))),
-    )
+    wanted = simulator.fetch(add)[0] & (active.population.num_agents < active.request.most)
+    places = np.flatnonzero(wanted)
+    active, query = active.take(wanted), query.take(simulator.tensor(places))
     found = _sample_positions(active, query, token, turn) if len(active) else None
     if found is None or not found.who.any():
         return active, None
@@ -177,7 +175,7 @@ def _sample_positions(
     left = np.ones(len(active), dtype=bool)
     for attempt in range(active.request.attempts):
         asked, places = active.take(left), np.flatnonzero(left)
-        inserted, cell = _sample_details(
+        inserted, cell = _sample_agents(
             asked,
             query.take(simulator.tensor(places)),
             taken[places],
@@ -197,54 +195,65 @@ def _sample_positions(
     return found
 
 
-def _sample_details(
+def _sample_agents(
     active: _ActiveRollouts,
     query: PositionOutputs,
     taken: Bool[np.ndarray, "rollout cell"],
     uniforms: UniformNumbers,
-) -> tuple[InsertedAgents, np.ndarray]:
-    """Sample position, type, size and heading; return them and the cells [rollout]."""
-    simulator = active.request.simulator
-    cell, position_m = _sample_position(simulator, query, taken, uniforms)
-    asked_at = None if query.position_logits is not None else simulator.tensor(position_m)
-    details = simulator.stepper.entry_details(
-        active.entries, simulator.tensor(cell.astype(np.int64)), asked_at
-    )
+) -> tuple[InsertedAgents, Int64[np.ndarray, " rollout"]]:
+    """Sample position, type, size and heading; return them and the cells.
+
+    Everything is sampled where the network is, and fetched at once.
+    """
+    simulator, grid = active.request.simulator, active.request.simulator.grid
+    cell, regressed_m = _sample_cell(simulator, query, taken, uniforms)
+    details = simulator.stepper.entry_details(active.entries, cell, regressed_m)
     agent_type = choose(details.agent_type_logits, uniforms(Purpose.AGENT_TYPE))
-    if details.offset_m is not None:
-        offset_m = _of_type(details.offset_m, agent_type).cpu().numpy()
-        position_m = _within(position_m + offset_m, simulator.grid)
+    heading = _sample_heading(simulator, details, agent_type, uniforms)
+    offset_m = None if details.offset_m is None else _of_type(details.offset_m, agent_type)
+    size_lwh_m = _of_type(details.size_lwh_m, agent_type)
+    more = offset_m if regressed_m is None else regressed_m
+    parts = [cell, agent_type, size_lwh_m, heading, *([] if more is None else [more])]
+    cells, types, sizes, headings, *rest = simulator.fetch(*parts)
+
+    position_m = decode_cell(cells.astype(np.int16), grid)
+    if regressed_m is not None:
+        position_m = rest[0]
+    elif rest:
+        position_m = _within(position_m + rest[0], grid)
+    if details.heading_logits is not None:
+        headings = decode_heading(headings.astype(np.int16), grid)
     found = InsertedAgents(
-        who=np.ones(len(cell), dtype=bool),
+        who=np.ones(len(cells), dtype=bool),
         position_m=position_m,
-        turned_rad=_sample_heading(simulator, details, agent_type, uniforms),
-        agent_type=agent_type.cpu().numpy().astype(np.int8),
-        size_lwh_m=_of_type(details.size_lwh_m, agent_type).cpu().numpy(),
+        turned_rad=headings,
+        agent_type=types.astype(np.int8),
+        size_lwh_m=sizes,
     )
-    return found, cell
+    return found, cells
 
 
-def _sample_position(
+def _sample_cell(
     simulator: Simulator,
     query: PositionOutputs,
-    taken: np.ndarray,
+    taken: Bool[np.ndarray, "rollout cell"],
     uniforms: UniformNumbers,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sample a cell per rollout; return it and its position in the grid frame."""
+) -> tuple[Tensor, Tensor | None]:
+    """Sample a cell per rollout, or take those of regressed positions, returned as well."""
     settings, grid = simulator.settings, simulator.grid
     if query.position_logits is not None:
-        drawn = choose(
+        cell = choose(
             query.position_logits.masked_fill(simulator.tensor(taken), float("-inf")),
             uniforms(Purpose.CELL),
             settings.position_top_k,
             nucleus=settings.position_top_p,
             temperature=settings.position_temperature,
         )
-        cell = drawn.cpu().numpy().astype(np.int16)
-        return cell, decode_cell(cell, grid)
+        return cell, None
     assert query.position_m is not None
-    position_m = _within(query.position_m.cpu().numpy(), grid)
-    return encode_cell(position_m, grid), position_m
+    position_m = _within(simulator.fetch(query.position_m)[0], grid)
+    cells = encode_cell(position_m, grid).astype(np.int64)
+    return simulator.tensor(cells), simulator.tensor(position_m)
 
 
 def _within(position_m: np.ndarray, grid: Grid) -> np.ndarray:
@@ -258,17 +267,16 @@ def _sample_heading(
     details: InsertionDetails,
     agent_type: Tensor,
     uniforms: UniformNumbers,
-) -> np.ndarray:
-    """Sample the heading of every inserted agent relative to the ego."""
+) -> Tensor:
+    """Sample the heading of every inserted agent: its bin, or relative to the ego."""
     if details.heading_logits is None:
         assert details.turned_rad is not None
-        return _of_type(details.turned_rad, agent_type).cpu().numpy()
-    drawn = choose(
+        return _of_type(details.turned_rad, agent_type)
+    return choose(
         _of_type(details.heading_logits, agent_type),
         uniforms(Purpose.HEADING),
         temperature=simulator.settings.heading_temperature,
     )
-    return decode_heading(drawn.cpu().numpy().astype(np.int16), simulator.grid)
 
 
 def _of_type(values: Tensor, agent_type: Tensor) -> Tensor:
