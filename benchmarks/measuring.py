@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,16 @@ from infgen.sources.womd import iter_scenes
 
 SCENE = "637f20cafde22ff8"
 RECORD = SHARED.parents[1] / "golden" / "wosac" / SCENE / "scenario.tfrecord"
+_SMALL = ModelSettings(
+    width=48, heads=4, map_blocks=1, motion_blocks=2, scene_blocks=1, fourier_bands=16
+)
 SIZES = {
     "paper": ModelSettings(),
-    "small": ModelSettings(
-        width=48, heads=4, map_blocks=1, motion_blocks=2, scene_blocks=1, fourier_bands=16
-    ),
+    "paper-narrow": ModelSettings(relation_width=32),
+    "small": _SMALL,
+    "small-narrow": replace(_SMALL, relation_width=16),
 }
+"""Sizes of the network by name; the narrow ones have narrow features of relative poses."""
 PEAK_SIDE = 2048
 
 
@@ -61,8 +66,8 @@ def peak_mib(device: str) -> float:
 
 def peak_flops(device: str, *, bf16: bool) -> float:
     """Operations a second (of the clock) of a product of large matrices."""
-    agent_type = torch.bfloat16 if bf16 else torch.float32
-    one = torch.randn(PEAK_SIDE, PEAK_SIDE, device=device, dtype=agent_type)
+    dtype = torch.bfloat16 if bf16 else torch.float32
+    one = torch.randn(PEAK_SIDE, PEAK_SIDE, device=device, dtype=dtype)
     other, best = one.clone(), 0.0
 
     def product() -> Tensor:

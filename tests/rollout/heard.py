@@ -214,8 +214,8 @@ def _details(network, played):
     told, kinds = played.details, len(KINDS)
     rollouts = len(played.starts)
 
-    def spread(name, agent_type, shape=()):
-        filled = torch.zeros((rollouts, len(told), *shape), dtype=agent_type)
+    def spread(name, dtype, shape=()):
+        filled = torch.zeros((rollouts, len(told), *shape), dtype=dtype)
         for at, one in enumerate(told):
             value = getattr(one, name)
             filled[one.rollout, at] = True if name == "rollout" else value

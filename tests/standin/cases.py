@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from pathlib import Path
 from typing import Any
 
 from tests.standin.device import StandIn, Tally, counted, set_up
@@ -81,22 +80,28 @@ def session(device: torch.device, count: int, settings: dict[str, Any]) -> Sessi
 
 
 def same(one: Frame, other: Frame) -> bool:
-    """Whether two frames are equal, bit for bit."""
-    fields = one.__dataclass_fields__
-    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in fields)
+    """Whether two frames have the same agents at the same places, but for rounding.
+
+    A device sums up padding that a CPU leaves out: zeros, but in other groups.
+    """
+    for name in one.__dataclass_fields__:
+        ours, theirs = np.asarray(getattr(one, name)), np.asarray(getattr(other, name))
+        close = np.allclose if ours.dtype.kind == "f" else np.array_equal
+        if ours.shape != theirs.shape or not close(ours, theirs):
+            return False
+    return True
 
 
 def rollout(mode: str, rules: str, steps: str = "3") -> Found:
-    """Token steps on both devices, and what one of them would cost."""
+    """Token steps on both devices, and what the last one of them would cost."""
     settings = {"mode": mode, **(RULES if rules == "rules" else {})}
     plain = session(CPU, 3, settings)
     with StandIn():
         ours = session(DEVICE, 3, settings)
-        equal, tally = [], Tally()
-        for _ in range(int(steps)):
-            with counted() as tally:
-                frame = ours.step()
-            equal.append(same(frame, plain.step()))
+        equal = [same(ours.step(), plain.step()) for _ in range(int(steps) - 1)]
+        with counted() as tally:
+            frame = ours.step()
+        equal.append(same(frame, plain.step()))
     return {"equal": equal, **costs(tally)}
 
 

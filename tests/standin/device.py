@@ -1,9 +1,9 @@
 """A stand-in for a GPU: an accelerator that computes true values on the CPU.
 
-It is a device of its own type (``standin:0``), so everything takes the path that it takes on
-a GPU, and what fails there fails here: operations that mix devices are refused with the line
-of the project that asked for them. Kernels and host waits are counted by line. There is no
-speed to be measured, only how often a GPU would be launched and waited for.
+It is a device of its own type (``standin:0``), so everything takes the path that it takes
+on a GPU, and what fails there fails here: operations that mix devices are refused with the
+line of the project that asked for them. Kernels and host waits are counted by line. There
+is no speed to be measured, only how often a GPU would be launched and waited for.
 
 It needs a process of its own: ``set_up`` comes before ``infgen`` is imported.
 """
@@ -30,20 +30,24 @@ _PROJECT = tuple(str(ROOT / part) for part in ("infgen", "pipeline", "benchmarks
 
 _aten = torch.ops.aten
 _FREE = {
-    "view", "_unsafe_view", "reshape", "expand", "permute", "transpose", "t", "select", "slice",
-    "squeeze", "unsqueeze", "unbind", "split", "split_with_sizes", "chunk", "detach", "alias",
-    "as_strided", "unfold", "diagonal", "empty", "empty_like", "empty_strided", "new_empty",
-    "new_empty_strided", "lift_fresh", "_reshape_alias", "movedim", "narrow", "view_as_real",
-    "set_", "is_same_size", "_has_compatible_shallow_copy_type", "resize_", "numel", "size",
-    "stride", "storage_offset", "sym_size", "sym_stride", "sym_numel", "sym_storage_offset",
+    "view", "_unsafe_view", "reshape", "expand", "permute", "transpose", "t", "select",
+    "slice", "squeeze", "unsqueeze", "unbind", "split", "split_with_sizes", "chunk",
+    "detach", "alias", "as_strided", "unfold", "diagonal", "empty", "empty_like",
+    "empty_strided", "new_empty", "new_empty_strided", "lift_fresh", "_reshape_alias",
+    "movedim", "narrow", "view_as_real", "set_", "is_same_size",
+    "_has_compatible_shallow_copy_type", "resize_", "numel", "size", "stride",
+    "storage_offset", "sym_size", "sym_stride", "sym_numel", "sym_storage_offset",
     "is_pinned", "unflatten", "view_as", "expand_as", "flatten", "ravel",
 }  # fmt: skip
 """Operations that launch nothing."""
 _WAITING = {
     "_local_scalar_dense", "item", "nonzero", "masked_select", "unique", "_unique2",
-    "unique_consecutive", "unique_dim", "is_nonzero", "equal", "_linalg_check_errors", "bincount",
+    "unique_consecutive", "unique_dim", "is_nonzero", "equal", "_linalg_check_errors",
+    "bincount",
 }  # fmt: skip
 """Operations whose result the host needs before it can go on."""
+_OF_THE_HOST = {"_local_scalar_dense", "equal", "is_nonzero", "item"}
+"""Operations whose result is no tensor."""
 _RESHAPING = {"squeeze_", "unsqueeze_", "t_", "transpose_", "swapaxes_", "as_strided_"}
 """Operations that change a shape in place."""
 
@@ -172,25 +176,28 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     tensors = [x for x in pytree.tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
     ours = [x for x in tensors if isinstance(x, StandInTensor)]
     name = _name(func)
-    wanted = kwargs.get("device")
     if name == "_to_copy":
         return _to_copy(func, args, kwargs, ours)
     if name == "copy_":
         return _copy(args)
-    if not ours and not _is_ours(wanted):
+    if not ours and not _is_ours(kwargs.get("device")):
         return func(*args, **kwargs)
     if ours:
         _check_devices(func, name, tensors)
+    _count(name, args)
+    return (
+        _reshape(func, args, kwargs) if name in _RESHAPING else _compute(func, args, kwargs)
+    )
+
+
+def _compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    """Do an operation on the values; wrap what it returns."""
+    wanted = kwargs.get("device")
     if wanted is not None:
         kwargs = {**kwargs, "device": torch.device("cpu")}
-    _count(name, args)
-    if name in _RESHAPING:
-        return _reshape(func, args, kwargs)
     plain_args, plain = pytree.tree_map(_unwrap, (args, kwargs))
     found = func(*plain_args, **plain)
-    if name in ("_local_scalar_dense", "equal", "is_nonzero", "item"):
-        return found
-    if wanted is not None and not _is_ours(wanted):
+    if _name(func) in _OF_THE_HOST or (wanted is not None and not _is_ours(wanted)):
         return found
     written = _written(func, args, kwargs)
     return pytree.tree_map(
@@ -199,7 +206,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def _reshape(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    """Change the shape of a tensor in place: of its values, and of what it says of itself."""
+    """Change a shape in place: that of the values, and that of the tensor."""
     func(_unwrap(args[0]), *args[1:], **kwargs)
     with no_dispatch():
         before = torch._C._meta_in_tls_dispatch_include()
