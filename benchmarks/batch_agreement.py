@@ -32,6 +32,7 @@ from rollout import Case, ThroughputMeter, make_network
 from infgen.clock import CLOCK
 from infgen.config import RolloutSettings, TokenSettings
 from infgen.model.network import Network
+from infgen.model.relations import Rows
 from infgen.model.step_memory import StepMemory
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import MotionStep, TokenStep
@@ -43,7 +44,7 @@ from infgen.scene import Scene
 from infgen.tokens.tokenizer import tokenize_scene
 from pipeline.storage.weights import load_network
 
-SAMPLED = ("life", "agent_type", "motion_token", "presence")
+SAMPLED = ("agent_number", "agent_type", "motion_token", "presence")
 
 
 class Saying(Stepper):
@@ -51,9 +52,11 @@ class Saying(Stepper):
 
     said: MotionStep | None = None
 
-    def motion_step(self, memory: StepMemory, column: TokenStep) -> MotionStep:
+    def motion_step(
+        self, memory: StepMemory, token_step: TokenStep, rows: Rows | None = None
+    ) -> MotionStep:
         """Append a column to the past and say what follows it."""
-        self.said = super().motion_step(memory, column)
+        self.said = super().motion_step(memory, token_step, rows)
         return self.said
 
 
@@ -111,7 +114,7 @@ def _parted(single: Population, together: Population, at: int) -> str:
         for name in SAMPLED
         if not np.array_equal(getattr(single, name)[0], getattr(together, name)[at])
     ]
-    return "entries" if "life" in differ else " and ".join(differ)
+    return "insertions" if "agent_number" in differ else " and ".join(differ)
 
 
 def _gap(single: MotionStep | None, together: MotionStep | None, at: int) -> float:

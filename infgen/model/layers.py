@@ -264,7 +264,7 @@ class Attention(nn.Module):
         # Fused optimizers write without a new version, but only in training.
         parts = [self.key, self.value, self.relation_key, self.relation_value]
         weights = [part.weight for part in (*parts, self.source_norm(), self.norm_relation)]
-        device = weights[0].device
+        device = self.key.weight.device
         versions = tuple((id(each), each._version) for each in weights)
         now = (device, torch.is_autocast_enabled(device.type), versions)
         if self._kept_fold is None or self._kept_fold[0] != now:

@@ -63,17 +63,17 @@ class Simulator:
 
     def tensor(self, values: np.ndarray) -> Tensor:
         """Bring an array to the network's device; the host does not wait for that."""
-        values = torch.from_numpy(values)
+        tensor = torch.from_numpy(values)
         if self.device.type == "cpu":
-            return values
-        return values.pin_memory().to(self.device, non_blocking=True)
+            return tensor
+        return tensor.pin_memory().to(self.device, non_blocking=True)
 
     def fetch(self, *tensors: Tensor) -> list[np.ndarray]:
         """Bring tensors to the host, all in one copy: the host waits once."""
         if self.device.type == "cpu":
             return [each.numpy() for each in tensors]
         parts = [each.contiguous().view(torch.uint8).flatten() for each in tensors]
-        held = torch.cat(parts).cpu().split([len(part) for part in parts])
+        held = torch.split(torch.cat(parts).cpu(), [len(part) for part in parts])
         return [
             part.clone().view(each.dtype).view(each.shape).numpy()
             for part, each in zip(held, tensors, strict=True)
