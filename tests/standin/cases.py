@@ -10,7 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tests.standin.device import StandIn, Tally, counted, set_up
+from tests.standin.device import (
+    MixedDevicesError,
+    StandIn,
+    Tally,
+    counted,
+    set_up,
+)
 
 DEVICE = set_up()
 
@@ -18,6 +24,7 @@ import numpy as np  # noqa: E402
 import torch  # noqa: E402
 
 from infgen.config import ModelSettings, RolloutSettings, TokenSettings, TrainSettings  # noqa: E402
+from infgen.model.network import Network  # noqa: E402
 from infgen.model.stepping import Stepper  # noqa: E402
 from infgen.model.training.losses import losses  # noqa: E402
 from infgen.pretrained import builtin_weights  # noqa: E402
@@ -59,9 +66,15 @@ def town() -> Scene:
     return scene
 
 
-def session(device: torch.device, count: int, settings: dict[str, Any]) -> Session:
-    """Start rollouts of a town with the package's weights."""
-    network = load_network(builtin_weights()).to(device).eval()
+def session(
+    device: torch.device,
+    count: int,
+    settings: dict[str, Any],
+    network: Network | None = None,
+) -> Session:
+    """Start rollouts of a town, with the package's weights if no others are given."""
+    network = network or load_network(builtin_weights())
+    network = network.to(device).eval()
     how = RolloutSettings(**{"seconds": 4.0, "batch_rollouts": count, **settings})
     simulator = Simulator(
         Stepper(network),
@@ -112,6 +125,24 @@ def costs(tally: Tally) -> Found:
         "waits": sum(tally.waits.values()),
         "words": tally.words(),
     }
+
+
+def counts(rollouts: str, mode: str, relation_width: str = "0") -> Found:
+    """What a token step costs at the paper's sizes."""
+    known = load_network(builtin_weights())
+    torch.manual_seed(0)
+    network = Network(
+        ModelSettings(relation_width=int(relation_width)),
+        known.motion_vocabulary(),
+        known.map_vocabulary(),
+        known.grid_settings,
+    )
+    with StandIn():
+        ours = session(DEVICE, int(rollouts), {"mode": mode}, network)
+        ours.step()
+        with counted() as tally:
+            ours.step()
+    return costs(tally)
 
 
 TINY = ModelSettings(
@@ -225,8 +256,41 @@ def compiled(shards: str, name: str) -> Found:
     }
 
 
+def device() -> Found:
+    """What the device refuses, and what it counts as waiting."""
+    with StandIn():
+        ones = torch.ones(4).to(DEVICE)
+        refused = []
+        for other in (torch.ones(4), torch.tensor(2.0)):
+            try:
+                ones + other
+            except MixedDevicesError as error:
+                refused.append(str(error).splitlines()[0])
+        waits = {
+            "to the device": lambda: torch.ones(4).to(DEVICE),
+            "from pinned memory": lambda: (
+                torch.ones(4).pin_memory().to(DEVICE, non_blocking=True)
+            ),
+            "to the host": lambda: ones.cpu(),
+            "a number": lambda: float(ones.sum()),
+            "places of a mask": lambda: ones[ones > 0],
+            "a sum": lambda: ones.sum(),
+        }
+        found = {}
+        for name, act in waits.items():
+            with counted() as tally:
+                act()
+            found[name] = [sum(tally.kernels.values()), sum(tally.waits.values())]
+        leaf = torch.ones(4).to(DEVICE).requires_grad_()
+        (torch.nn.functional.linear(leaf, torch.eye(4).to(DEVICE)) ** 2).sum().backward()
+        gradient = leaf.grad.cpu().tolist() if leaf.grad is not None else []
+    return {"refused": refused, "counts": found, "gradient": gradient}
+
+
 CASES: dict[str, Callable[..., Found]] = {
     "compiled": compiled,
+    "counts": counts,
+    "device": device,
     "resuming": resuming,
     "rollout": rollout,
     "training": training,
