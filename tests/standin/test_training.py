@@ -14,7 +14,7 @@ MOST = {
     "no-remove-token": (6270, 90),
     "no-position-token": (6300, 90),
     "no-heading-token": (6370, 90),
-    "patterns": (3390, 60),
+    "patterns": (3390, 64),
 }
 
 
