@@ -7,13 +7,12 @@ of relations, H heads, C width of one head, F scalars, P nodes of a table.
 import math
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from infgen.model.neighbour_attention import Shared, attend_to_pairs
+from infgen.model.neighbour_attention import PairWeights, Shared, attend_to_pairs
 from infgen.model.settings import ModelSettings
 
 FEED_FORWARD = 4
@@ -145,24 +144,6 @@ class AttentionSources:
         )
 
 
-class _Folded(NamedTuple):
-    """Weights of an attention layer with the gains and biases of its norms folded in.
-
-    Attributes:
-        key: For features [H, C, D].
-        value: For features [H, C, D].
-        relation_key: For relations [H, C, R].
-        relation_value: For relations [H, C, R].
-        value_bias: What biases add to every value [H, C]; in keys they cancel out.
-    """
-
-    key: Tensor
-    value: Tensor
-    relation_key: Tensor
-    relation_value: Tensor
-    value_bias: Tensor
-
-
 class Attention(nn.Module):
     """Let targets look at their neighbours; gated update and feed-forward (SPEC 4.1).
 
@@ -200,7 +181,7 @@ class Attention(nn.Module):
             nn.Linear(FEED_FORWARD * width, width),
             nn.LayerNorm(width),
         )
-        self._kept_fold: tuple[Hashable, _Folded] | None = None
+        self._kept_fold: tuple[Hashable, PairWeights] | None = None
 
     def train(self, mode: bool = True) -> "Attention":
         """Switch between training and evaluation; forget what was made of the weights."""
@@ -221,43 +202,31 @@ class Attention(nn.Module):
 
     def look(self, normal_NSD: Tensor, seen: AttentionSources) -> Tensor:
         """Sum what each slot sees: [N, S, D]; ``seen.present`` is [N, S, K]."""
-        targets, slots, width = normal_NSD.shape
-        heads = (targets, slots, self.heads)
-        query = self.query(normal_NSD).view(*heads, width // self.heads)
-        weights = self._folded()
-        query = query * query.shape[-1] ** -0.5
-        hidden = ~seen.present
-        if slots > 1:
-            hidden = hidden[:, :, None].expand(*heads, -1).flatten(1, 2)
+        width = normal_NSD.shape[-1]
+        query = self.query(normal_NSD).unflatten(-1, (self.heads, width // self.heads))
         looked = attend_to_pairs(
-            _per_head(query, weights.key),
-            _per_head(query, weights.relation_key),
+            query * query.shape[-1] ** -0.5,
+            self._folded(),
             seen.features,
             seen.index,
             seen.relation,
-            hidden,
-            self._kept(query.flatten(1, 2), hidden.shape[-1]),
+            ~seen.present,
+            self._kept(query, seen.index.shape[-1]),
         )
-        from_source = looked.features.view(*heads, width)
-        from_relation = looked.relation.view(*heads, looked.relation.shape[-1])
-        value = torch.einsum("nshd,hcd->nshc", from_source, weights.value)
-        value = value + torch.einsum(
-            "nshd,hcd->nshc", from_relation, weights.relation_value
-        )
-        return (value + looked.weight.view(*heads, 1) * weights.value_bias).flatten(2)
+        return looked.flatten(2)
 
-    def _kept(self, query_NQC: Tensor, neighbours: int) -> Tensor | None:
+    def _kept(self, query_NSHC: Tensor, neighbours: int) -> Tensor | None:
         """Factors of dropout on the weights of pairs, if there is any."""
         if not (self.training and self.dropout):
             return None
-        like = query_NQC.new_empty((*query_NQC.shape[:2], neighbours))
+        like = query_NSHC.new_empty((*query_NSHC.shape[:3], neighbours))
         return dropout_factors(like, self.dropout)
 
     def source_norm(self) -> nn.LayerNorm:
         """Norm of the neighbours' features: the targets' own unless they differ."""
         return self.norm_target if self.norm_source is None else self.norm_source
 
-    def _folded(self) -> _Folded:
+    def _folded(self) -> PairWeights:
         """Fold the norms into the weights: in evaluation once, until the weights change."""
         if self.training or torch.is_grad_enabled():
             return self._fold()
@@ -271,21 +240,16 @@ class Attention(nn.Module):
             self._kept_fold = now, self._fold()
         return self._kept_fold[1]
 
-    def _fold(self) -> _Folded:
+    def _fold(self) -> PairWeights:
         def fold(linear: nn.Linear, norm: nn.LayerNorm) -> Tensor:
             return (linear.weight * norm.weight).view(self.heads, -1, len(norm.weight))
 
         source, relation = self.source_norm(), self.norm_relation
         bias = self.value(source.bias) + self.relation_value(relation.bias)
-        return _Folded(
+        return PairWeights(
             key=fold(self.key, source),
             value=fold(self.value, source),
             relation_key=fold(self.relation_key, relation),
             relation_value=fold(self.relation_value, relation),
             value_bias=bias.view(self.heads, -1),
         )
-
-
-def _per_head(query_NSHC: Tensor, weight_HCD: Tensor) -> Tensor:
-    """Bring queries to the space of normed features: [N, S H, D]."""
-    return torch.einsum("nshc,hcd->nshd", query_NSHC, weight_HCD).flatten(1, 2)

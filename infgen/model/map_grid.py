@@ -30,7 +30,7 @@ class MapGrid:
         size: Squares along x and y: of the largest map.
         start: Where each square's tokens begin in ``order``; then their number.
         order: Tokens by square, those that are none last.
-        xy_m: Where the tokens are, in their own order.
+        xy_m: Where the tokens are, in the order of ``order``.
         longest: Most tokens of so many consecutive squares, as far as it is known.
     """
 
@@ -58,7 +58,8 @@ class MapGrid:
         ordered, order = square.sort(dim=1, stable=True)
         squares = torch.arange(rows * columns + 1, device=pose.device)
         start = torch.searchsorted(ordered, squares.expand(len(pose), -1).contiguous())
-        return cls(corner_m, (columns, rows), start, order, xy_m)
+        ordered_m = xy_m.gather(1, order[..., None].expand_as(xy_m))
+        return cls(corner_m, (columns, rows), start, order, ordered_m)
 
     @torch.no_grad()
     def nearest(
@@ -91,10 +92,14 @@ class MapGrid:
 
         def listed(at: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             part = slice(at, at + block)
-            place, there = self._listed(xy_m[part], scene[part], radius_m)
+            at, there = self._listed(xy_m[part], scene[part], radius_m)
+            place = self.order.flatten().index_select(0, at.flatten()).view_as(at)
+            # A pair of numbers at a time: the look-up costs as much as the search.
+            pairs = torch.view_as_complex(self.xy_m).flatten()
+            listed_m = torch.view_as_real(pairs.index_select(0, at.flatten()))
             if itself is not None:
                 there &= place != itself[part, None]
-            return xy_m[part], self.xy_m[scene[part][:, None], place], place, there
+            return xy_m[part], listed_m.view(*at.shape, 2), place, there
 
         # One at a time: what a part lists stays in the cache until it is searched.
         parts = map(listed, range(0, max(1, len(xy_m)), block))
@@ -103,7 +108,10 @@ class MapGrid:
     def _listed(
         self, xy_m: Tensor, scene: Tensor, radius_m: float
     ) -> tuple[Tensor, Tensor]:
-        """Tokens [row, listed] of the squares that a circle touches; which there are."""
+        """Tokens [row, listed] of the squares that a circle touches; which there are.
+
+        They are named by where all maps' tokens, one map after the other, are in ``order``.
+        """
         columns, rows = self.size
         here_m, reach_m = xy_m - self.corner_m[scene], radius_m + MARGIN_M
         low, high = _squares(here_m - reach_m), _squares(here_m + reach_m)
@@ -121,8 +129,9 @@ class MapGrid:
         longest = self._longest(length, most)
         steps = torch.arange(longest, device=row.device)
         there = steps < length[..., None]  # [target, row, step]
+        begin = begin + scene[:, None] * self.order.shape[1]
         at = torch.where(there, begin[..., None] + steps, 0).flatten(1)
-        return self.order[scene[:, None], at], there.flatten(1)
+        return at, there.flatten(1)
 
     def _longest(self, length: Tensor, squares: int) -> int:
         """Most tokens of one row of so many squares, of those asked for or of the map.

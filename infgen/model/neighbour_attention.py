@@ -3,12 +3,13 @@
 What is big here is what there is per pair: the neighbours' features, gathered from the
 rows of all sources, and their relations to the target, which many layers share. Left to
 autograd both would be kept, or made anew, for every layer. Instead targets are taken a few
-at a time, so that their pairs stay in the processor's cache: features are gathered when
-they are used, again in the backward pass, and the gradient of shared relations is summed
-in place.
+at a time, so that everything about them stays in the processor's cache: queries are brought
+to the space of features, and sums back from it, when they are used; features are gathered
+again in the backward pass, and the gradient of shared relations is summed in place.
 
-Shape letters as in ``layers``, Q queries of a target (its slots times its heads), and M
-rows of sources.
+Shape letters as in ``layers``: N targets, S slots, H heads, C width of a head, K
+neighbours, D width of features, R of relations, M rows of sources; T are the slots of a few
+targets, and Q the queries of a target, its slots times its heads.
 """
 
 from collections.abc import Iterator
@@ -21,8 +22,10 @@ from torch.autograd.function import once_differentiable
 
 HIDDEN_SCORE = -1e9
 """Score of what a target does not see: its weight is exactly zero beside any other."""
-CACHED_NUMBERS = 1 << 18
-"""Numbers of one kind per pair that are held at once on a CPU: some of its cache."""
+CACHED_NUMBERS = 1 << 19
+"""Numbers about targets that are held at once on a CPU: some of its cache."""
+VECTOR_NUMBERS = 16
+"""Softmax over fewer numbers than a vector register holds is made of plain operations."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -60,7 +63,7 @@ class Shared:
 
 @dataclass(slots=True)
 class _Sum:
-    """A sum that grows in place; empty until something is added."""
+    """A float32 sum that grows in place; empty until something is added."""
 
     tensor: Tensor | None = field(default=None)
 
@@ -78,77 +81,69 @@ class _Ticket(torch.autograd.Function):
         return summed, None
 
 
-class AttentionResult(NamedTuple):
-    """What queries saw.
+class PairWeights(NamedTuple):
+    """Weights of keys and values, the gains and biases of norms folded in.
 
     Attributes:
-        features: Neighbours' features summed by weight [N, Q, D].
-        relation: Their relations summed by weight [N, Q, R].
-        weight: Sum of the weights [N, Q]: 1, but for dropout, or 0 without neighbours.
+        key: Of features [H, C, D].
+        value: Of features [H, C, D].
+        relation_key: Of relations [H, C, R].
+        relation_value: Of relations [H, C, R].
+        value_bias: Added to every value [H, C]; in keys a bias would cancel out.
     """
 
-    features: Tensor
-    relation: Tensor
-    weight: Tensor
+    key: Tensor
+    value: Tensor
+    relation_key: Tensor
+    relation_value: Tensor
+    value_bias: Tensor
 
 
 def attend_to_pairs(
-    by_features: Tensor,
-    by_relation: Tensor,
+    query: Tensor,
+    weights: PairWeights,
     features: Tensor,
     index: Tensor,
     relation: Shared,
     hidden: Tensor,
     kept: Tensor | None,
-) -> AttentionResult:
-    """Weigh neighbours by the softmax of their scores, and sum them.
+) -> Tensor:
+    """Weigh the values of neighbours by the softmax of their scores, and sum them.
 
     Args:
-        by_features: Queries for features [N, Q, D]; the score is the sum of both products.
-        by_relation: Queries for relations [N, Q, R].
+        query: Scaled queries [N, S, H, C].
+        weights: Of keys and values.
         features: Of all sources [M, D].
         index: Row of each neighbour among them [N, K].
         relation: Of the neighbours [N, K, R].
-        hidden: Which neighbours there are not [N, Q, K], or [N, 1, K] for all queries.
-        kept: Factor on each weight for dropout [N, Q, K], or None.
+        hidden: Which neighbours a slot does not see [N, S, K].
+        kept: Factor on each weight for dropout [N, S, H, K], or None.
+
+    Returns:
+        Sums [N, S, H, C]; zero for a slot that sees nobody.
     """
-    kind = by_features.dtype  # The queries' own: low precision under autocast.
-    shared = relation.of_kind(kind), relation.ticket, relation.pulled
+    kind = query.dtype  # The queries' own: low precision under autocast.
+    weights = PairWeights(*(weight.to(kind) for weight in weights))
     kept = None if kept is None else kept.to(kind)
-    # Batches of products are slow where the queries lie head by head, as they may come.
-    queries = by_features.contiguous(), by_relation.contiguous()
-    pairs = (*queries, features.to(kind), index, *shared, hidden, kept)
-    with torch.autocast(by_features.device.type, enabled=False):
-        return AttentionResult(*_Pairs.apply(*pairs))  # type: ignore[no-untyped-call]
+    sources = features.to(kind), index, relation.of_kind(kind)
+    shared = relation.ticket, relation.pulled
+    with torch.autocast(query.device.type, enabled=False):
+        summed: Tensor = _Attend.apply(  # type: ignore[no-untyped-call]
+            query.contiguous(), *weights, *sources, *shared, hidden, kept
+        )
+    return summed
 
 
-@dataclass(frozen=True, slots=True)
-class _Cover:
-    """What hides neighbours from queries: added to scores, and what is left of weights."""
-
-    score: Tensor
-    blind: Tensor | None
-
-    @classmethod
-    def of(cls, hidden: Tensor, like: Tensor) -> "_Cover":
-        score = like.new_zeros(hidden.shape).masked_fill_(hidden, HIDDEN_SCORE)
-        blind = hidden.all(dim=-1, keepdim=True)
-        # Looking whether anybody is blind saves a pass, but would make a GPU wait.
-        needed = blind.device.type != "cpu" or bool(blind.any())
-        return cls(score, blind if needed else None)
-
-    def weigh(self, score: Tensor, part: slice) -> Tensor:
-        """Turn scores into weights; a query without neighbours has none."""
-        weight = score.softmax(dim=-1)
-        return weight if self.blind is None else weight.masked_fill_(self.blind[part], 0.0)
-
-
-class _Pairs(torch.autograd.Function):
+class _Attend(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        by_features: Tensor,
-        by_relation: Tensor,
+        query: Tensor,
+        key: Tensor,
+        value: Tensor,
+        relation_key: Tensor,
+        relation_value: Tensor,
+        value_bias: Tensor,
         features: Tensor,
         index: Tensor,
         relation: Tensor,
@@ -156,89 +151,188 @@ class _Pairs(torch.autograd.Function):
         pulled: _Sum,
         hidden: Tensor,
         kept: Tensor | None,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        shape = (*by_features.shape[:2], index.shape[1])
+    ) -> Tensor:
         learns = any(ctx.needs_input_grad)
-        weight = by_features.new_empty(shape if learns else (0, *shape[1:]))
-        total = by_features.new_empty(shape[:2])
-        saw, related = torch.empty_like(by_features), torch.empty_like(by_relation)
-        cover = _Cover.of(hidden, by_features)
-        for part, near in _parts(features, index):
-            score = torch.baddbmm(
-                cover.score[part], by_features[part], near.transpose(1, 2)
+        queries = query.shape[1] * query.shape[2]
+        count = len(query) if learns else 0
+        weight = query.new_empty((count, queries, index.shape[1]))
+        saw = query.new_empty((count, queries, features.shape[1]))
+        related = query.new_empty((count, queries, relation.shape[2]))
+        summed = torch.empty_like(query)
+        blind = _blind(hidden)
+        for part, near in _parts(query, features, index):
+            used = _scores(
+                (_widen(query[part], key), _widen(query[part], relation_key)),
+                (near, relation[part]),
+                hidden[part],
             )
-            score.baddbmm_(by_relation[part], relation[part].transpose(1, 2))
-            used = cover.weigh(score, part)
+            used = _softmax(used).to(query.dtype)
+            if blind is not None:
+                _by_slot(used, hidden[part]).masked_fill_(blind[part, :, None], 0.0)
             if learns:
                 weight[part] = used
-            used = used if kept is None else used.mul_(kept[part])
-            torch.bmm(used, near, out=saw[part])
-            torch.bmm(used, relation[part], out=related[part])
-            torch.sum(used, dim=-1, out=total[part])
+            if kept is not None:
+                used = used * kept[part].flatten(1, 2)
+            looked, beside = torch.bmm(used, near), torch.bmm(used, relation[part])
+            if learns:
+                saw[part], related[part] = looked, beside
+            found = torch.bmm(_by_head(looked, key), value.mT)
+            found.baddbmm_(_by_head(beside, key), relation_value.mT)
+            summed[part] = found.transpose(0, 1).view_as(summed[part])
+            total = used.sum(dim=-1).view(*summed[part].shape[:3], 1)
+            summed[part].addcmul_(total, value_bias)
         ctx.save_for_backward(
-            by_features, by_relation, features, index, relation, weight, kept
-        )
+            query, key, value, relation_key, relation_value, value_bias,
+            features, index, relation, weight, saw, related, kept,
+        )  # fmt: skip
         ctx.pulled = pulled
-        return saw, related, total
+        return summed
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *pulls: Tensor) -> tuple[Tensor | None, ...]:
-        by_features, by_relation, features, index, relation, weight, kept = (
-            ctx.saved_tensors
-        )
-        pull_features, pull_relation, pull_total = (pull.contiguous() for pull in pulls)
-        shared = ctx.needs_input_grad[5]
-        to_queries, to_relation_queries = (
-            torch.empty_like(by_features),
-            torch.empty_like(by_relation),
-        )
-        to_features = torch.zeros_like(features)
+    def backward(ctx: Any, pull: Tensor) -> tuple[Tensor | None, ...]:
+        (
+            query, key, value, relation_key, relation_value, value_bias,
+            features, index, relation, weight, saw, related, kept,
+        ) = ctx.saved_tensors  # fmt: skip
+        pull = pull.contiguous()
+        to_query, to_features = torch.empty_like(query), torch.zeros_like(features)
+        to_key, to_value = torch.zeros_like(key), torch.zeros_like(value)
+        to_relation_key = torch.zeros_like(relation_key)
+        to_relation_value = torch.zeros_like(relation_value)
+        to_bias = torch.zeros_like(value_bias)
+        shared = ctx.needs_input_grad[9]
         first = ctx.pulled.tensor is None
         if shared and first:
-            ctx.pulled.tensor = torch.empty_like(relation)
-        for part, near in _parts(features, index):
-            pull = torch.bmm(pull_features[part], near.transpose(1, 2))
-            pull.baddbmm_(pull_relation[part], relation[part].transpose(1, 2))
-            pull.add_(pull_total[part, :, None])
-            used = weight[part]
-            if kept is not None:
-                pull.mul_(kept[part])
-            pull.sub_((pull * used).sum(dim=-1, keepdim=True)).mul_(used)  # The score's.
-            used = used if kept is None else used * kept[part]
-            torch.bmm(pull, near, out=to_queries[part])
-            torch.bmm(pull, relation[part], out=to_relation_queries[part])
-
-            both = torch.cat([pull, used], dim=1).transpose(1, 2)  # [N, K, 2 Q]
-            to_near = torch.bmm(both, _beside(by_features, pull_features, part))
-            to_features += torch.ops.aten.embedding_dense_backward(
-                to_near.flatten(0, 1), index[part].flatten(), len(features), -1, False
+            ctx.pulled.tensor = torch.empty_like(relation, dtype=torch.float32)
+        for part, near in _parts(query, features, index):
+            to_saw, to_related = (
+                _widen(pull[part], value),
+                _widen(pull[part], relation_value),
             )
-            if not shared:
-                continue
-            queries = _beside(by_relation, pull_relation, part)
-            if first:
-                torch.bmm(both, queries, out=ctx.pulled.tensor[part])
-            else:
-                ctx.pulled.tensor[part].baddbmm_(both, queries)
+            used, factor = weight[part], 1.0
+            if kept is not None:
+                factor = kept[part].flatten(1, 2)
+            dropped = used * factor
+            to_score = torch.bmm(to_saw, near.mT)
+            to_score.baddbmm_(to_related, relation[part].mT)
+            to_total = (pull[part] * value_bias).sum(dim=-1).flatten(1)
+            to_score.add_(to_total[..., None]).mul_(factor)
+            to_score.sub_((to_score * used).sum(dim=-1, keepdim=True)).mul_(used)
+
+            asked = torch.bmm(to_score, near), torch.bmm(to_score, relation[part])
+            pulled = torch.bmm(_by_head(asked[0], key), key.mT)
+            pulled.baddbmm_(_by_head(asked[1], key), relation_key.mT)
+            to_query[part] = pulled.transpose(0, 1).view_as(to_query[part])
+
+            given = query[part].flatten(0, 1).permute(1, 2, 0)  # [H, C, T]
+            to_key.baddbmm_(given, _by_head(asked[0], key))
+            to_relation_key.baddbmm_(given, _by_head(asked[1], key))
+            given = pull[part].flatten(0, 1).permute(1, 2, 0)
+            to_value.baddbmm_(given, _by_head(saw[part], key))
+            to_relation_value.baddbmm_(given, _by_head(related[part], key))
+            total = dropped.sum(dim=-1).view(*pull[part].shape[:3], 1)
+            to_bias += (pull[part] * total).sum(dim=(0, 1))
+
+            both = torch.cat([to_score, dropped], dim=1).mT  # [N, K, 2 Q]
+            widened = torch.cat([_widen(query[part], key), to_saw], dim=1)
+            _add_rows(to_features, index[part], torch.bmm(both, widened))
+            if shared:
+                widened = torch.cat([_widen(query[part], relation_key), to_related], dim=1)
+                _add_product(ctx.pulled.tensor[part], both, widened, first=first)
         ticket = relation.new_zeros(()) if shared else None
         return (
-            to_queries, to_relation_queries, to_features,
-            None, None, ticket, None, None, None,
+            to_query, to_key, to_value, to_relation_key, to_relation_value, to_bias,
+            to_features, None, None, ticket, None, None, None,
         )  # fmt: skip
 
 
-def _beside(one: Tensor, other: Tensor, part: slice) -> Tensor:
-    return torch.cat([one[part], other[part]], dim=1)
-
-
-def _parts(features: Tensor, index: Tensor) -> Iterator[tuple[slice, Tensor]]:
+def _parts(
+    query: Tensor, features: Tensor, index: Tensor
+) -> Iterator[tuple[slice, Tensor]]:
     """Take targets a few at a time; yield which, and their neighbours' features."""
     targets, neighbours = index.shape
     few = max(1, targets)
     if features.device.type == "cpu":
-        few = max(1, CACHED_NUMBERS // max(1, neighbours * features.shape[1]))
+        queries = query.shape[1] * query.shape[2]
+        few = max(1, CACHED_NUMBERS // ((neighbours + 2 * queries) * features.shape[1]))
+    few = min(few, max(1, targets))
+    # One buffer for all of them: a fresh one each time costs more than to fill it.
+    buffer = features.new_empty((few, neighbours, features.shape[1]))
     for start in range(0, targets, few):
         part = slice(start, min(start + few, targets))
-        near = features.index_select(0, index[part].flatten())
-        yield part, near.view(part.stop - part.start, neighbours, features.shape[1])
+        near = buffer[: part.stop - part.start]
+        rows = near.flatten(0, 1)
+        torch.index_select(features, 0, index[part].flatten(), out=rows)
+        yield part, near
+
+
+def _blind(hidden: Tensor) -> Tensor | None:
+    """Mark the slots [N, S, 1] that see nobody; None if it is known that there are none."""
+    blind = hidden.all(dim=-1, keepdim=True)
+    # Looking whether there are any saves a pass, but would make a GPU wait.
+    return blind if blind.device.type != "cpu" or bool(blind.any()) else None
+
+
+def _widen(narrow: Tensor, weight_HCD: Tensor) -> Tensor:
+    """Bring what each head has [N, S, H, C] to the space of features: [N, Q, D]."""
+    rows = narrow.flatten(0, 1)
+    wide = rows.new_empty((*rows.shape[:2], weight_HCD.shape[2]))
+    # Written where it belongs: the copy would cost as much as the product.
+    torch.bmm(rows.transpose(0, 1), weight_HCD, out=wide.transpose(0, 1))
+    return wide.view(len(narrow), narrow.shape[1:3].numel(), weight_HCD.shape[2])
+
+
+def _by_head(wide: Tensor, weight_HCD: Tensor) -> Tensor:
+    """View queries [N, Q, D] head by head: [H, T, D]."""
+    heads = len(weight_HCD)
+    rows = wide.shape[:2].numel() // heads
+    return wide.view(rows, heads, wide.shape[-1]).transpose(0, 1)
+
+
+def _by_slot(score: Tensor, hidden: Tensor) -> Tensor:
+    """View numbers of queries [N, Q, K] slot by slot: [N, S, H, K]."""
+    targets, slots, neighbours = hidden.shape
+    return score.view(targets, slots, score.shape[1] // slots, neighbours)
+
+
+def _scores(
+    queries: tuple[Tensor, Tensor], sources: tuple[Tensor, Tensor], hidden: Tensor
+) -> Tensor:
+    """Scores [N, Q, K] of features and relations together, in float32."""
+    score = torch.bmm(queries[0], sources[0].mT)
+    if score.dtype == torch.float32:
+        score.baddbmm_(queries[1], sources[1].mT)
+    else:
+        score = score.float() + torch.bmm(queries[1], sources[1].mT)
+    _by_slot(score, hidden).masked_fill_(hidden[:, :, None], HIDDEN_SCORE)
+    return score
+
+
+def _softmax(score: Tensor) -> Tensor:
+    """Softmax over neighbours, in place where that is quicker."""
+    if score.device.type != "cpu" or not 0 < score.shape[-1] < VECTOR_NUMBERS:
+        return score.softmax(dim=-1)
+    # Torch takes so few numbers one by one, five times as long as this.
+    score.sub_(score.amax(dim=-1, keepdim=True)).exp_()
+    return score.div_(score.sum(dim=-1, keepdim=True))
+
+
+def _add_rows(rows: Tensor, index: Tensor, values: Tensor) -> None:
+    """Add values [N, K, D] to the rows [M, D] that an index [N, K] names."""
+    index, values = index.flatten(), values.flatten(0, 1)
+    if rows.device.type == "cpu":
+        rows.index_add_(0, index, values)
+    else:  # There ``index_add_`` adds in any order.
+        rows += torch.ops.aten.embedding_dense_backward(values, index, len(rows), -1, False)
+
+
+def _add_product(total: Tensor, one: Tensor, other: Tensor, *, first: bool) -> None:
+    """Add products to a float32 total; the first ones are written over what it holds."""
+    if one.dtype != total.dtype:
+        product = torch.bmm(one, other)
+        total.copy_(product) if first else total.add_(product)
+    elif first:
+        torch.bmm(one, other, out=total)
+    else:
+        total.baddbmm_(one, other)

@@ -13,11 +13,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from infgen.model import neighbour_attention
 from infgen.model.layers import FourierEmbedding
 
 NORM_EPS = 1e-5
 """What norms add to a variance, as torch's do."""
+CACHED_NUMBERS = 1 << 18
+"""Numbers of relations that are held at once on a CPU: some of its cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +163,7 @@ def _parts(nodes: Tensor, table_PD: Tensor) -> list[slice]:
     count = len(nodes)
     few = max(1, count)
     if nodes.device.type == "cpu":
-        few = max(1, neighbour_attention.CACHED_NUMBERS // table_PD.shape[1])
+        few = max(1, CACHED_NUMBERS // table_PD.shape[1])
     return [slice(start, min(start + few, count)) for start in range(0, count, few)]
 
 

@@ -139,13 +139,15 @@ class Stepper:
         sight = self._context(memory, token_step, rows)
         x = x if sight.light is None else x + sight.light
         place = memory.columns % memory.window
+        ring = torch.arange(memory.window, device=visible.device)
+        past_index = rows.at[:, None] * memory.window + ring
         for block, past in zip(motion.blocks, memory.features, strict=True):
             before = normed(x)
-            own = AttentionSources.own(
-                rows.pack(past), sight.past_relation, sight.past_present
+            own = AttentionSources(
+                past.flatten(0, 2), past_index, sight.past_relation, sight.past_present
             )
             x = block(x, own, sight)
-            past[:, :, place] = rows.spread(before)
+            past.flatten(0, 1)[rows.at, place] = before
         memory.pose[:, :, place] = token_step.pose
         memory.visible[:, :, place] = visible
         memory.columns += 1

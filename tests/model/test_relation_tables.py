@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from infgen.model import neighbour_attention
+from infgen.model import relation_tables
 from infgen.model.layers import FourierEmbedding, initialise, normed
 from infgen.model.relation_tables import RelationEmbedding, Span
 
@@ -81,7 +81,7 @@ def test_pairs_embedded_in_parts_are_those_embedded_at_once(relation, monkeypatc
         return found, *torch.autograd.grad(found[..., :5].square().sum(), parameters)
 
     whole = run()
-    monkeypatch.setattr(neighbour_attention, "CACHED_NUMBERS", 4 * WIDTH)
+    monkeypatch.setattr(relation_tables, "CACHED_NUMBERS", 4 * WIDTH)
     for part, other in zip(run(), whole, strict=True):
         torch.testing.assert_close(part, other, atol=1e-4, rtol=1e-4)
 
