@@ -90,8 +90,8 @@ class MapGrid:
         across = math.ceil(2 * radius_m / SIDE_M) + 1
         block = block_length(across * across * 4, xy_m.device)
 
-        def listed(at: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-            part = slice(at, at + block)
+        def listed(begin: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+            part = slice(begin, begin + block)
             at, there = self._listed(xy_m[part], scene[part], radius_m)
             place = self.order.flatten().index_select(0, at.flatten()).view_as(at)
             # A pair of numbers at a time: the look-up costs as much as the search.
