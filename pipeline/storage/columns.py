@@ -8,7 +8,8 @@ values of every field (``tracks.xyz_m``), and the size of every named dimension 
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import is_dataclass
 from functools import cache
 from typing import (
@@ -148,7 +149,20 @@ class PackedRecords(Generic[T], Sequence[T]):
     depends on the type alone is computed once: training reads one record at a time.
     """
 
-    def __init__(self, columns: Columns, kind: type[T]) -> None:
+    def __init__(
+        self,
+        columns: Columns,
+        kind: type[T],
+        reading: Callable[[], AbstractContextManager[object]] = nullcontext,
+    ) -> None:
+        """Find where each record is.
+
+        Args:
+            columns: Values of all records.
+            kind: Their type.
+            reading: Entered around reading a record: keeps the file of the columns open.
+        """
+        self._reading = reading
         record: Any = (
             kind  # a type is hashable, whatever the type checker thinks of type[T]
         )
@@ -172,7 +186,9 @@ class PackedRecords(Generic[T], Sequence[T]):
             (int(starts[row]), int(starts[row + 1]), [int(size[row]) for size in sizes])
             for starts, sizes in self._offsets
         ]
-        return _make(self._layout, [_value_at(cut, all_offsets) for cut in self._slices])
+        with self._reading():
+            values = [_value_at(cut, all_offsets) for cut in self._slices]
+        return _make(self._layout, values)
 
     def __iter__(self) -> Iterator[T]:
         return (self[row] for row in range(len(self)))

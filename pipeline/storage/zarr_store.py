@@ -1,14 +1,15 @@
-"""Columns in Zarr groups, read whole or in parts.
+"""Columns in Zarr groups, each group one file, read whole or in parts.
 
-Every array is one chunk. Without ``compress`` its only codec is crc32c: the chunk file is
-the array followed by four bytes, and any part of it can be read alone. A missing chunk is
-an error, never zeros. Zarr is imported in functions: it takes a second, and neither
-``infgen status`` nor reading in parts needs it.
+Every array is one chunk. Without ``compress`` its only codec is crc32c: the chunk is the
+array followed by four bytes, and any part of it can be read alone. A missing chunk is an
+error, never zeros. Zarr is imported in functions: it takes a second, and neither ``infgen
+status`` nor reading in parts needs it.
 """
 
 import json
-import os
-from collections.abc import Mapping, Sequence
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from pipeline.engine.atomic import StoreError, publish, write_file, write_json
 from pipeline.storage.columns import Columns, PackedRecords, names, pack
+from pipeline.storage.group_file import StoredKey, open_group_file, write_group_file
 
 __all__ = [
     "DiskColumn",
@@ -35,21 +37,23 @@ T = TypeVar("T")
 CHECKSUM_BYTES = 4
 
 
-class DiskColumn:
-    """A column on disk, of which any part can be read; no file is kept open.
+METADATA = "zarr.json"
 
-    Memory maps would keep a descriptor and a mapping each. Training samples scenes from all
-    shards at once, and those of WOMD have 52,000 columns, while most systems allow a
-    process 1,024 descriptors and 65,530 mappings.
-    """
+
+class DiskColumn:
+    """A column on disk, of which any part can be read; no file is kept open."""
 
     __slots__ = ("_chunk", "_length", "dtype")
 
-    def __init__(self, chunk: Path, dtype: np.dtype, length: int) -> None:
-        self._chunk, self._length, self.dtype = str(chunk), length, dtype
+    def __init__(self, chunk: StoredKey, dtype: np.dtype, length: int) -> None:
+        self._chunk, self._length, self.dtype = chunk, length, dtype
 
     def __len__(self) -> int:
         return self._length
+
+    def reading(self) -> AbstractContextManager[object]:
+        """Keep the file open while several parts of it are read."""
+        return self._chunk.file.reading()
 
     def __getitem__(self, part: slice) -> np.ndarray:
         """Read a part.
@@ -60,17 +64,12 @@ class DiskColumn:
         start, stop, _ = part.indices(self._length)
         if stop <= start:
             return np.empty(0, self.dtype)
-        size = self.dtype.itemsize
-        try:
-            handle = os.open(self._chunk, os.O_RDONLY)
-            try:
-                data = os.pread(handle, (stop - start) * size, start * size)
-            finally:
-                os.close(handle)
-        except OSError as error:
-            raise StoreError(f"{self._chunk} cannot be read: {error}") from error
+        size, chunk = self.dtype.itemsize, self._chunk
+        data = chunk.file.read(chunk.extent.offset + start * size, (stop - start) * size)
         if len(data) != (stop - start) * size:
-            raise StoreError(f"{self._chunk} is cut short; `infgen verify` lists damage")
+            raise StoreError(
+                f"{chunk.file.path} is cut short; `infgen verify` lists damage"
+            )
         return np.frombuffer(data, self.dtype)
 
 
@@ -83,8 +82,8 @@ def write_group(
 ) -> None:
     """Write one-dimensional columns as a new Zarr v3 group.
 
-    Zarr builds the group in memory, and its files are then written directly: Zarr's own
-    local store starts a thread per file access, which doubles the time.
+    Zarr builds the group in memory, and its keys are then written directly: Zarr's own
+    stores start a thread per access, which doubles the time.
 
     Raises:
         FileExistsError: if the path exists.
@@ -112,10 +111,8 @@ def write_group(
         )
         if len(values):
             array[:] = values
-    path.mkdir(parents=True)
-    for key, data in files.items():
-        (path / key).parent.mkdir(parents=True, exist_ok=True)
-        (path / key).write_bytes(data.as_numpy_array().data)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_group_file(path, {key: data.to_bytes() for key, data in sorted(files.items())})
 
 
 def read_group(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -126,22 +123,37 @@ def read_group(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """
     import zarr  # noqa: PLC0415
 
-    _json(path / "zarr.json")
+    keys = open_group_file(path)
+    _json(path, keys, METADATA)
     columns = {}
-    try:
-        group = zarr.open_group(path, mode="r")
-        arrays = sorted(group.arrays())
-    except (ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{path} is damaged: {error}") from error
-    for name, array in arrays:
-        chunk = _chunk(path, name)
-        if array.size and not chunk.is_file():
-            raise StoreError(f"{chunk} is missing; `infgen verify` lists damage")
+    with _as_zarr_reads(path) as store:
         try:
-            columns[name] = np.asarray(array[:])
-        except (ValueError, RuntimeError) as error:
-            raise StoreError(f"{chunk} is damaged: {error}") from error
+            group = zarr.open_group(store, mode="r")
+            arrays = sorted(group.arrays())
+        except (ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+            raise StoreError(f"{path} is damaged: {error}") from error
+        for name, array in arrays:
+            if array.size and _chunk(name) not in keys:
+                raise StoreError(
+                    f"{path} lacks {_chunk(name)}; `infgen verify` lists damage"
+                )
+            try:
+                columns[name] = np.asarray(array[:])
+            except (ValueError, RuntimeError, OSError, zipfile.BadZipFile) as error:
+                raise StoreError(f"{path}: {_chunk(name)} is damaged: {error}") from error
     return columns, dict(group.attrs)
+
+
+@contextmanager
+def _as_zarr_reads(path: Path) -> Iterator[Any]:
+    """Open what Zarr reads a group from: a zip archive, or a folder of before."""
+    from zarr.storage import LocalStore, ZipStore  # noqa: PLC0415
+
+    store = (LocalStore if path.is_dir() else ZipStore)(path, read_only=True)
+    try:
+        yield store
+    finally:
+        store.close()
 
 
 def open_group(path: Path) -> tuple[dict[str, DiskColumn], dict[str, Any]]:
@@ -150,16 +162,18 @@ def open_group(path: Path) -> tuple[dict[str, DiskColumn], dict[str, Any]]:
     Raises:
         StoreError: if the group is compressed, or a chunk is missing or cut short.
     """
-    about = _json(path / "zarr.json")
+    keys = open_group_file(path)
+    about = _json(path, keys, METADATA)
     columns = {}
-    for meta_file in sorted(path.glob("*/zarr.json")):
-        meta = _json(meta_file)
-        name, dtype = meta_file.parent.name, np.dtype(meta["data_type"])
+    for key in sorted(keys):
+        name, _, rest = key.rpartition(f"/{METADATA}")
+        if rest or not name:
+            continue
+        meta = _json(path, keys, key)
         if [codec["name"] for codec in meta["codecs"]] != ["bytes", "crc32c"]:
-            raise StoreError(
-                f"{meta_file.parent} is compressed and cannot be read in parts"
-            )
-        columns[name] = _disk_column(_chunk(path, name), dtype, int(meta["shape"][0]))
+            raise StoreError(f"{path}: {name} is compressed and cannot be read in parts")
+        dtype, length = np.dtype(meta["data_type"]), int(meta["shape"][0])
+        columns[name] = _disk_column(path, keys.get(_chunk(name)), name, dtype, length)
     return columns, about.get("attributes", {})
 
 
@@ -180,7 +194,11 @@ def read_records(
         StoreError: if the group holds another schema, or is damaged.
     """
     columns: Columns
-    columns, attributes = read_group(path) if whole else open_group(path)
+    opened: dict[str, DiskColumn] = {}
+    if whole:
+        columns, attributes = read_group(path)
+    else:
+        columns, attributes = opened, _ = open_group(path)
     if attributes.get("schema") != schema:
         found = attributes.get("schema")
         raise StoreError(
@@ -189,26 +207,31 @@ def read_records(
     lost = sorted(names(kind) - columns.keys())
     if lost:
         raise StoreError(f"{path} lacks {', '.join(lost)}; `infgen verify` lists damage")
-    return PackedRecords(columns, kind)
+    reading = next((each.reading for each in opened.values()), nullcontext)
+    return PackedRecords(columns, kind, reading)
 
 
-def _disk_column(chunk: Path, dtype: np.dtype, length: int) -> DiskColumn:
+def _disk_column(
+    path: Path, chunk: StoredKey | None, name: str, dtype: np.dtype, length: int
+) -> DiskColumn:
     expected = length * dtype.itemsize + CHECKSUM_BYTES
-    found = chunk.stat().st_size if chunk.is_file() else None
-    if length and found != expected:
-        raise StoreError(f"{chunk} holds {found} bytes, expected {expected}")
+    found = None if chunk is None else chunk.extent.length
+    if chunk is None or (length and found != expected):
+        if not length:
+            return DiskColumn(StoredKey.nowhere(path), dtype, 0)
+        raise StoreError(f"{path}: {_chunk(name)} holds {found} bytes, expected {expected}")
     return DiskColumn(chunk, dtype, length)
 
 
-def _chunk(path: Path, name: str) -> Path:
-    return path / name / "c" / "0"
+def _chunk(name: str) -> str:
+    return f"{name}/c/0"
 
 
-def _json(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise StoreError(f"{path} is missing")
+def _json(path: Path, keys: Mapping[str, StoredKey], key: str) -> dict[str, Any]:
+    if key not in keys:
+        raise StoreError(f"{path} lacks {key}; `infgen verify` lists damage")
     try:
-        loaded: dict[str, Any] = json.loads(path.read_bytes())
+        loaded: dict[str, Any] = json.loads(keys[key].read())
     except ValueError as error:
-        raise StoreError(f"{path} is damaged: {error}") from error
+        raise StoreError(f"{path}: {key} is damaged: {error}") from error
     return loaded
