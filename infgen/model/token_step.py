@@ -44,6 +44,19 @@ class TokenStep:
         """Go on with some rollouts only."""
         return TokenStep(*(getattr(self, each.name)[rollouts] for each in fields(self)))
 
+    def put(self, at: Int64[Tensor, " changed"], rows: "TokenStep") -> "TokenStep":
+        """Return a token step with other agents in some rows.
+
+        Args:
+            at: Flat indices of the rows among [rollout, row].
+            rows: What is in them, as a single rollout [1, changed].
+        """
+        changed = []
+        for each in fields(self):
+            old, new = getattr(self, each.name), getattr(rows, each.name)[0]
+            changed.append(old.flatten(0, 1).index_copy(0, at, new).view_as(old))
+        return TokenStep(*changed)
+
 
 @dataclass(frozen=True, slots=True)
 class MotionStep:

@@ -6,20 +6,21 @@ boxes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from infgen.geometry import boxes_overlap, to_world
+from infgen.rollout.lane_squares import Lanes, LaneSquares, lane_gap_m
 from infgen.rollout.population import EGO_ROW, InsertedAgents, Population, insertion_pose
 from infgen.scene import AgentType
 from infgen.tokens.map import PolylineType
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
-NOWHERE_M = np.float32(1e9)
-"""Coordinate of padded lane segments."""
+MARGIN_M = 0.1
+"""Boxes whose circles are farther apart do not overlap, whatever rounding does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,62 +28,90 @@ class InsertionMask:
     """Lane segments of the maps of a batch, and what decides whether a position is allowed.
 
     Attributes:
-        start_m: First point of each segment.
-        along_m: Vector from there to its last point.
+        lanes: Lane segments of each map.
+        squares: The same by where they are.
         scene: Map of each rollout.
-        lane_m: Greatest distance of a vehicle to a lane, on a map that has lanes.
-        end_pose: End pose of each motion token by agent type.
+        end_pose: End pose of each motion token by agent type ...
+        length_m: ... and how far away it is.
     """
 
-    start_m: Float32[np.ndarray, "scene lane 2"]
-    along_m: Float32[np.ndarray, "scene lane 2"]
+    lanes: Sequence[Lanes]
+    squares: LaneSquares
     scene: Int64[np.ndarray, " rollout"]
-    lane_m: float
     end_pose: Float32[np.ndarray, "3 motion_token 3"]
-
-    def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "InsertionMask":
-        """Keep some rollouts only."""
-        return replace(self, scene=self.scene[rollouts])
+    length_m: Float32[np.ndarray, "3 motion_token"]
 
     def allows(
-        self, population: Population, inserted: InsertedAgents
-    ) -> Bool[np.ndarray, " rollout"]:
-        """Tell which inserted agents have an allowed position."""
-        pose = insertion_pose(population.pose[:, EGO_ROW], inserted)
-        pedestrian = inserted.agent_type == AgentType.PEDESTRIAN
-        passed = pedestrian[:, None] & (population.agent_type == AgentType.PEDESTRIAN)
-        overlaps = np.zeros(len(pose), dtype=bool)
-        for everyone in (population.pose, self._soon(population)):
-            meets = boxes_overlap(
-                pose[:, None],
-                inserted.size_lwh_m[:, None, :2],
-                everyone,
-                population.size_lwh_m[..., :2],
-            )
-            meets &= (population.presence != Presence.ABSENT) & ~passed
-            overlaps |= meets.any(axis=1)
-        no_lanes = (self.start_m == NOWHERE_M).all(axis=(1, 2))[self.scene]
-        near_lane = self.lane_distance_m(pose[:, :2]) <= self.lane_m
-        near_lane |= no_lanes | (inserted.agent_type != AgentType.VEHICLE)
-        return near_lane & ~overlaps
+        self,
+        population: Population,
+        inserted: InsertedAgents,
+        rollouts: Int64[np.ndarray, " inserted"] | None = None,
+    ) -> Bool[np.ndarray, " inserted"]:
+        """Tell which inserted agents have an allowed position.
 
-    def _soon(self, population: Population) -> Float32[np.ndarray, "rollout row 3"]:
-        """Poses one token step ahead if every agent repeats its motion token."""
-        moves = population.motion_token >= 0
-        motion_token = np.where(moves, population.motion_token, 0)
-        step = self.end_pose[population.agent_type, motion_token] * moves[..., None]
-        return to_world(step, population.pose)
+        Args:
+            population: All agents of all rollouts.
+            inserted: Agents to insert.
+            rollouts: Where to insert them; one into each rollout if None.
+        """
+        rollouts = np.arange(len(self.scene)) if rollouts is None else rollouts
+        pose = insertion_pose(population.pose[rollouts, EGO_ROW], inserted)
+        allowed = ~self._overlaps(population.without_free_rows(), inserted, rollouts, pose)
+        vehicle = inserted.agent_type == AgentType.VEHICLE
+        asked = np.flatnonzero(allowed & vehicle & self._has_lanes()[self.scene[rollouts]])
+        allowed[asked] = self.squares.has_lane(pose[asked, :2], self.scene[rollouts[asked]])
+        return allowed
+
+    def _has_lanes(self) -> Bool[np.ndarray, " scene"]:
+        return np.array([len(start_m) > 0 for start_m, _ in self.lanes])
+
+    def _overlaps(
+        self,
+        population: Population,
+        inserted: InsertedAgents,
+        rollouts: Int64[np.ndarray, " inserted"],
+        pose: Float32[np.ndarray, "inserted 3"],
+    ) -> Bool[np.ndarray, " inserted"]:
+        """Tell which boxes overlap another one, now or one token step ahead."""
+        moves = population.motion_token[rollouts] >= 0
+        motion_token = np.where(moves, population.motion_token[rollouts], 0)
+        agent_type = population.agent_type[rollouts]
+        size_m = population.size_lwh_m[rollouts]
+        # Only boxes whose circles meet, a token step of motion included, are looked at.
+        reach_m = np.hypot(size_m[..., 0], size_m[..., 1]) / 2 + MARGIN_M
+        reach_m += self.length_m[agent_type, motion_token] * moves
+        reach_m += np.hypot(*inserted.size_lwh_m[:, :2].T)[:, None] / 2
+        there = population.pose[rollouts]
+        x_m, y_m = there[..., 0] - pose[:, :1], there[..., 1] - pose[:, 1:2]
+        near = x_m * x_m + y_m * y_m < reach_m * reach_m
+        near &= population.presence[rollouts] != Presence.ABSENT
+        pedestrian = (inserted.agent_type == AgentType.PEDESTRIAN)[:, None]
+        near &= ~(pedestrian & (agent_type == AgentType.PEDESTRIAN))
+        who, row = np.nonzero(near)
+
+        step = self.end_pose[agent_type[who, row], motion_token[who, row]]
+        step = step * moves[who, row, None]
+        meets = np.zeros(len(who), dtype=bool)
+        for everyone in (there[who, row], to_world(step, there[who, row])):
+            meets |= boxes_overlap(
+                pose[who],
+                inserted.size_lwh_m[who, :2],
+                everyone,
+                size_m[who, row, :2],
+            )
+        overlaps = np.zeros(len(pose), dtype=bool)
+        overlaps[who[meets]] = True
+        return overlaps
 
     def lane_distance_m(
         self, xy_m: Float32[np.ndarray, "rollout 2"]
     ) -> Float32[np.ndarray, " rollout"]:
         """Distance of one point per rollout to the nearest lane of its map."""
-        start_m, along_m = self.start_m[self.scene], self.along_m[self.scene]
-        away_m = xy_m[:, None] - start_m  # [rollout, lane, 2]
-        length2 = np.maximum((along_m**2).sum(axis=-1), np.float32(1e-6))
-        share = np.clip((away_m * along_m).sum(axis=-1) / length2, 0, 1)
-        gap_m = np.linalg.norm(away_m - share[..., None] * along_m, axis=-1)
-        return gap_m.min(axis=1, initial=np.inf)
+        nearest_m = [
+            lane_gap_m(point_m, *self.lanes[at]).min(initial=np.inf)
+            for point_m, at in zip(xy_m, self.scene, strict=True)
+        ]
+        return np.array(nearest_m, dtype=np.float32)
 
 
 def make_insertion_mask(
@@ -91,19 +120,23 @@ def make_insertion_mask(
     scene: Int64[np.ndarray, " rollout"],
     lane_m: float,
 ) -> InsertionMask:
-    """Make the insertion mask of some maps; ``scene`` is the map of each rollout."""
+    """Make the insertion mask of some maps.
+
+    Args:
+        maps: Tokens of the maps.
+        books: Motion tokens and map tokens.
+        scene: Map of each rollout.
+        lane_m: Greatest distance of a vehicle to a lane, on a map that has lanes.
+    """
     moves, roads = books
     lanes = [_lanes(tokens, roads) for tokens in maps]
-    shape = (len(maps), max(len(start_m) for start_m, _ in lanes), 2)
-    start_m = np.full(shape, NOWHERE_M)
-    along_m = np.zeros(shape, dtype=np.float32)
-    for at, (first_m, step_m) in enumerate(lanes):
-        start_m[at, : len(first_m)] = first_m
-        along_m[at, : len(first_m)] = step_m
-    return InsertionMask(start_m, along_m, scene, lane_m, moves.end_pose)
+    length_m = np.hypot(moves.end_pose[..., 0], moves.end_pose[..., 1])
+    return InsertionMask(
+        lanes, LaneSquares.of(lanes, lane_m), scene, moves.end_pose, length_m
+    )
 
 
-def _lanes(tokens: SceneTokens, roads: MapVocabulary) -> tuple[np.ndarray, np.ndarray]:
+def _lanes(tokens: SceneTokens, roads: MapVocabulary) -> Lanes:
     """First points of the lane tokens of a map, and vectors to their last points."""
     rows = tokens.map_polyline_type == PolylineType.LANE
     end_m = roads.curve_m[tokens.map_token[rows], -1]
