@@ -10,7 +10,7 @@ from torch import Tensor
 
 from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.token_step import InsertionDetails, PositionOutputs
-from infgen.rollout.insertion_mask import InsertionMask
+from infgen.rollout.insertion_mask import Circles, InsertionMask
 from infgen.rollout.population import (
     EGO_ROW,
     InsertedAgents,
@@ -102,6 +102,7 @@ class _Inserting:
         occupied: Cells that hold an agent: no other is inserted there.
         num_agents: Agents of each rollout.
         num_others: Agents around each ego, itself excluded.
+        circles: Circles that hold the boxes; None without an insertion mask.
     """
 
     request: InsertionRequest
@@ -110,10 +111,11 @@ class _Inserting:
     occupied: Bool[np.ndarray, "rollout cell"]
     num_agents: Int64[np.ndarray, " rollout"]
     num_others: Int64[np.ndarray, " rollout"]
+    circles: Circles | None
 
     @classmethod
     def of(cls, request: InsertionRequest, population: Population) -> "_Inserting":
-        grid = request.simulator.grid
+        grid, mask = request.simulator.grid, request.insertion_mask
         cells = population.cells(grid)
         return cls(
             request,
@@ -122,6 +124,7 @@ class _Inserting:
             _occupied(cells, grid.num_cells),
             population.num_agents,
             population.count_others(grid.radius_m),
+            None if mask is None else mask.circles(population),
         )
 
     def add_bias(
@@ -151,6 +154,9 @@ class _Inserting:
         )
         self.cells[at] = cell
         self.occupied[at[0][cell != NO_CELL], cell[cell != NO_CELL]] = True
+        mask, circles = self.request.insertion_mask, self.circles
+        if mask is not None and circles is not None:
+            circles.put(at, mask.circles(everyone, at))
         return row
 
 
@@ -186,13 +192,11 @@ class _ActiveRollouts:
         """Add the inserted agents to the population and to the input of the network."""
         batch, simulator = self.batch, self.batch.request.simulator
         row = batch.add(self.rollout, inserted)
-        fits = row >= 0
-        fresh = np.zeros((len(row), batch.cells.shape[1]), dtype=bool)
-        fresh[fits, row[fits]] = True
+        at = self.rollout[row >= 0], row[row >= 0]
+        fresh = np.zeros(batch.cells.shape, dtype=bool)
+        fresh[at] = True
         rows = simulator.rows(fresh)
-        step = simulator.token_step(
-            batch.population, batch.cells, (self.rollout[fits], row[fits])
-        )
+        step = simulator.token_step(batch.population, batch.cells, at)
         entries = simulator.stepper.entry_add(
             self.entries, self.entries.token_step.put(rows.at, step), rows
         )
@@ -275,7 +279,7 @@ def _sample_positions(
             _of_attempt(simulator, numbers, number[places], attempt),
         )
         if mask is not None:
-            allowed = mask.allows(batch.population, inserted, asked.rollout)
+            allowed = mask.allows(batch.population, inserted, asked.rollout, batch.circles)
             inserted = replace(inserted, who=allowed)
         found = inserted if found is None else found.put(places, inserted)
         taken[places, cell] = True

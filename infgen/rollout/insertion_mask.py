@@ -21,6 +21,28 @@ from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 MARGIN_M = 0.1
 """Boxes whose circles are farther apart do not overlap, whatever rounding does."""
+FAR_M = np.float32(1e9)
+"""Where nobody is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Circles:
+    """Circles that hold the boxes of agents now and one token step later.
+
+    Attributes:
+        x_m: Centres; ``FAR_M`` where there is no agent.
+        y_m: Centres.
+        radius_m: Radii.
+    """
+
+    x_m: Float32[np.ndarray, "rollout row"]
+    y_m: Float32[np.ndarray, "rollout row"]
+    radius_m: Float32[np.ndarray, "rollout row"]
+
+    def put(self, at: tuple[np.ndarray, np.ndarray], others: "Circles") -> None:
+        """Replace the circles of some rollouts and rows, in place."""
+        for name in ("x_m", "y_m", "radius_m"):
+            getattr(self, name)[at] = getattr(others, name)[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +63,30 @@ class InsertionMask:
     end_pose: Float32[np.ndarray, "3 motion_token 3"]
     length_m: Float32[np.ndarray, "3 motion_token"]
 
+    def circles(
+        self, population: Population, at: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> Circles:
+        """Return the circles of all agents, or of some rows as a single rollout."""
+
+        def some(values: np.ndarray) -> np.ndarray:
+            return values if at is None else values[at][None]
+
+        there = some(population.presence) != Presence.ABSENT
+        agent_type = some(population.agent_type)
+        motion_token = some(population.motion_token)
+        pose, size_m = some(population.pose), some(population.size_lwh_m)
+        radius_m = np.hypot(size_m[..., 0], size_m[..., 1]) / 2 + MARGIN_M
+        moves = motion_token >= 0
+        radius_m += self.length_m[agent_type, np.where(moves, motion_token, 0)] * moves
+        x_m, y_m = (np.where(there, pose[..., axis], FAR_M) for axis in (0, 1))
+        return Circles(x_m, y_m, radius_m)
+
     def allows(
         self,
         population: Population,
         inserted: InsertedAgents,
         rollouts: Int64[np.ndarray, " inserted"] | None = None,
+        circles: Circles | None = None,
     ) -> Bool[np.ndarray, " inserted"]:
         """Tell which inserted agents have an allowed position.
 
@@ -53,17 +94,18 @@ class InsertionMask:
             population: All agents of all rollouts.
             inserted: Agents to insert.
             rollouts: Where to insert them; one into each rollout if None.
+            circles: Of the population, if they are known.
         """
         rollouts = np.arange(len(self.scene)) if rollouts is None else rollouts
+        circles = self.circles(population) if circles is None else circles
         pose = insertion_pose(population.pose[rollouts, EGO_ROW], inserted)
-        allowed = ~self._overlaps(population.without_free_rows(), inserted, rollouts, pose)
+        allowed = ~self._overlaps(population, inserted, rollouts, pose, circles)
         vehicle = inserted.agent_type == AgentType.VEHICLE
-        asked = np.flatnonzero(allowed & vehicle & self._has_lanes()[self.scene[rollouts]])
-        allowed[asked] = self.squares.has_lane(pose[asked, :2], self.scene[rollouts[asked]])
+        has_lanes = np.array([len(start_m) > 0 for start_m, _ in self.lanes])
+        scene = self.scene[rollouts]
+        asked = np.flatnonzero(allowed & vehicle & has_lanes[scene])
+        allowed[asked] = self.squares.has_lane(pose[asked, :2], scene[asked])
         return allowed
-
-    def _has_lanes(self) -> Bool[np.ndarray, " scene"]:
-        return np.array([len(start_m) > 0 for start_m, _ in self.lanes])
 
     def _overlaps(
         self,
@@ -71,37 +113,40 @@ class InsertionMask:
         inserted: InsertedAgents,
         rollouts: Int64[np.ndarray, " inserted"],
         pose: Float32[np.ndarray, "inserted 3"],
+        circles: Circles,
     ) -> Bool[np.ndarray, " inserted"]:
         """Tell which boxes overlap another one, now or one token step ahead."""
-        moves = population.motion_token[rollouts] >= 0
-        motion_token = np.where(moves, population.motion_token[rollouts], 0)
-        agent_type = population.agent_type[rollouts]
-        size_m = population.size_lwh_m[rollouts]
-        # Only boxes whose circles meet, a token step of motion included, are looked at.
-        reach_m = np.hypot(size_m[..., 0], size_m[..., 1]) / 2 + MARGIN_M
-        reach_m += self.length_m[agent_type, motion_token] * moves
-        reach_m += np.hypot(*inserted.size_lwh_m[:, :2].T)[:, None] / 2
-        there = population.pose[rollouts]
-        x_m, y_m = there[..., 0] - pose[:, :1], there[..., 1] - pose[:, 1:2]
-        near = x_m * x_m + y_m * y_m < reach_m * reach_m
-        near &= population.presence[rollouts] != Presence.ABSENT
-        pedestrian = (inserted.agent_type == AgentType.PEDESTRIAN)[:, None]
-        near &= ~(pedestrian & (agent_type == AgentType.PEDESTRIAN))
-        who, row = np.nonzero(near)
-
-        step = self.end_pose[agent_type[who, row], motion_token[who, row]]
-        step = step * moves[who, row, None]
+        own_m = np.hypot(inserted.size_lwh_m[:, 0], inserted.size_lwh_m[:, 1]) / 2
+        x_m, y_m = circles.x_m[rollouts] - pose[:, :1], circles.y_m[rollouts] - pose[:, 1:2]
+        reach_m = circles.radius_m[rollouts] + own_m[:, None]
+        who, row = np.nonzero(x_m * x_m + y_m * y_m < reach_m * reach_m)
+        agent_type = population.agent_type[rollouts[who], row]
+        pedestrians = (agent_type == AgentType.PEDESTRIAN) & (
+            inserted.agent_type[who] == AgentType.PEDESTRIAN
+        )
+        who, row = who[~pedestrians], row[~pedestrians]
+        at = (rollouts[who], row)
+        now = population.pose[at]
         meets = np.zeros(len(who), dtype=bool)
-        for everyone in (there[who, row], to_world(step, there[who, row])):
+        for everyone in (now, to_world(self._step(population, at), now)):
             meets |= boxes_overlap(
                 pose[who],
                 inserted.size_lwh_m[who, :2],
                 everyone,
-                size_m[who, row, :2],
+                population.size_lwh_m[at][:, :2],
             )
         overlaps = np.zeros(len(pose), dtype=bool)
         overlaps[who[meets]] = True
         return overlaps
+
+    def _step(
+        self, population: Population, at: tuple[np.ndarray, np.ndarray]
+    ) -> Float32[np.ndarray, "row 3"]:
+        """Return how far some agents get if they repeat their motion tokens."""
+        motion_token = population.motion_token[at]
+        moves = motion_token >= 0
+        step = self.end_pose[population.agent_type[at], np.where(moves, motion_token, 0)]
+        return step * moves[:, None]
 
     def lane_distance_m(
         self, xy_m: Float32[np.ndarray, "rollout 2"]
