@@ -30,9 +30,19 @@ from infgen.rollout import insertion, motion_sampler
 from infgen.rollout.session import Session
 from pipeline.commands.screen import show_table
 
-NETWORK = ("begin", "motion_step", "entry_begin", "entry_add", "entry_query", "entry_details")
+NETWORK = (
+    "begin",
+    "motion_step",
+    "entry_begin",
+    "entry_add",
+    "entry_query",
+    "entry_details",
+)
 """Calls of the network."""
-SAMPLING = {insertion: ("choose", "sample_event"), motion_sampler: ("choose", "sample_event")}
+SAMPLING = {
+    insertion: ("choose", "sample_event"),
+    motion_sampler: ("choose", "sample_event"),
+}
 """Functions that sample from logits, by the module that calls them."""
 
 
@@ -124,7 +134,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     show_table(
         "host time outside the network and sampling",
         ("rollouts", "agents", "inserted a step", "ms a step", f"ms per {LENGTH_S:g} s"),
-        [(name, *(f"{value:.3g}" for value in row.values())) for name, row in found.items()],
+        [
+            (name, *(f"{value:.3g}" for value in row.values()))
+            for name, row in found.items()
+        ],
     )
     print(json.dumps(found))
 

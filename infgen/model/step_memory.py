@@ -47,11 +47,10 @@ class StepMemory:
 
 @dataclass(frozen=True, slots=True)
 class Insertions:
-    """One token step as the entry stage sees it. ``entry_add`` writes into ``raw`` and
-    ``relation``.
+    """One token step as the entry stage sees it.
 
-    All but ``rollout`` is of every rollout of the batch: what is large is taken only when
-    it is looked at.
+    ``Stepper.entry_add`` writes into ``raw`` and ``relation``. All but ``rollout`` is of
+    every rollout of the batch: what is large is taken only when it is looked at.
 
     Attributes:
         token: The token step.

@@ -274,8 +274,8 @@ def _sample_positions(
         asked, places = active.take(left), np.flatnonzero(left)
         inserted, cell = _sample_agents(
             asked,
-            query.take(simulator.tensor(places)),
-            taken[places],
+            query if left.all() else query.take(simulator.tensor(places)),
+            taken if left.all() else taken[places],
             _of_attempt(simulator, numbers, number[places], attempt),
         )
         if mask is not None:

@@ -127,14 +127,13 @@ class InsertionMask:
         who, row = who[~pedestrians], row[~pedestrians]
         at = (rollouts[who], row)
         now = population.pose[at]
-        meets = np.zeros(len(who), dtype=bool)
-        for everyone in (now, to_world(self._step(population, at), now)):
-            meets |= boxes_overlap(
-                pose[who],
-                inserted.size_lwh_m[who, :2],
-                everyone,
-                population.size_lwh_m[at][:, :2],
-            )
+        soon = to_world(self._step(population, at), now)
+        meets = boxes_overlap(
+            pose[who],
+            inserted.size_lwh_m[who, :2],
+            np.stack([now, soon]),
+            population.size_lwh_m[at][:, :2],
+        ).any(axis=0)
         overlaps = np.zeros(len(pose), dtype=bool)
         overlaps[who[meets]] = True
         return overlaps

@@ -11,7 +11,7 @@ SIDE_M = 10.0
 MARGIN_M = 0.1
 """Squares list segments a little farther away than asked for: rounding loses none."""
 
-Lanes = tuple[Float32[np.ndarray, "lane 2"], Float32[np.ndarray, "lane 2"]]
+Lanes = tuple[Float32[np.ndarray, "_ 2"], Float32[np.ndarray, "_ 2"]]
 """First point of each segment, and the vector to its last point."""
 
 
