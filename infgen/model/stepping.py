@@ -23,7 +23,7 @@ with an empty past, so a freed row can be given to an inserted agent as it is.
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from infgen.model.agents import AgentContext, AgentRows
@@ -201,7 +201,11 @@ class Stepper:
 
     @torch.no_grad()
     def entry_add(
-        self, entries: Insertions, token_step: TokenStep, fresh: Rows | None = None
+        self,
+        entries: Insertions,
+        token_step: TokenStep,
+        fresh: Rows | None = None,
+        real: Bool[Tensor, " row"] | None = None,
     ) -> Insertions:
         """Go on with inserted agents as further visible rows of the same column.
 
@@ -209,18 +213,23 @@ class Stepper:
             entries: The column so far.
             token_step: The column with the inserted agents.
             fresh: Their rows; who knows them saves waiting for their number.
+            real: Which of these rows hold an inserted agent; all of them if None.
         """
         if fresh is None:
             fresh = Rows.where(token_step.visible & ~entries.token_step.visible)
-        came = fresh.spread(torch.ones(len(fresh.at), device=fresh.at.device)) > 0
-        embedded = self._embed(entries.before, entries.known, token_step, fresh)
+        some = torch.ones_like(fresh.at, dtype=torch.bool) if real is None else real
+        came = fresh.spread(some)
+        embedded = normed(self._embed(entries.before, entries.known, token_step, fresh))
         ego_pose = token_step.pose[:, EGO, None].expand_as(token_step.pose)
         described = relations(fresh.pack(ego_pose), fresh.pack(token_step.pose)[:, None])
         reach = self._asked().cell_agents
         related = reach.relation.look_up(described, reach.table)[:, 0]
         within = came & within_radius(ego_pose, token_step.pose, reach.radius_m)
-        entries.raw.flatten(0, 1).index_copy_(0, fresh.at, normed(embedded))
-        entries.relation.flatten(0, 1).index_copy_(0, fresh.at, related)
+        for kept, new in ((entries.raw, embedded), (entries.relation, related)):
+            flat = kept.flatten(0, 1)
+            if real is not None:
+                new = torch.where(real[:, None], new, flat[fresh.at])
+            flat.index_copy_(0, fresh.at, new)
         return replace(entries, token_step=token_step, within=entries.within | within)
 
     @torch.no_grad()

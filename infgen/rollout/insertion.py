@@ -1,163 +1,26 @@
 """Insertion of agents in one token step, one agent per query of the network."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int16, Int64
+from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.token_step import InsertionDetails, PositionOutputs
-from infgen.rollout.insertion_mask import Circles, InsertionMask
-from infgen.rollout.population import (
-    EGO_ROW,
-    InsertedAgents,
-    Population,
-    place_inserted,
-)
-from infgen.rollout.random_streams import WORDS, Purpose, Streams
+from infgen.rollout.insertion_state import InsertionRequest, InsertionState, TurnNumbers
+from infgen.rollout.population import InsertedAgents, Population
+from infgen.rollout.random_streams import Purpose
 from infgen.rollout.sampling import choose, sample_event
 from infgen.rollout.simulator import Simulator
-from infgen.tokens.grid import Grid, decode_cell, decode_heading, encode_cell, to_grid
-from infgen.tokens.scene_tokens import NO_CELL
+from infgen.tokens.grid import Grid, decode_cell, decode_heading, encode_cell
 
 INSIDE = 0.999
 """Inserted agents stay within this share of the grid radius, whatever their offsets."""
 
-TURN_PURPOSES = (Purpose.ADD, Purpose.CELL, Purpose.AGENT_TYPE, Purpose.HEADING)
-"""What is sampled in one insertion."""
-
 UniformNumbers = Callable[[Purpose], Tensor]
-
-
-@dataclass(frozen=True, slots=True)
-class InsertionRequest:
-    """What insertion needs besides the agents: network, random numbers and limits.
-
-    Attributes:
-        simulator: The network.
-        streams: Random numbers of the rollouts.
-        insertion_mask: Rejects positions; None allows all.
-        most: Most agents of each rollout at any one time.
-        wanted: Number of other agents wanted around each ego; None for no control.
-    """
-
-    simulator: Simulator
-    streams: Streams
-    insertion_mask: InsertionMask | None
-    most: Int64[np.ndarray, " rollout"]
-    wanted: Float64[np.ndarray, " rollout"] | None = None
-
-    @property
-    def attempts(self) -> int:
-        """Number of positions sampled for one insertion before it is given up."""
-        if self.insertion_mask is None:
-            return 1
-        return self.simulator.settings.max_insertion_attempts
-
-
-@dataclass(slots=True)
-class _TurnNumbers:
-    """The uniform numbers of one insertion of some rollouts.
-
-    Attributes:
-        streams: Random numbers of these rollouts.
-        token: Token step.
-        turn: Which insertion of it.
-        block: Block of four attempts whose numbers are held.
-        places: Rollouts, among these, that numbers are held of, in order.
-        numbers: The numbers [purpose, place, attempt].
-    """
-
-    streams: Streams
-    token: int
-    turn: int
-    block: int = -1
-    places: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    numbers: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, WORDS)))
-
-    def of(
-        self, purpose: Purpose, places: Int64[np.ndarray, " asked"], attempt: int = 0
-    ) -> Float64[np.ndarray, " asked"]:
-        """Return the numbers of one attempt; later ones may ask for fewer rollouts only."""
-        if attempt // WORDS != self.block:
-            self.block, self.places = attempt // WORDS, places
-            self.numbers = self.streams.take(places).uniform_block(
-                self.token, TURN_PURPOSES, self.block, self.turn
-            )
-        held = np.searchsorted(self.places, places)
-        return self.numbers[TURN_PURPOSES.index(purpose), held, attempt % WORDS]
-
-
-@dataclass(slots=True)
-class _Inserting:
-    """All rollouts of a batch while agents are inserted; changes in place.
-
-    Attributes:
-        request: What insertion needs.
-        population: All agents, those inserted so far included.
-        cells: Cell of each agent, or ``NO_CELL``.
-        occupied: Cells that hold an agent: no other is inserted there.
-        num_agents: Agents of each rollout.
-        num_others: Agents around each ego, itself excluded.
-        circles: Circles that hold the boxes; None without an insertion mask.
-    """
-
-    request: InsertionRequest
-    population: Population
-    cells: Int16[np.ndarray, "rollout row"]
-    occupied: Bool[np.ndarray, "rollout cell"]
-    num_agents: Int64[np.ndarray, " rollout"]
-    num_others: Int64[np.ndarray, " rollout"]
-    circles: Circles | None
-
-    @classmethod
-    def of(cls, request: InsertionRequest, population: Population) -> "_Inserting":
-        grid, mask = request.simulator.grid, request.insertion_mask
-        cells = population.cells(grid)
-        return cls(
-            request,
-            population.copy(),
-            cells,
-            _occupied(cells, grid.num_cells),
-            population.num_agents,
-            population.count_others(grid.radius_m),
-            None if mask is None else mask.circles(population),
-        )
-
-    def add_bias(
-        self, rollouts: Int64[np.ndarray, " asked"]
-    ) -> Float64[np.ndarray, " asked"]:
-        """Return what is added to the logit of ADD, with density control."""
-        settings, wanted = self.request.simulator.settings, self.request.wanted
-        bias = np.full(len(rollouts), settings.add_bias)
-        if wanted is not None:
-            there = self.num_others[rollouts]
-            # Insertions are sampled one by one: their number is proportional to the odds.
-            bias += settings.density_control * np.log((wanted[rollouts] + 1) / (there + 1))
-        return bias
-
-    def add(
-        self, rollouts: Int64[np.ndarray, " inserted"], inserted: InsertedAgents
-    ) -> Int64[np.ndarray, " inserted"]:
-        """Insert agents; return the row of each, -1 in a full rollout."""
-        grid, everyone = self.request.simulator.grid, self.population
-        row = place_inserted(everyone, rollouts, inserted)
-        at = (rollouts[row >= 0], row[row >= 0])
-        away_m = everyone.pose[at][:, :2] - everyone.pose[at[0], EGO_ROW, :2]
-        self.num_agents[at[0]] += 1
-        self.num_others[at[0]] += np.hypot(*away_m.T) < grid.radius_m
-        cell = encode_cell(
-            to_grid(everyone.pose[at][:, :2], everyone.pose[at[0], EGO_ROW]), grid
-        )
-        self.cells[at] = cell
-        self.occupied[at[0][cell != NO_CELL], cell[cell != NO_CELL]] = True
-        mask, circles = self.request.insertion_mask, self.circles
-        if mask is not None and circles is not None:
-            circles.put(at, mask.circles(everyone, at))
-        return row
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +33,7 @@ class _ActiveRollouts:
         rollout: Indices of these in the batch.
     """
 
-    batch: _Inserting
+    batch: InsertionState
     entries: Insertions
     rollout: Int64[np.ndarray, " rollout"]
 
@@ -207,7 +70,7 @@ def insert_agents(
     request: InsertionRequest, memory: StepMemory, population: Population, token: int
 ) -> Population:
     """Insert agents into every rollout until the network samples BEGIN MOTION."""
-    simulator, batch = request.simulator, _Inserting.of(request, population)
+    simulator, batch = request.simulator, InsertionState.of(request, population)
     entries = simulator.stepper.entry_begin(
         memory,
         simulator.token_step(population, batch.cells),
@@ -232,7 +95,7 @@ def _insert_next(
     """
     batch, asked = active.batch, np.arange(len(active))
     request, simulator = batch.request, batch.request.simulator
-    numbers = _TurnNumbers(request.streams.take(active.rollout), token, turn)
+    numbers = TurnNumbers(request.streams.take(active.rollout), token, turn)
     query = simulator.stepper.entry_query(active.entries)
     bias = simulator.tensor(batch.add_bias(active.rollout))
     uniform = simulator.tensor(numbers.of(Purpose.ADD, asked))
@@ -253,7 +116,7 @@ def _insert_next(
 def _sample_positions(
     active: _ActiveRollouts,
     query: PositionOutputs,
-    numbers: _TurnNumbers,
+    numbers: TurnNumbers,
     number: Int64[np.ndarray, " rollout"],
 ) -> InsertedAgents:
     """Sample an inserted agent of every rollout, and whether its position is allowed.
@@ -276,7 +139,7 @@ def _sample_positions(
             asked,
             query if left.all() else query.take(simulator.tensor(places)),
             taken if left.all() else taken[places],
-            _of_attempt(simulator, numbers, number[places], attempt),
+            _attempt_numbers(simulator, numbers, number[places], attempt),
         )
         if mask is not None:
             allowed = mask.allows(batch.population, inserted, asked.rollout, batch.circles)
@@ -290,8 +153,8 @@ def _sample_positions(
     return found
 
 
-def _of_attempt(
-    simulator: Simulator, numbers: _TurnNumbers, places: np.ndarray, attempt: int
+def _attempt_numbers(
+    simulator: Simulator, numbers: TurnNumbers, places: np.ndarray, attempt: int
 ) -> UniformNumbers:
     """Return the uniform numbers of one attempt of some rollouts, by purpose."""
     return lambda purpose: simulator.tensor(numbers.of(purpose, places, attempt))
@@ -311,9 +174,9 @@ def _sample_agents(
     cell, regressed_m = _sample_cell(simulator, query, taken, uniforms)
     details = simulator.stepper.entry_details(active.entries, cell, regressed_m)
     agent_type = choose(details.agent_type_logits, uniforms(Purpose.AGENT_TYPE))
-    heading = _sample_heading(simulator, details, agent_type, uniforms)
-    offset_m = None if details.offset_m is None else _of_type(details.offset_m, agent_type)
-    size_lwh_m = _of_type(details.size_lwh_m, agent_type)
+    heading = sample_heading(simulator, details, agent_type, uniforms)
+    offset_m = None if details.offset_m is None else of_type(details.offset_m, agent_type)
+    size_lwh_m = of_type(details.size_lwh_m, agent_type)
     more = offset_m if regressed_m is None else regressed_m
     parts = [cell, agent_type, size_lwh_m, heading, *([] if more is None else [more])]
     cells, types, sizes, headings, *rest = simulator.fetch(*parts)
@@ -364,7 +227,7 @@ def _within(position_m: np.ndarray, grid: Grid) -> np.ndarray:
     return position_m / np.maximum(far, np.float32(1))[:, None]
 
 
-def _sample_heading(
+def sample_heading(
     simulator: Simulator,
     details: InsertionDetails,
     agent_type: Tensor,
@@ -373,24 +236,14 @@ def _sample_heading(
     """Sample the heading of every inserted agent: its bin, or relative to the ego."""
     if details.heading_logits is None:
         assert details.turned_rad is not None
-        return _of_type(details.turned_rad, agent_type)
+        return of_type(details.turned_rad, agent_type)
     return choose(
-        _of_type(details.heading_logits, agent_type),
+        of_type(details.heading_logits, agent_type),
         uniforms(Purpose.HEADING),
         temperature=simulator.settings.heading_temperature,
     )
 
 
-def _of_type(values: Tensor, agent_type: Tensor) -> Tensor:
+def of_type(values: Tensor, agent_type: Tensor) -> Tensor:
     """Take the values [rollout, ...] of the sampled agent types."""
     return values[torch.arange(len(agent_type), device=agent_type.device), agent_type]
-
-
-def _occupied(
-    cells: Int16[np.ndarray, "rollout row"], count: int
-) -> Bool[np.ndarray, "rollout cell"]:
-    """Mark the cells that hold an agent."""
-    occupied = np.zeros((len(cells), count), dtype=bool)
-    rollout, row = np.nonzero(cells != NO_CELL)
-    occupied[rollout, cells[rollout, row]] = True
-    return occupied

@@ -18,12 +18,12 @@ ROUNDS = 10
 WORDS = 4
 """Numbers that one evaluation makes."""
 _LOW, _HALF, _UNUSED_BITS = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(11)
-_MULTIPLIERS = np.array([0xD2E7470EE14C6C93, 0xCA5A826395121157], dtype=np.uint64)[
+MULTIPLIERS = np.array([0xD2E7470EE14C6C93, 0xCA5A826395121157], dtype=np.uint64)[
     :, None, None
 ]
 """Of the first and the third word of the counter; in halves below."""
-_BY_LOW, _BY_HIGH = _MULTIPLIERS & _LOW, _MULTIPLIERS >> _HALF
-_KEY_STEPS = np.array([0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B], dtype=np.uint64)[
+_BY_LOW, _BY_HIGH = MULTIPLIERS & _LOW, MULTIPLIERS >> _HALF
+KEY_STEPS = np.array([0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B], dtype=np.uint64)[
     :, None, None
 ]
 
@@ -120,7 +120,7 @@ def _philox(
         multiplied = top[::-1] ^ others
         multiplied ^= keys
         others = bottom[::-1]
-        keys = keys + _KEY_STEPS
+        keys = keys + KEY_STEPS
     return np.stack([multiplied[0], others[0], multiplied[1], others[1]], axis=-1)
 
 
@@ -138,4 +138,4 @@ def _multiply(word: UInt64[np.ndarray, "2 stream draw"]) -> tuple[np.ndarray, np
     high *= _BY_HIGH
     high += middle
     high += low
-    return high, word * _MULTIPLIERS
+    return high, word * MULTIPLIERS
