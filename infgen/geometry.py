@@ -56,9 +56,14 @@ def to_world(
     pose: Float[np.ndarray, "... 3"], frame: Float[np.ndarray, "... 3"]
 ) -> Float[np.ndarray, "... 3"]:
     """Bring poses given in the frame of other poses to the world."""
-    xy_m = rotate(pose[..., :2], frame[..., 2]) + frame[..., :2]
-    heading_rad = wrap_angle(pose[..., 2] + frame[..., 2])
-    return np.concatenate([xy_m, heading_rad[..., None]], axis=-1)
+    cos, sin = np.cos(frame[..., 2]), np.sin(frame[..., 2])
+    x_m, y_m = pose[..., 0], pose[..., 1]
+    shape = np.broadcast_shapes(pose.shape, frame.shape)
+    placed = np.empty(shape, dtype=np.result_type(pose, frame))
+    placed[..., 0] = cos * x_m - sin * y_m + frame[..., 0]
+    placed[..., 1] = sin * x_m + cos * y_m + frame[..., 1]
+    placed[..., 2] = wrap_angle(pose[..., 2] + frame[..., 2])
+    return placed
 
 
 def box_corners(

@@ -223,7 +223,9 @@ def advance_agents(
     there = (population.presence != Presence.ABSENT) & ~gone
     remove = remove & there
     remove[:, EGO_ROW] = False
-    steps = vocabulary.path[population.agent_type[there], motion_token[there], 1:]
+    paths = vocabulary.path[:, :, 1:].reshape(-1, *vocabulary.path[0, 0, 1:].shape)
+    row = population.agent_type[there] * np.int64(vocabulary.num_motion_tokens)
+    steps = paths.take(row + motion_token[there], axis=0)
     path = np.zeros((*there.shape, *steps.shape[1:]), dtype=np.float32)
     path[there] = to_world(steps, population.pose[there][:, None])
     presence = np.where(remove, Presence.REMOVED, Presence.PRESENT) * there

@@ -18,18 +18,23 @@ _UNUSED_BITS, _USED = 11, (1 << 53) - 1
 class DeviceStreams:
     """The random streams of some rollouts on a device.
 
-    Holds what does not change between draws: the keys of all rounds and the multipliers.
+    Holds what does not change between draws: keys and multipliers of all rounds.
     """
 
     def __init__(self, key: np.ndarray, device: torch.device) -> None:
         """Bring the keys [stream, 2] of ``Streams`` to a device."""
         signed = key.view(np.int64).T[:, :, None]  # [word, stream, 1]
-        steps = KEY_STEPS.view(np.int64)
-        with np.errstate(over="ignore"):
-            keys = np.stack([signed + turn * steps for turn in range(ROUNDS)])
-        self._keys = torch.from_numpy(keys).to(device)
-        by = torch.from_numpy(MULTIPLIERS.view(np.int64).copy()).to(device)
-        self._by, self._by_low, self._by_high = by, by & _LOW, (by >> _HALF) & _LOW
+        steps, by = KEY_STEPS.view(np.int64), MULTIPLIERS.view(np.int64)
+        keys = np.stack([signed + turn * steps for turn in range(ROUNDS)])
+        halves = np.stack([by & _LOW, by >> _HALF & _LOW], axis=-1)[..., None, :]
+        # Every round leaves the two words that are multiplied in the other order.
+        self._rounds = [
+            tuple(
+                torch.from_numpy(np.flip(x, 0).copy() if flipped else x.copy()).to(device)
+                for x, flipped in ((keys[at], not at % 2), (by, at % 2), (halves, at % 2))
+            )
+            for at in range(ROUNDS)
+        ]
 
     def uniform(
         self,
@@ -39,23 +44,27 @@ class DeviceStreams:
         purpose: Int64[Tensor, " draw"],
     ) -> Float64[Tensor, "stream draw 4"]:
         """Draw the four numbers of each block, counted from 0, of each stream."""
-        shape = (self._keys.shape[2], len(block))
+        streams = self._rounds[0][0].shape[1]
         counter = torch.stack([block + 1, turn, torch.full_like(turn, token), purpose])
-        counter = counter[:, None].expand(4, *shape)
-        multiplied, others = counter[0::2], counter[1::2]
-        for keys in self._keys:
-            top, bottom = self._multiply(multiplied)
-            multiplied = top.flip(0) ^ others ^ keys
-            others = bottom.flip(0)
+        counter = counter[:, None].expand(WORDS, streams, -1)
+        multiplied, others = counter[0::2].contiguous(), counter[1::2]
+        for keys, by, halves in self._rounds:
+            top, bottom = _multiply(multiplied, by, halves)
+            multiplied, others = top ^ others.flip(0) ^ keys, bottom
         words = torch.stack([multiplied, others], dim=1).flatten(0, 1)  # In their order.
-        assert len(words) == WORDS
         used = (words >> _UNUSED_BITS) & _USED
         return used.movedim(0, -1).double() * 2.0**-53
 
-    def _multiply(self, word: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the upper and the lower 64 bits of words times their multipliers."""
-        low, high = word & _LOW, (word >> _HALF) & _LOW
-        middle = high * self._by_low + (((low * self._by_low) >> _HALF) & _LOW)
-        crossed = low * self._by_high + (middle & _LOW)
-        top = high * self._by_high + ((middle >> _HALF) & _LOW)
-        return top + ((crossed >> _HALF) & _LOW), word * self._by
+
+def _multiply(word: Tensor, by: Tensor, halves: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the upper and the lower 64 bits of words times their multipliers."""
+    products = _halves(word)[..., :, None] * halves  # [..., half of the word, of the other]
+    low, high = _halves(products).unbind(-1)
+    middle = high[..., 0, 0] + low[..., 0, 1] + low[..., 1, 0]
+    top = products[..., 1, 1] + high[..., 0, 1] + high[..., 1, 0] + (middle >> _HALF)
+    return top, word * by
+
+
+def _halves(word: Int64[Tensor, "*shape"]) -> Int64[Tensor, "*shape 2"]:
+    """Split words into their lower and their upper 32 bits, as numbers of 64 bits."""
+    return word.view(torch.int32).long().unflatten(-1, (-1, 2)) & _LOW
