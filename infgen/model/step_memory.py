@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Int64
 from torch import Tensor
 
 from infgen.model.layers import AttentionSources
+from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import MapFeatures
 from infgen.model.token_step import TokenStep
 
@@ -47,11 +49,15 @@ class StepMemory:
 class Insertions:
     """One token step as the entry stage sees it.
 
+    ``Stepper.entry_add`` writes into ``raw`` and ``relation``. All but ``rollout`` is of
+    every rollout of the batch: what is large is taken only when it is looked at.
+
     Attributes:
         token: The token step.
-        rollout: Rollouts whose insertion turns go on, by their index in the batch.
+        rollout: Rollouts whose insertion turns go on, by their index in the batch, in
+            order [active].
         map: Encoded maps.
-        scene: Map of each of those rollouts.
+        scene: Map of each rollout.
         before: Poses [rollout, row, 3] one token step earlier ...
         known: ... and rows observed then [rollout, row].
         token_step: The agents so far.
@@ -78,18 +84,35 @@ class Insertions:
 
     def take(self, places: Int64[Tensor, " kept"]) -> "Insertions":
         """Go on with some of the rollouts only: nothing more is computed for the others."""
-        return replace(
-            self,
-            rollout=self.rollout[places],
-            scene=self.scene[places],
-            before=self.before[places],
-            known=self.known[places],
-            token_step=self.token_step.take(places),
-            raw=self.raw[places],
-            relation=self.relation[places],
-            within=self.within[places],
-            roads=self.roads.take(places),
-            cell_features=None
-            if self.cell_features is None
-            else self.cell_features[places],
+        return replace(self, rollout=self.rollout[places])
+
+    @property
+    def all_active(self) -> bool:
+        """Whether all rollouts of the batch go on."""
+        return len(self.rollout) == len(self.scene)
+
+    def active(self, values: Tensor) -> Tensor:
+        """Take the values [rollout, ...] of the rollouts that go on."""
+        return values if self.all_active else values[self.rollout]
+
+    def rows(self) -> Int64[Tensor, "active row"]:
+        """Flat indices of the rows of the rollouts that go on."""
+        rows = self.within.shape[1]
+        row = torch.arange(rows, device=self.rollout.device)
+        return self.rollout[:, None] * rows + row
+
+    def agents(self) -> AttentionSources:
+        """Show every ego that goes on the agents around it."""
+        relation = Shared.of(self.active(self.relation))
+        within = self.active(self.within)
+        return AttentionSources(self.raw.flatten(0, 1), self.rows(), relation, within)
+
+    def around(self) -> tuple[AttentionSources, Tensor | None]:
+        """Return the map tokens, and the features of cells, around these egos."""
+        if self.all_active:
+            return self.roads, self.cell_features
+        cells = self.cell_features
+        return (
+            self.roads.take(self.rollout),
+            None if cells is None else cells[self.rollout],
         )

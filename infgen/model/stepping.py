@@ -23,7 +23,7 @@ with an empty past, so a freed row can be given to an inserted agent as it is.
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from infgen.model.agents import AgentContext, AgentRows
@@ -203,7 +203,11 @@ class Stepper:
 
     @torch.no_grad()
     def entry_add(
-        self, entries: Insertions, token_step: TokenStep, fresh: Rows | None = None
+        self,
+        entries: Insertions,
+        token_step: TokenStep,
+        fresh: Rows | None = None,
+        real: Bool[Tensor, " row"] | None = None,
     ) -> Insertions:
         """Go on with inserted agents as further visible rows of the same column.
 
@@ -211,35 +215,34 @@ class Stepper:
             entries: The column so far.
             token_step: The column with the inserted agents.
             fresh: Their rows; who knows them saves waiting for their number.
+            real: Which of these rows hold an inserted agent; all of them if None.
         """
         if fresh is None:
             fresh = Rows.where(token_step.visible & ~entries.token_step.visible)
-        came = fresh.spread(torch.ones(len(fresh.at), device=fresh.at.device)) > 0
-        embedded = self._embed(entries.before, entries.known, token_step, fresh)
-        raw = fresh.spread(normed(embedded))
+        some = torch.ones_like(fresh.at, dtype=torch.bool) if real is None else real
+        came = fresh.spread(some)
+        embedded = normed(self._embed(entries.before, entries.known, token_step, fresh))
         ego_pose = token_step.pose[:, EGO, None].expand_as(token_step.pose)
         described = relations(fresh.pack(ego_pose), fresh.pack(token_step.pose)[:, None])
         reach = self._asked().cell_agents
         related = reach.relation.look_up(described, reach.table)[:, 0]
         within = came & within_radius(ego_pose, token_step.pose, reach.radius_m)
-        return replace(
-            entries,
-            token_step=token_step,
-            raw=torch.where(came[..., None], raw, entries.raw),
-            relation=torch.where(came[..., None], fresh.spread(related), entries.relation),
-            within=entries.within | within,
-        )
+        for kept, new in ((entries.raw, embedded), (entries.relation, related)):
+            flat = kept.flatten(0, 1)
+            if real is not None:
+                new = torch.where(real[:, None], new, flat[fresh.at])
+            flat.index_copy_(0, fresh.at, new)
+        return replace(entries, token_step=token_step, within=entries.within | within)
 
     @torch.no_grad()
     def entry_query(self, entries: Insertions) -> PositionOutputs:
-        """Ask for the next inserted agent of every rollout."""
-        cells = self._asked().cells
-        occupied = cells.occupied(entries.token_step.cell, entries.within)
-        relation = Shared.of(entries.relation)
-        agents = AttentionSources.own(entries.raw, relation, entries.within)
-        x = cells(occupied[:, None], entries.roads, agents)[:, 0]
+        """Ask for the next inserted agent of every rollout that goes on."""
+        cells, agents = self._asked().cells, entries.agents()
+        occupied = cells.occupied(entries.active(entries.token_step.cell), agents.present)
+        roads, cell_features = entries.around()
+        x = cells(occupied[:, None], roads, agents)[:, 0]
         each = torch.arange(len(x), device=x.device)
-        said = cells.answer(Rows(each, each), x[:, None], entries.cell_features)
+        said = cells.answer(Rows(each, each), x[:, None], cell_features)
         return PositionOutputs(
             said.add_logit[:, 0],
             None if said.position_logits is None else said.position_logits[:, 0],
@@ -250,10 +253,10 @@ class Stepper:
     def entry_details(
         self,
         entries: Insertions,
-        cell: Int64[Tensor, " rollout"],
-        position_m: Float32[Tensor, "rollout 2"] | None = None,
+        cell: Int64[Tensor, " active"],
+        position_m: Float32[Tensor, "active 2"] | None = None,
     ) -> InsertionDetails:
-        """Query the details of an inserted agent at a cell of every rollout.
+        """Query the details of an inserted agent at a cell of every rollout that goes on.
 
         Args:
             entries: The token step.
@@ -263,20 +266,20 @@ class Stepper:
         asking, token_step = self._asked(), entries.token_step
         details = asking.details
         position_m = details.centre_m[cell] if position_m is None else position_m
-        pose = cell_pose(token_step.pose[:, EGO], position_m)[:, None]
+        agents_pose = entries.active(token_step.pose)
+        pose = cell_pose(agents_pose[:, EGO], position_m)[:, None]
         each = torch.arange(len(cell), device=cell.device)
         rows = Rows(each, each[:, None])
-        source = torch.arange(token_step.presence.numel(), device=cell.device)
         around = find_neighbours(
             asking.detail_agents,
             rows,
             pose,
-            token_step.pose,
-            source.view_as(token_step.presence),
-            token_step.visible[:, None],
+            agents_pose,
+            entries.rows(),
+            entries.active(token_step.visible)[:, None],
         )
         roads = find_map_neighbours(
-            asking.detail_roads, rows, pose, entries.map, entries.scene
+            asking.detail_roads, rows, pose, entries.map, entries.active(entries.scene)
         )
         x = details(cell, roads, around.seen(entries.raw.flatten(0, 1)))
         kinds = torch.arange(details.given_kind.num_embeddings, device=cell.device)

@@ -5,6 +5,7 @@ Dims as in ``steps``. What a network has no head for is None in its answers.
 
 from dataclasses import dataclass, fields
 
+import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
@@ -43,6 +44,28 @@ class TokenStep:
     def take(self, rollouts: Int64[Tensor, " kept"]) -> "TokenStep":
         """Go on with some rollouts only."""
         return TokenStep(*(getattr(self, each.name)[rollouts] for each in fields(self)))
+
+    def pick(self, at: Int64[Tensor, " chosen"]) -> "TokenStep":
+        """Take some rows by their flat indices among [rollout, row]: a single rollout."""
+        rows = (getattr(self, each.name).flatten(0, 1)[at] for each in fields(self))
+        return TokenStep(*(values[None] for values in rows))
+
+    def put(self, at: Int64[Tensor, " changed"], rows: "TokenStep") -> "TokenStep":
+        """Return a token step with other agents in some rows. Inverse of ``pick``."""
+        changed = []
+        for each in fields(self):
+            old, new = getattr(self, each.name), getattr(rows, each.name)[0]
+            changed.append(old.flatten(0, 1).index_copy(0, at, new).view_as(old))
+        return TokenStep(*changed)
+
+    def where(self, chosen: Bool[Tensor, "rollout row"], other: "TokenStep") -> "TokenStep":
+        """Take the chosen rows of this, and the other rows of another token step."""
+        merged = []
+        for each in fields(self):
+            own, others = getattr(self, each.name), getattr(other, each.name)
+            mask = chosen if own.dim() == chosen.dim() else chosen[..., None]
+            merged.append(torch.where(mask, own, others))
+        return TokenStep(*merged)
 
 
 @dataclass(frozen=True, slots=True)

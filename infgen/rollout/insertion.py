@@ -5,18 +5,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.token_step import InsertionDetails, PositionOutputs
-from infgen.rollout.insertion_mask import InsertionMask
-from infgen.rollout.population import InsertedAgents, Population, add_inserted
-from infgen.rollout.random_streams import Purpose, Streams
+from infgen.rollout.insertion_state import InsertionRequest, InsertionState, TurnNumbers
+from infgen.rollout.population import InsertedAgents, Population
+from infgen.rollout.random_streams import Purpose
 from infgen.rollout.sampling import choose, sample_event
 from infgen.rollout.simulator import Simulator
 from infgen.tokens.grid import Grid, decode_cell, decode_heading, encode_cell
-from infgen.tokens.scene_tokens import NO_CELL
 
 INSIDE = 0.999
 """Inserted agents stay within this share of the grid radius, whatever their offsets."""
@@ -25,75 +24,17 @@ UniformNumbers = Callable[[Purpose], Tensor]
 
 
 @dataclass(frozen=True, slots=True)
-class InsertionRequest:
-    """What insertion needs besides the agents: network, random numbers and limits.
-
-    Attributes:
-        simulator: The network.
-        streams: Random numbers of the rollouts.
-        insertion_mask: Rejects positions; None allows all.
-        most: Most agents of each rollout at any one time.
-        wanted: Number of other agents wanted around each ego; None for no control.
-    """
-
-    simulator: Simulator
-    streams: Streams
-    insertion_mask: InsertionMask | None
-    most: Int64[np.ndarray, " rollout"]
-    wanted: Float64[np.ndarray, " rollout"] | None = None
-
-    @property
-    def attempts(self) -> int:
-        """Number of positions sampled for one insertion before it is given up."""
-        if self.insertion_mask is None:
-            return 1
-        return self.simulator.settings.max_insertion_attempts
-
-    def uniforms(self, token: int, turn: int, attempt: int = 0) -> UniformNumbers:
-        """Return the uniform numbers of one insertion of each rollout."""
-        # A longer draw starts with the shorter one: the first attempt is always the same.
-        return lambda purpose: self.simulator.tensor(
-            self.streams.uniform(token, purpose, attempt + 1, turn)[:, attempt]
-        )
-
-    def take(self, places: Int64[np.ndarray, " kept"]) -> "InsertionRequest":
-        """Keep some rollouts only."""
-        insertion_mask = (
-            None if self.insertion_mask is None else self.insertion_mask.take(places)
-        )
-        return replace(
-            self,
-            streams=self.streams.take(places),
-            insertion_mask=insertion_mask,
-            most=self.most[places],
-            wanted=None if self.wanted is None else self.wanted[places],
-        )
-
-    def add_bias(self, population: Population) -> Float64[np.ndarray, " rollout"]:
-        """Return what is added to the logit of ADD, with density control."""
-        settings = self.simulator.settings
-        bias = np.full(len(self.streams), settings.add_bias)
-        if self.wanted is not None:
-            there = population.count_others(self.simulator.grid.radius_m)
-            # Insertions are sampled one by one: their number is proportional to the odds.
-            bias += settings.density_control * np.log((self.wanted + 1) / (there + 1))
-        return bias
-
-
-@dataclass(frozen=True, slots=True)
 class _ActiveRollouts:
     """Rollouts whose insertion turns go on; nothing is computed for the others.
 
     Attributes:
-        request: What insertion needs.
-        entries: The token step, as the network sees it.
-        population: All agents, those inserted so far included.
-        rollout: Indices of the rollouts in the batch.
+        batch: All rollouts.
+        entries: The token step of the active ones, as the network sees it.
+        rollout: Indices of these in the batch.
     """
 
-    request: InsertionRequest
+    batch: InsertionState
     entries: Insertions
-    population: Population
     rollout: Int64[np.ndarray, " rollout"]
 
     def __len__(self) -> int:
@@ -105,39 +46,43 @@ class _ActiveRollouts:
             return self
         places = np.flatnonzero(which)
         return _ActiveRollouts(
-            request=self.request.take(places),
-            entries=self.entries.take(self.request.simulator.tensor(places)),
-            population=self.population.take(places),
+            batch=self.batch,
+            entries=self.entries.take(self.batch.request.simulator.tensor(places)),
             rollout=self.rollout[places],
         )
 
     def add_inserted(self, inserted: InsertedAgents) -> "_ActiveRollouts":
         """Add the inserted agents to the population and to the input of the network."""
-        simulator = self.request.simulator
-        population, _ = add_inserted(self.population, inserted)
-        fresh = simulator.rows(population.visible & ~self.population.visible)
+        batch, simulator = self.batch, self.batch.request.simulator
+        row = batch.add(self.rollout, inserted)
+        at = self.rollout[row >= 0], row[row >= 0]
+        fresh = np.zeros(batch.cells.shape, dtype=bool)
+        fresh[at] = True
+        rows = simulator.rows(fresh)
+        step = simulator.token_step(batch.population, batch.cells, at)
         entries = simulator.stepper.entry_add(
-            self.entries, simulator.token_step(population), fresh
+            self.entries, self.entries.token_step.put(rows.at, step), rows
         )
-        return replace(self, entries=entries, population=population)
+        return replace(self, entries=entries)
 
 
 def insert_agents(
     request: InsertionRequest, memory: StepMemory, population: Population, token: int
 ) -> Population:
     """Insert agents into every rollout until the network samples BEGIN MOTION."""
-    simulator, everyone = request.simulator, np.arange(len(request.streams))
+    simulator, batch = request.simulator, InsertionState.of(request, population)
     entries = simulator.stepper.entry_begin(
-        memory, simulator.token_step(population), simulator.rows(population.visible)
+        memory,
+        simulator.token_step(population, batch.cells),
+        simulator.rows(population.visible),
     )
-    active = _ActiveRollouts(request, entries, population, everyone)
+    active = _ActiveRollouts(batch, entries, np.arange(len(request.streams)))
     for turn in range(simulator.settings.max_insertions):
         active, inserted = _insert_next(active, token, turn)
         if inserted is None:
             break
         active = active.add_inserted(inserted)
-        population = population.put(active.rollout, active.population)
-    return population
+    return batch.population
 
 
 def _insert_next(
@@ -148,44 +93,57 @@ def _insert_next(
     Returns:
         The rollouts that insert an agent, and these agents; None if there are none.
     """
-    simulator, uniforms = active.request.simulator, active.request.uniforms(token, turn)
+    batch, asked = active.batch, np.arange(len(active))
+    request, simulator = batch.request, batch.request.simulator
+    numbers = TurnNumbers(request.streams.take(active.rollout), token, turn)
     query = simulator.stepper.entry_query(active.entries)
-    bias = simulator.tensor(active.request.add_bias(active.population))
-    add = sample_event(query.add_logit, uniforms(Purpose.ADD), bias)
+    bias = simulator.tensor(batch.add_bias(active.rollout))
+    uniform = simulator.tensor(numbers.of(Purpose.ADD, asked))
+    add = sample_event(query.add_logit, uniform, bias)
     # A batch has as many rows as its most crowded scene needs: free rows are no limit.
-    wanted = simulator.fetch(add)[0] & (active.population.num_agents < active.request.most)
+    free = batch.num_agents[active.rollout] < request.most[active.rollout]
+    wanted = simulator.fetch(add)[0] & free
     places = np.flatnonzero(wanted)
+    if not len(places):
+        return active, None
     active, query = active.take(wanted), query.take(simulator.tensor(places))
-    found = _sample_positions(active, query, token, turn) if len(active) else None
-    if found is None or not found.who.any():
+    found = _sample_positions(active, query, numbers, places)
+    if not found.who.any():
         return active, None
     return active.take(found.who), found.take(np.flatnonzero(found.who))
 
 
 def _sample_positions(
-    active: _ActiveRollouts, query: PositionOutputs, token: int, turn: int
+    active: _ActiveRollouts,
+    query: PositionOutputs,
+    numbers: TurnNumbers,
+    number: Int64[np.ndarray, " rollout"],
 ) -> InsertedAgents:
     """Sample an inserted agent of every rollout, and whether its position is allowed.
 
     A rejected position is sampled again in another cell, up to ``max_insertion_attempts``
     times: the network chooses among the allowed positions.
+
+    Args:
+        active: The rollouts.
+        query: Logits of their positions.
+        numbers: Random numbers of the turn ...
+        number: ... and the place of each rollout among them.
     """
-    simulator, found = active.request.simulator, None
-    taken = _taken(active.population.cells(simulator.grid), simulator.grid.num_cells)
-    left = np.ones(len(active), dtype=bool)
-    for attempt in range(active.request.attempts):
+    batch, found = active.batch, None
+    simulator, mask = batch.request.simulator, batch.request.insertion_mask
+    taken, left = batch.occupied[active.rollout], np.ones(len(active), dtype=bool)
+    for attempt in range(batch.request.attempts):
         asked, places = active.take(left), np.flatnonzero(left)
         inserted, cell = _sample_agents(
             asked,
-            query.take(simulator.tensor(places)),
-            taken[places],
-            asked.request.uniforms(token, turn, attempt),
+            query if left.all() else query.take(simulator.tensor(places)),
+            taken if left.all() else taken[places],
+            _attempt_numbers(simulator, numbers, number[places], attempt),
         )
-        insertion_mask = asked.request.insertion_mask
-        if insertion_mask is not None:
-            inserted = replace(
-                inserted, who=insertion_mask.allows(asked.population, inserted)
-            )
+        if mask is not None:
+            allowed = mask.allows(batch.population, inserted, asked.rollout, batch.circles)
+            inserted = replace(inserted, who=allowed)
         found = inserted if found is None else found.put(places, inserted)
         taken[places, cell] = True
         left = ~found.who
@@ -193,6 +151,13 @@ def _sample_positions(
             break
     assert found is not None
     return found
+
+
+def _attempt_numbers(
+    simulator: Simulator, numbers: TurnNumbers, places: np.ndarray, attempt: int
+) -> UniformNumbers:
+    """Return the uniform numbers of one attempt of some rollouts, by purpose."""
+    return lambda purpose: simulator.tensor(numbers.of(purpose, places, attempt))
 
 
 def _sample_agents(
@@ -205,13 +170,13 @@ def _sample_agents(
 
     Everything is sampled where the network is, and fetched at once.
     """
-    simulator, grid = active.request.simulator, active.request.simulator.grid
+    simulator, grid = active.batch.request.simulator, active.batch.request.simulator.grid
     cell, regressed_m = _sample_cell(simulator, query, taken, uniforms)
     details = simulator.stepper.entry_details(active.entries, cell, regressed_m)
     agent_type = choose(details.agent_type_logits, uniforms(Purpose.AGENT_TYPE))
-    heading = _sample_heading(simulator, details, agent_type, uniforms)
-    offset_m = None if details.offset_m is None else _of_type(details.offset_m, agent_type)
-    size_lwh_m = _of_type(details.size_lwh_m, agent_type)
+    heading = sample_heading(simulator, details, agent_type, uniforms)
+    offset_m = None if details.offset_m is None else of_type(details.offset_m, agent_type)
+    size_lwh_m = of_type(details.size_lwh_m, agent_type)
     more = offset_m if regressed_m is None else regressed_m
     parts = [cell, agent_type, size_lwh_m, heading, *([] if more is None else [more])]
     cells, types, sizes, headings, *rest = simulator.fetch(*parts)
@@ -262,7 +227,7 @@ def _within(position_m: np.ndarray, grid: Grid) -> np.ndarray:
     return position_m / np.maximum(far, np.float32(1))[:, None]
 
 
-def _sample_heading(
+def sample_heading(
     simulator: Simulator,
     details: InsertionDetails,
     agent_type: Tensor,
@@ -271,22 +236,14 @@ def _sample_heading(
     """Sample the heading of every inserted agent: its bin, or relative to the ego."""
     if details.heading_logits is None:
         assert details.turned_rad is not None
-        return _of_type(details.turned_rad, agent_type)
+        return of_type(details.turned_rad, agent_type)
     return choose(
-        _of_type(details.heading_logits, agent_type),
+        of_type(details.heading_logits, agent_type),
         uniforms(Purpose.HEADING),
         temperature=simulator.settings.heading_temperature,
     )
 
 
-def _of_type(values: Tensor, agent_type: Tensor) -> Tensor:
+def of_type(values: Tensor, agent_type: Tensor) -> Tensor:
     """Take the values [rollout, ...] of the sampled agent types."""
     return values[torch.arange(len(agent_type), device=agent_type.device), agent_type]
-
-
-def _taken(cells: np.ndarray, count: int) -> Bool[np.ndarray, "rollout cell"]:
-    """Mark the cells that hold an agent: no other is inserted there."""
-    taken = np.zeros((len(cells), count + 1), dtype=bool)
-    # Agents outside the grid fall into an extra last column.
-    np.put_along_axis(taken, np.where(cells == NO_CELL, -1, cells), True, axis=1)
-    return taken[:, :-1]

@@ -6,20 +6,43 @@ boxes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from infgen.geometry import boxes_overlap, to_world
+from infgen.rollout.lane_squares import Lanes, LaneSquares, lane_gap_m
 from infgen.rollout.population import EGO_ROW, InsertedAgents, Population, insertion_pose
 from infgen.scene import AgentType
 from infgen.tokens.map import PolylineType
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
-NOWHERE_M = np.float32(1e9)
-"""Coordinate of padded lane segments."""
+MARGIN_M = 0.1
+"""Boxes whose circles are farther apart do not overlap, whatever rounding does."""
+FAR_M = np.float32(1e9)
+"""Where nobody is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Circles:
+    """Circles that hold the boxes of agents now and one token step later.
+
+    Attributes:
+        x_m: Centres; ``FAR_M`` where there is no agent.
+        y_m: Centres.
+        radius_m: Radii.
+    """
+
+    x_m: Float32[np.ndarray, "rollout row"]
+    y_m: Float32[np.ndarray, "rollout row"]
+    radius_m: Float32[np.ndarray, "rollout row"]
+
+    def put(self, at: tuple[np.ndarray, np.ndarray], others: "Circles") -> None:
+        """Replace the circles of some rollouts and rows, in place."""
+        for name in ("x_m", "y_m", "radius_m"):
+            getattr(self, name)[at] = getattr(others, name)[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,62 +50,112 @@ class InsertionMask:
     """Lane segments of the maps of a batch, and what decides whether a position is allowed.
 
     Attributes:
-        start_m: First point of each segment.
-        along_m: Vector from there to its last point.
+        lanes: Lane segments of each map.
+        squares: The same by where they are.
         scene: Map of each rollout.
-        lane_m: Greatest distance of a vehicle to a lane, on a map that has lanes.
-        end_pose: End pose of each motion token by agent type.
+        end_pose: End pose of each motion token by agent type ...
+        length_m: ... and how far away it is.
     """
 
-    start_m: Float32[np.ndarray, "scene lane 2"]
-    along_m: Float32[np.ndarray, "scene lane 2"]
+    lanes: Sequence[Lanes]
+    squares: LaneSquares
     scene: Int64[np.ndarray, " rollout"]
-    lane_m: float
     end_pose: Float32[np.ndarray, "3 motion_token 3"]
+    length_m: Float32[np.ndarray, "3 motion_token"]
 
-    def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "InsertionMask":
-        """Keep some rollouts only."""
-        return replace(self, scene=self.scene[rollouts])
+    def circles(
+        self, population: Population, at: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> Circles:
+        """Return the circles of all agents, or of some rows as a single rollout."""
+
+        def some(values: np.ndarray) -> np.ndarray:
+            return values if at is None else values[at][None]
+
+        there = some(population.presence) != Presence.ABSENT
+        agent_type = some(population.agent_type)
+        motion_token = some(population.motion_token)
+        pose, size_m = some(population.pose), some(population.size_lwh_m)
+        radius_m = np.hypot(size_m[..., 0], size_m[..., 1]) / 2 + MARGIN_M
+        moves = motion_token >= 0
+        radius_m += self.length_m[agent_type, np.where(moves, motion_token, 0)] * moves
+        x_m, y_m = (np.where(there, pose[..., axis], FAR_M) for axis in (0, 1))
+        return Circles(x_m, y_m, radius_m)
 
     def allows(
-        self, population: Population, inserted: InsertedAgents
-    ) -> Bool[np.ndarray, " rollout"]:
-        """Tell which inserted agents have an allowed position."""
-        pose = insertion_pose(population.pose[:, EGO_ROW], inserted)
-        pedestrian = inserted.agent_type == AgentType.PEDESTRIAN
-        passed = pedestrian[:, None] & (population.agent_type == AgentType.PEDESTRIAN)
-        overlaps = np.zeros(len(pose), dtype=bool)
-        for everyone in (population.pose, self._soon(population)):
-            meets = boxes_overlap(
-                pose[:, None],
-                inserted.size_lwh_m[:, None, :2],
-                everyone,
-                population.size_lwh_m[..., :2],
-            )
-            meets &= (population.presence != Presence.ABSENT) & ~passed
-            overlaps |= meets.any(axis=1)
-        no_lanes = (self.start_m == NOWHERE_M).all(axis=(1, 2))[self.scene]
-        near_lane = self.lane_distance_m(pose[:, :2]) <= self.lane_m
-        near_lane |= no_lanes | (inserted.agent_type != AgentType.VEHICLE)
-        return near_lane & ~overlaps
+        self,
+        population: Population,
+        inserted: InsertedAgents,
+        rollouts: Int64[np.ndarray, " inserted"] | None = None,
+        circles: Circles | None = None,
+    ) -> Bool[np.ndarray, " inserted"]:
+        """Tell which inserted agents have an allowed position.
 
-    def _soon(self, population: Population) -> Float32[np.ndarray, "rollout row 3"]:
-        """Poses one token step ahead if every agent repeats its motion token."""
-        moves = population.motion_token >= 0
-        motion_token = np.where(moves, population.motion_token, 0)
-        step = self.end_pose[population.agent_type, motion_token] * moves[..., None]
-        return to_world(step, population.pose)
+        Args:
+            population: All agents of all rollouts.
+            inserted: Agents to insert.
+            rollouts: Where to insert them; one into each rollout if None.
+            circles: Of the population, if they are known.
+        """
+        rollouts = np.arange(len(self.scene)) if rollouts is None else rollouts
+        circles = self.circles(population) if circles is None else circles
+        pose = insertion_pose(population.pose[rollouts, EGO_ROW], inserted)
+        allowed = ~self._overlaps(population, inserted, rollouts, pose, circles)
+        vehicle = inserted.agent_type == AgentType.VEHICLE
+        has_lanes = np.array([len(start_m) > 0 for start_m, _ in self.lanes])
+        scene = self.scene[rollouts]
+        asked = np.flatnonzero(allowed & vehicle & has_lanes[scene])
+        allowed[asked] = self.squares.has_lane(pose[asked, :2], scene[asked])
+        return allowed
+
+    def _overlaps(
+        self,
+        population: Population,
+        inserted: InsertedAgents,
+        rollouts: Int64[np.ndarray, " inserted"],
+        pose: Float32[np.ndarray, "inserted 3"],
+        circles: Circles,
+    ) -> Bool[np.ndarray, " inserted"]:
+        """Tell which boxes overlap another one, now or one token step ahead."""
+        own_m = np.hypot(inserted.size_lwh_m[:, 0], inserted.size_lwh_m[:, 1]) / 2
+        x_m, y_m = circles.x_m[rollouts] - pose[:, :1], circles.y_m[rollouts] - pose[:, 1:2]
+        reach_m = circles.radius_m[rollouts] + own_m[:, None]
+        who, row = np.nonzero(x_m * x_m + y_m * y_m < reach_m * reach_m)
+        agent_type = population.agent_type[rollouts[who], row]
+        pedestrians = (agent_type == AgentType.PEDESTRIAN) & (
+            inserted.agent_type[who] == AgentType.PEDESTRIAN
+        )
+        who, row = who[~pedestrians], row[~pedestrians]
+        at = (rollouts[who], row)
+        now = population.pose[at]
+        soon = to_world(self._step(population, at), now)
+        meets = boxes_overlap(
+            pose[who],
+            inserted.size_lwh_m[who, :2],
+            np.stack([now, soon]),
+            population.size_lwh_m[at][:, :2],
+        ).any(axis=0)
+        overlaps = np.zeros(len(pose), dtype=bool)
+        overlaps[who[meets]] = True
+        return overlaps
+
+    def _step(
+        self, population: Population, at: tuple[np.ndarray, np.ndarray]
+    ) -> Float32[np.ndarray, "row 3"]:
+        """Return how far some agents get if they repeat their motion tokens."""
+        motion_token = population.motion_token[at]
+        moves = motion_token >= 0
+        step = self.end_pose[population.agent_type[at], np.where(moves, motion_token, 0)]
+        return step * moves[:, None]
 
     def lane_distance_m(
         self, xy_m: Float32[np.ndarray, "rollout 2"]
     ) -> Float32[np.ndarray, " rollout"]:
         """Distance of one point per rollout to the nearest lane of its map."""
-        start_m, along_m = self.start_m[self.scene], self.along_m[self.scene]
-        away_m = xy_m[:, None] - start_m  # [rollout, lane, 2]
-        length2 = np.maximum((along_m**2).sum(axis=-1), np.float32(1e-6))
-        share = np.clip((away_m * along_m).sum(axis=-1) / length2, 0, 1)
-        gap_m = np.linalg.norm(away_m - share[..., None] * along_m, axis=-1)
-        return gap_m.min(axis=1, initial=np.inf)
+        nearest_m = [
+            lane_gap_m(point_m, *self.lanes[at]).min(initial=np.inf)
+            for point_m, at in zip(xy_m, self.scene, strict=True)
+        ]
+        return np.array(nearest_m, dtype=np.float32)
 
 
 def make_insertion_mask(
@@ -91,19 +164,23 @@ def make_insertion_mask(
     scene: Int64[np.ndarray, " rollout"],
     lane_m: float,
 ) -> InsertionMask:
-    """Make the insertion mask of some maps; ``scene`` is the map of each rollout."""
+    """Make the insertion mask of some maps.
+
+    Args:
+        maps: Tokens of the maps.
+        books: Motion tokens and map tokens.
+        scene: Map of each rollout.
+        lane_m: Greatest distance of a vehicle to a lane, on a map that has lanes.
+    """
     moves, roads = books
     lanes = [_lanes(tokens, roads) for tokens in maps]
-    shape = (len(maps), max(len(start_m) for start_m, _ in lanes), 2)
-    start_m = np.full(shape, NOWHERE_M)
-    along_m = np.zeros(shape, dtype=np.float32)
-    for at, (first_m, step_m) in enumerate(lanes):
-        start_m[at, : len(first_m)] = first_m
-        along_m[at, : len(first_m)] = step_m
-    return InsertionMask(start_m, along_m, scene, lane_m, moves.end_pose)
+    length_m = np.hypot(moves.end_pose[..., 0], moves.end_pose[..., 1])
+    return InsertionMask(
+        lanes, LaneSquares.of(lanes, lane_m), scene, moves.end_pose, length_m
+    )
 
 
-def _lanes(tokens: SceneTokens, roads: MapVocabulary) -> tuple[np.ndarray, np.ndarray]:
+def _lanes(tokens: SceneTokens, roads: MapVocabulary) -> Lanes:
     """First points of the lane tokens of a map, and vectors to their last points."""
     rows = tokens.map_polyline_type == PolylineType.LANE
     end_m = roads.curve_m[tokens.map_token[rows], -1]

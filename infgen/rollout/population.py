@@ -63,9 +63,12 @@ class Population:
 
     def cells(self, grid: Grid) -> Int16[np.ndarray, "rollout row"]:
         """Cell [rollout, row] of the ego's grid that holds each agent, or ``NO_CELL``."""
-        ego_pose = self.pose[:, EGO_ROW, None]
-        cell = encode_cell(to_grid(self.pose[..., :2], ego_pose), grid)
-        return np.where(self.presence == Presence.ABSENT, np.int16(NO_CELL), cell)
+        there = self.presence != Presence.ABSENT
+        rollout, _ = np.nonzero(there)
+        ego_pose = self.pose[rollout, EGO_ROW]
+        cell = np.full(there.shape, NO_CELL, dtype=np.int16)
+        cell[there] = encode_cell(to_grid(self.pose[there, :2], ego_pose), grid)
+        return cell
 
     def count_others(self, radius_m: float) -> Int64[np.ndarray, " rollout"]:
         """Count the agents within a radius of each ego, without the ego."""
@@ -89,11 +92,9 @@ class Population:
         """Take some rollouts."""
         return _take(self, rollouts)
 
-    def put(
-        self, rollouts: Int64[np.ndarray, " kept"], others: "Population"
-    ) -> "Population":
-        """Replace some rollouts by others. Inverse of ``take``."""
-        return _put(self, rollouts, others)
+    def copy(self) -> "Population":
+        """Return arrays of its own."""
+        return replace(self, **{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,8 +223,11 @@ def advance_agents(
     there = (population.presence != Presence.ABSENT) & ~gone
     remove = remove & there
     remove[:, EGO_ROW] = False
-    steps = vocabulary.path[population.agent_type, motion_token][:, :, 1:]
-    path = to_world(steps, population.pose[:, :, None]) * there[..., None, None]
+    paths = vocabulary.path[:, :, 1:].reshape(-1, *vocabulary.path[0, 0, 1:].shape)
+    row = population.agent_type[there] * np.int64(vocabulary.num_motion_tokens)
+    steps = paths.take(row + motion_token[there], axis=0)
+    path = np.zeros((*there.shape, *steps.shape[1:]), dtype=np.float32)
+    path[there] = to_world(steps, population.pose[there][:, None])
     presence = np.where(remove, Presence.REMOVED, Presence.PRESENT) * there
     moved = replace(
         population,
@@ -266,23 +270,40 @@ def add_inserted(
         The population with them, and the row that each rollout's inserted agent got (-1
         where there is none). A full rollout drops its inserted agent.
     """
-    free = population.agent_number == NOBODY
-    fits = inserted.who & free.any(axis=1)
-    rollout = np.flatnonzero(fits)
-    row = free.argmax(axis=1)[rollout]
+    new, who = population.copy(), np.flatnonzero(inserted.who)
+    row = np.full(len(inserted.who), -1, dtype=np.int64)
+    row[who] = place_inserted(new, who, inserted.take(who))
+    return new, row
 
-    new = population.take(np.arange(len(fits)))  # A copy.
-    new.num_agents_so_far[fits] += 1
-    new.agent_number[rollout, row] = population.num_agents_so_far[rollout]
-    new.agent_type[rollout, row] = inserted.agent_type[rollout]
-    new.size_lwh_m[rollout, row] = inserted.size_lwh_m[rollout]
-    new.pose[rollout, row] = insertion_pose(population.pose[:, EGO_ROW], inserted)[rollout]
-    new.motion_token[rollout, row] = FIRST_MOTION_TOKEN
-    new.presence[rollout, row] = Presence.INSERTED
-    new.observed[rollout, row] = False
-    rows = np.full(len(fits), -1, dtype=np.int64)
-    rows[rollout] = row
-    return new, rows
+
+def place_inserted(
+    population: Population,
+    rollouts: Int64[np.ndarray, " inserted"],
+    inserted: InsertedAgents,
+) -> Int64[np.ndarray, " inserted"]:
+    """Write inserted agents into a population, which changes in place.
+
+    Args:
+        population: All agents.
+        rollouts: Where each is inserted: at most one into a rollout.
+        inserted: The agents.
+
+    Returns:
+        The row that each agent got: the first free one; -1 in a full rollout.
+    """
+    free = population.agent_number[rollouts] == NOBODY
+    row, fits = free.argmax(axis=1), free.any(axis=1)
+    pose = insertion_pose(population.pose[rollouts, EGO_ROW], inserted)[fits]
+    rollout, at = rollouts[fits], (rollouts[fits], row[fits])
+    population.agent_number[at] = population.num_agents_so_far[rollout]
+    population.num_agents_so_far[rollout] += 1
+    population.agent_type[at] = inserted.agent_type[fits]
+    population.size_lwh_m[at] = inserted.size_lwh_m[fits]
+    population.pose[at] = pose
+    population.motion_token[at] = FIRST_MOTION_TOKEN
+    population.presence[at] = Presence.INSERTED
+    population.observed[at] = False
+    return np.where(fits, row, -1)
 
 
 def insertion_pose(

@@ -7,7 +7,7 @@ The generator is Philox4x64-10 (Salmon et al. 2011, "Parallel random numbers: as
 """
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -17,9 +17,15 @@ from jaxtyping import Float64, Int64, UInt64
 ROUNDS = 10
 WORDS = 4
 """Numbers that one evaluation makes."""
-_MULTIPLIERS = (np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157))
-_KEY_STEPS = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B))
 _LOW, _HALF, _UNUSED_BITS = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(11)
+MULTIPLIERS = np.array([0xD2E7470EE14C6C93, 0xCA5A826395121157], dtype=np.uint64)[
+    :, None, None
+]
+"""Of the first and the third word of the counter; in halves below."""
+_BY_LOW, _BY_HIGH = MULTIPLIERS & _LOW, MULTIPLIERS >> _HALF
+KEY_STEPS = np.array([0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B], dtype=np.uint64)[
+    :, None, None
+]
 
 
 class Purpose(IntEnum):
@@ -73,35 +79,63 @@ class Streams:
         """
         blocks = -(-count // WORDS)
         # The lowest word counts within a draw, from 1 on; the others name the draw.
-        block = np.arange(1, blocks + 1, dtype=np.uint64)[None]
+        block = np.arange(1, blocks + 1, dtype=np.uint64)
         words = _philox((block, turn, token, int(purpose)), self.key)
-        numbers = words.reshape(len(self), -1)[:, :count] >> _UNUSED_BITS
-        return numbers * 2.0**-53
+        return _numbers(words.reshape(len(self), -1)[:, :count])
+
+    def uniform_block(
+        self, token: int, purposes: Sequence[Purpose], block: int, turn: int = 0
+    ) -> Float64[np.ndarray, "purpose stream 4"]:
+        """Return four consecutive numbers of each purpose's draw: one evaluation each.
+
+        They are ``uniform(...)[:, WORDS * block : WORDS * (block + 1)]`` of each purpose.
+        """
+        kinds = np.array(purposes, dtype=np.uint64)
+        words = _philox((1 + block, turn, token, kinds), self.key)
+        return np.moveaxis(_numbers(words), 1, 0)
+
+
+def _numbers(words: UInt64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+    """Make numbers in [0, 1) of random words."""
+    return (words >> _UNUSED_BITS) * 2.0**-53
 
 
 def _philox(
-    counter: tuple[UInt64[np.ndarray, "1 block"], int, int, int],
+    counter: tuple[int | UInt64[np.ndarray, " draw"], ...],
     key: UInt64[np.ndarray, "stream 2"],
-) -> UInt64[np.ndarray, "stream block 4"]:
-    """Evaluate the generator for every key and every block of the counter."""
-    shape = (len(key), counter[0].shape[1])
-    first, second, third, fourth = (
-        np.broadcast_to(np.asarray(word, dtype=np.uint64), shape) for word in counter
-    )
-    low, high = key[:, :1], key[:, 1:]
+) -> UInt64[np.ndarray, "stream draw 4"]:
+    """Evaluate the generator for every key and every value of the counter.
+
+    Args:
+        counter: Its four words, lowest first: numbers, or one for every draw.
+        key: Keys, their low words first.
+    """
+    draws = np.broadcast_shapes(*(np.shape(word) for word in counter), (1,))
+    multiplied = np.empty((2, len(key), *draws), dtype=np.uint64)  # First and third word.
+    others = np.empty_like(multiplied)
+    multiplied[0], others[0], multiplied[1], others[1] = counter
+    keys = key.T[..., None]
     for _ in range(ROUNDS):
-        top_first, bottom_first = _multiply(first, _MULTIPLIERS[0])
-        top_third, bottom_third = _multiply(third, _MULTIPLIERS[1])
-        first, second = top_third ^ second ^ low, bottom_third
-        third, fourth = top_first ^ fourth ^ high, bottom_first
-        low, high = low + _KEY_STEPS[0], high + _KEY_STEPS[1]
-    return np.stack([first, second, third, fourth], axis=-1)
+        top, bottom = _multiply(multiplied)
+        multiplied = top[::-1] ^ others
+        multiplied ^= keys
+        others = bottom[::-1]
+        keys = keys + KEY_STEPS
+    return np.stack([multiplied[0], others[0], multiplied[1], others[1]], axis=-1)
 
 
-def _multiply(word: np.ndarray, by: np.uint64) -> tuple[np.ndarray, np.ndarray]:
-    """Return the upper and the lower 64 bits of products of 64-bit words."""
+def _multiply(word: UInt64[np.ndarray, "2 stream draw"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the upper and the lower 64 bits of words times their multipliers."""
     low, high = word & _LOW, word >> _HALF
-    by_low, by_high = by & _LOW, by >> _HALF
-    middle = high * by_low + (low * by_low >> _HALF)
-    crossed = low * by_high + (middle & _LOW)
-    return high * by_high + (middle >> _HALF) + (crossed >> _HALF), word * by
+    carried = low * _BY_LOW
+    carried >>= _HALF
+    middle = high * _BY_LOW
+    middle += carried
+    low *= _BY_HIGH
+    low += middle & _LOW
+    low >>= _HALF
+    middle >>= _HALF
+    high *= _BY_HIGH
+    high += middle
+    high += low
+    return high, word * MULTIPLIERS

@@ -24,8 +24,10 @@ from infgen.model.batching.batch import MapTokens, collate_maps, to_device
 from infgen.model.signal_features import StopLines
 from infgen.model.step_memory import StepMemory
 from infgen.model.token_step import MotionStep
-from infgen.rollout.insertion import InsertionRequest, insert_agents
+from infgen.rollout.device.insertion import DeviceInsertion
+from infgen.rollout.insertion import insert_agents
 from infgen.rollout.insertion_mask import make_insertion_mask
+from infgen.rollout.insertion_state import InsertionRequest
 from infgen.rollout.motion_sampler import Choices, MotionSampler
 from infgen.rollout.population import (
     EGO_ROW,
@@ -75,6 +77,8 @@ class Session:
         self._memory, self._asking = _start(
             simulator, roads, starts, self._streams, history[0]
         )
+        on_host = simulator.device.type == "cpu" or not simulator.inserts
+        self._device = None if on_host else DeviceInsertion(self._asking)
         self._density = _make_density_control(simulator, starts, history[-1])
         for population in history[:-1]:
             self._ask_motion(population)
@@ -120,7 +124,8 @@ class Session:
         moved, paths = self._move(before, choices, said, path)
         after = moved
         if simulator.inserts:
-            after = insert_agents(self._query_network(moved), self._memory, moved, token)
+            insert = insert_agents if self._device is None else self._device.insert
+            after = insert(self._query_network(moved), self._memory, moved, token)
         self.population, self.token = after, token
         self._driven_to = None if path is None else path[:, -1]
         return Frame(

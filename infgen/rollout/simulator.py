@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int16
 from torch import Tensor
 
 from infgen.model.relations import Rows
@@ -86,14 +86,30 @@ class Simulator:
         number.flat[at] = np.arange(len(at))
         return Rows(self.tensor(at), self.tensor(number))
 
-    def token_step(self, population: Population) -> TokenStep:
-        """Show a population to the network."""
+    def token_step(
+        self,
+        population: Population,
+        cells: Int16[np.ndarray, "rollout row"] | None = None,
+        at: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> TokenStep:
+        """Show a population to the network.
+
+        Args:
+            population: All agents.
+            cells: Their cells, if they are known.
+            at: Rollouts and rows of some agents only: they become a single rollout.
+        """
+        cells = population.cells(self.grid) if cells is None else cells
+
+        def shown(values: np.ndarray) -> Tensor:
+            return self.tensor(values if at is None else values[at][None])
+
         return TokenStep(
-            agent_type=self.tensor(population.agent_type).long(),
-            size_lwh_m=self.tensor(population.size_lwh_m),
-            pose=self.tensor(population.pose),
-            motion_token=self.tensor(population.motion_token).long(),
-            presence=self.tensor(population.presence).long(),
-            observed=self.tensor(population.observed),
-            cell=self.tensor(population.cells(self.grid)).long(),
+            agent_type=shown(population.agent_type).long(),
+            size_lwh_m=shown(population.size_lwh_m),
+            pose=shown(population.pose),
+            motion_token=shown(population.motion_token).long(),
+            presence=shown(population.presence).long(),
+            observed=shown(population.observed),
+            cell=shown(cells).long(),
         )

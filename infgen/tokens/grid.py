@@ -117,8 +117,8 @@ def encode_cell(
     """
     reach = len(grid.cell_at) // 2
     tick = np.rint(xy_m / np.float32(grid.step_m)).astype(np.int64)
-    column, row = np.moveaxis(np.clip(tick, -reach, reach) + reach, -1, 0)
-    cell = grid.cell_at[row, column]
+    tick = np.minimum(np.maximum(tick, -reach), reach)
+    cell = grid.cell_at[tick[..., 1] + reach, tick[..., 0] + reach]
     inside = np.hypot(xy_m[..., 0], xy_m[..., 1]) <= grid.radius_m
     rim = inside & (cell == NO_CELL)
     if rim.any():

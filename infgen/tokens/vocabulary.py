@@ -6,6 +6,7 @@ what is here.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -60,12 +61,18 @@ class MotionVocabulary:
     @property
     def stationary(self) -> Bool[np.ndarray, "3 motion"]:
         """Whether each motion token is shorter than ``STATIONARY_M``."""
-        return np.hypot(*np.moveaxis(self.end_pose[..., :2], -1, 0)) < STATIONARY_M
+        return _stationary(self)
 
     @property
     def end_corners_m(self) -> Float32[np.ndarray, "3 motion 4 2"]:
         """Corners of the box at the end of each motion token, in the frame of its start."""
         return box_corners(self.end_pose, self.size_lw_m[:, None])
+
+
+@lru_cache(maxsize=8)
+def _stationary(vocabulary: MotionVocabulary) -> Bool[np.ndarray, "3 motion"]:
+    """Compute ``MotionVocabulary.stationary``: it is asked for at every rejection."""
+    return np.hypot(*np.moveaxis(vocabulary.end_pose[..., :2], -1, 0)) < STATIONARY_M
 
 
 @dataclass(frozen=True, slots=True)

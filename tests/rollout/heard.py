@@ -77,7 +77,8 @@ class Listening(Stepper):
 
 def asked(entries, said, *where):
     """Note who asked; inserted agents so far tell the turn."""
-    turn = (entries.token_step.presence == Presence.INSERTED).sum(dim=1)
+    presence = entries.token_step.presence[entries.rollout]
+    turn = (presence == Presence.INSERTED).sum(dim=1)
     return RequestOptions(entries.token, entries.rollout, turn, said, *where)
 
 

@@ -28,6 +28,7 @@ from infgen.model.network import Network  # noqa: E402
 from infgen.model.stepping import Stepper  # noqa: E402
 from infgen.model.training.losses import losses  # noqa: E402
 from infgen.pretrained import builtin_weights  # noqa: E402
+from infgen.rollout.device.insertion import DeviceInsertion  # noqa: E402
 from infgen.rollout.recording import Frame, RolloutStart  # noqa: E402
 from infgen.rollout.session import Session  # noqa: E402
 from infgen.rollout.simulator import Simulator  # noqa: E402
@@ -55,6 +56,27 @@ RULES = {
     "max_stall_s": 2.0,
     "density_control": 1.0,
 }
+OPTIONS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "rules": RULES,
+    "pretrained": {
+        **RULES,
+        "motion_top_k": 0,
+        "motion_top_p": 0.9,
+        "position_top_k": 0,
+        "max_insertion_attempts": 16,
+        "insertion_lane_distance_m": 25.0,
+        "add_bias": 0.185,
+        "remove_bias": 0.1556,
+    },
+    "crowded": {
+        "max_agents": 24,
+        "max_insertions": 3,
+        "add_bias": 1.5,
+        "removal_radius_m": 50.0,
+    },
+    "unmasked": {"insertion_mask": False, "add_bias": 1.0},
+}
 Found = dict[str, Any]
 
 
@@ -75,7 +97,8 @@ def session(
     """Start rollouts of a town, with the package's weights if no others are given."""
     network = network or load_network(builtin_weights())
     network = network.to(device).eval()
-    how = RolloutSettings(**{"seconds": 4.0, "batch_rollouts": count, **settings})
+    length = {} if settings["mode"] == "wosac" else {"seconds": 4.0}
+    how = RolloutSettings(**{**length, "batch_rollouts": count, **settings})
     simulator = Simulator(
         Stepper(network),
         network.motion_vocabulary(),
@@ -107,7 +130,7 @@ def same(one: Frame, other: Frame) -> bool:
 
 def rollout(mode: str, rules: str, steps: str = "3") -> Found:
     """Token steps on both devices, and what the last one of them would cost."""
-    settings = {"mode": mode, **(RULES if rules == "rules" else {})}
+    settings = {"mode": mode, **OPTIONS[rules]}
     plain = session(CPU, 3, settings)
     with StandIn():
         ours = session(DEVICE, 3, settings)
@@ -116,6 +139,25 @@ def rollout(mode: str, rules: str, steps: str = "3") -> Found:
             frame = ours.step()
         equal.append(same(frame, plain.step()))
     return {"equal": equal, **costs(tally)}
+
+
+def insertion(rollouts: str) -> Found:
+    """What each pass of insertion costs, and for how many rollouts it was."""
+    passes, plain = [], DeviceInsertion._ask
+
+    def asked(engine: Any, running: Any, wanted: Any) -> None:
+        with counted() as tally:
+            plain(engine, running, wanted)
+        costs = (tally.kernels, tally.waits, tally.copies)
+        rollouts = len(running.entries.rollout)
+        passes.append([rollouts, *(sum(each.values()) for each in costs)])
+
+    DeviceInsertion._ask = asked  # type: ignore[method-assign]
+    with StandIn():
+        settings = {"mode": "long", **OPTIONS["pretrained"], "add_bias": 1.0}
+        ours = session(DEVICE, int(rollouts), settings)
+        ours.step()
+    return {"passes": passes}
 
 
 def costs(tally: Tally) -> Found:
@@ -291,6 +333,7 @@ CASES: dict[str, Callable[..., Found]] = {
     "compiled": compiled,
     "counts": counts,
     "device": device,
+    "insertion": insertion,
     "resuming": resuming,
     "rollout": rollout,
     "training": training,

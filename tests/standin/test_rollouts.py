@@ -21,3 +21,33 @@ def test_rollouts_are_those_of_the_cpu_and_cost_no_more_than_they_did(case, mode
     assert found["equal"] == [True, True, True]
     assert found["kernels"] <= kernels, found["words"]
     assert found["waits"] <= waits, found["words"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mode", "options", "steps"),
+    [
+        ("long", "pretrained", "10"),
+        ("long", "crowded", "8"),
+        ("long", "unmasked", "4"),
+        ("motion-only", "rules", "4"),
+        ("wosac", "plain", "4"),
+    ],
+)
+def test_longer_rollouts_of_all_options_are_those_of_the_cpu(case, mode, options, steps):
+    found = case("rollout", mode, options, steps)
+
+    assert found["equal"] == [True] * int(steps)
+
+
+@pytest.mark.slow
+def test_a_pass_of_insertion_never_waits_and_has_fixed_shapes(case):
+    passes = case("insertion", "18")["passes"]
+
+    assert len(passes) > 3
+    assert {size for size, *_ in passes} <= {18, 16, 8}
+    assert {(waits, copies) for *_, waits, copies in passes} == {(0, 0)}
+    kernels = {}
+    for size, launched, *_ in passes:
+        kernels.setdefault(size, set()).add(launched)
+    assert all(len(each) == 1 for each in kernels.values()), passes

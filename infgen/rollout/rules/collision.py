@@ -22,7 +22,7 @@ def repeat(
 ) -> Float32[np.ndarray, "rollout row time 3"]:
     """Poses at ``COMPARED_STEPS`` if every agent repeats its motion token."""
     steps = vocabulary.path[before.agent_type, motion_token][
-        :, :, COMPARED_STEPS
+        ..., COMPARED_STEPS, :
     ]  # [rollout, row, time, 3]
     pose, found = before.pose, []
     for _ in range(times):
@@ -35,6 +35,7 @@ def find_collisions(
     before: Population,
     there: Bool[np.ndarray, "rollout row"],
     poses: Float32[np.ndarray, "rollout row time 3"],
+    drawn: Bool[np.ndarray, "rollout row"] | None = None,
 ) -> Bool[np.ndarray, "rollout row"]:
     """Tell which agents collide with an agent ahead that they did not overlap before.
 
@@ -44,9 +45,10 @@ def find_collisions(
         before: All agents at the beginning of the token step.
         there: Agents that are present in it.
         poses: Predicted poses.
+        drawn: Only pairs with one of these agents are checked; None for all pairs.
     """
     hits = np.zeros(there.shape, dtype=bool)
-    rollout, one, two = _near(before, there, poses)
+    rollout, one, two = _near(before, there, poses, there if drawn is None else drawn)
     if not len(rollout):
         return hits
     size_lw_m = before.size_lwh_m[..., :2]
@@ -58,26 +60,48 @@ def find_collisions(
         poses[rollout, two],
         sizes_m[1][:, None],
     ).any(axis=1)
-    meet &= ~boxes_overlap(starts[0], sizes_m[0], starts[1], sizes_m[1])
+    (pair,) = np.nonzero(meet)
+    apart = ~boxes_overlap(
+        starts[0][pair], sizes_m[0][pair], starts[1][pair], sizes_m[1][pair]
+    )
+    pair = pair[apart]
     for who, start, other in ((one, *starts), (two, *starts[::-1])):
-        ahead = to_local(other, start)[:, 0] > 0
-        hits[rollout[meet & ahead], who[meet & ahead]] = True
+        ahead = pair[to_local(other[pair], start[pair])[:, 0] > 0]
+        hits[rollout[ahead], who[ahead]] = True
     return hits
 
 
 def _near(
-    before: Population, there: np.ndarray, poses: np.ndarray
+    before: Population, there: np.ndarray, poses: np.ndarray, drawn: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs whose boxes may overlap: rollout and both rows."""
-    reach_m = np.linalg.norm(before.size_lwh_m[..., :2], axis=-1) / 2  # [rollout, row]
-    near = np.zeros((*there.shape, there.shape[1]), dtype=bool)
-    for xy_m in np.moveaxis(poses[..., 1::2, :2], 2, 0):  # at the ends of token steps
-        gap_m = np.linalg.norm(xy_m[:, :, None] - xy_m[:, None], axis=-1)
-        near |= gap_m < reach_m[:, :, None] + reach_m[:, None] + MARGIN_M
-    near &= there[:, :, None] & there[:, None]
+    """Pairs whose boxes may overlap: rollout, a drawn row and another row."""
+    reach_m = _length_m(before.size_lwh_m[..., 0], before.size_lwh_m[..., 1]) / 2
+    first, second = np.nonzero(drawn & there)
+    # Far pairs are ruled out by where they are now and how far they get, with a margin that
+    # covers rounding; one axis at a time: sums over a last dimension of two are slow.
+    ends_m = np.moveaxis(poses[:, :, 1::2, :2], 3, 0)  # [axis, rollout, row, token step]
+    x_m, y_m = before.pose[..., 0], before.pose[..., 1]
+    travel_m = _length_m(*(ends_m - np.stack([x_m, y_m])[..., None])).max(axis=2)
+    around_m = reach_m + travel_m + MARGIN_M
+    away_x_m = x_m[first] - x_m[first, second, None]
+    away_y_m = y_m[first] - y_m[first, second, None]
+    wide_m = around_m[first] + around_m[first, second, None]
+    near = away_x_m * away_x_m + away_y_m * away_y_m < wide_m * wide_m
+    near &= there[first]
+    # Each pair once: with the lower row first, or with the only drawn one.
+    row = np.arange(there.shape[1])
+    near &= (row > second[:, None]) | ~drawn[first] & (row != second[:, None])
+    at, other = np.nonzero(near)
+    rollout, row = first[at], second[at]
     pedestrian = before.agent_type == AgentType.PEDESTRIAN
-    near &= ~(pedestrian[:, :, None] & pedestrian[:, None])
-    rows = there.shape[1]
-    near &= np.triu(np.ones((rows, rows), dtype=bool), 1)
-    rollout, one, two = np.nonzero(near)
-    return rollout, one, two
+    kept = ~(pedestrian[rollout, row] & pedestrian[rollout, other])
+    rollout, row, other = rollout[kept], row[kept], other[kept]
+    reach_m = reach_m[rollout, row] + reach_m[rollout, other] + MARGIN_M
+    away_m = ends_m[:, rollout, row] - ends_m[:, rollout, other]
+    near = (_length_m(*away_m) < reach_m[:, None]).any(axis=1)
+    return rollout[near], row[near], other[near]
+
+
+def _length_m(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    length_m: np.ndarray = np.sqrt(x_m * x_m + y_m * y_m)
+    return length_m

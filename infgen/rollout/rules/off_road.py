@@ -136,13 +136,15 @@ def find_off_road(
     """
     departs = np.zeros(which.shape, dtype=bool)
     vehicle = which & (before.agent_type == AgentType.VEHICLE)
-    path = np.concatenate([before.pose[:, :, None], poses], axis=2)
     for at, edge in enumerate(road_edge_tiles):
         rollout, row = np.nonzero(vehicle & (scene == at)[:, None])
-        counts = np.arange(path.shape[2]) <= moments[rollout, row, None]  # now, and then
+        path = np.concatenate(
+            [before.pose[rollout, row, None], poses[rollout, row]], axis=1
+        )
+        counts = np.arange(path.shape[1]) <= moments[rollout, row, None]  # now, and then
         who, moment = np.nonzero(counts)
         size_lw_m = before.size_lwh_m[rollout[who], row[who], :2]
-        corners_m = box_corners(path[rollout[who], row[who], moment], size_lw_m)
+        corners_m = box_corners(path[who, moment], size_lw_m)
         off_m = np.full((*counts.shape, 4), -np.inf, dtype=np.float32)
         off_m[counts] = edge.off_m(corners_m.reshape(-1, 2)).reshape(-1, 4)
         now_m, then_m = off_m[:, 0].max(axis=1), off_m[:, 1:].max(axis=(1, 2))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
@@ -53,7 +54,7 @@ class MotionCheck:
             before: All agents at the beginning of the token step.
             motion_token: Motion token of every agent.
             drawn: Rows sampled since the last check: only these are checked for
-                off-road, and only rollouts that have some for collisions.
+                off-road, and only pairs with one of them for collisions.
             road: Whether to check for off-road.
 
         Returns:
@@ -86,7 +87,8 @@ class MotionCheck:
         times = max(CLEAR_AHEAD, *ROAD_AHEAD) if road else CLEAR_AHEAD
         poses = repeat(before, motion_token, self.vocabulary, times)
         soon = poses[:, :, : CLEAR_AHEAD * len(COMPARED_STEPS)]
-        hits = find_collisions(before, there, soon) & moving
+        # Other pairs were checked before: neither of the two has drawn since.
+        hits = find_collisions(before, there, soon, drawn) & moving
         if not road:
             return hits, np.zeros_like(hits)
         moments = len(COMPARED_STEPS) * self._look_ahead_tokens(before, motion_token)
@@ -113,8 +115,7 @@ class MotionCheck:
     def _length_m(
         self, before: Population, motion_token: Int64[np.ndarray, "rollout row"]
     ) -> Float32[np.ndarray, "rollout row"]:
-        step_m: np.ndarray = self.vocabulary.end_pose[before.agent_type, motion_token, :2]
-        return np.linalg.norm(step_m, axis=-1)
+        return _lengths_m(self.vocabulary)[before.agent_type, motion_token]
 
     def _look_ahead_tokens(
         self, before: Population, motion_token: Int64[np.ndarray, "rollout row"]
@@ -122,6 +123,11 @@ class MotionCheck:
         """Token steps that each vehicle needs to stop, within ``ROAD_AHEAD``."""
         stops_s = self._length_m(before, motion_token) / CLOCK.token_s / (2 * BRAKES_MPS2)
         return np.ceil(stops_s / CLOCK.token_s).clip(*ROAD_AHEAD).astype(np.int64)
+
+
+@lru_cache(maxsize=8)
+def _lengths_m(vocabulary: MotionVocabulary) -> Float32[np.ndarray, "3 motion_token"]:
+    return np.linalg.norm(vocabulary.end_pose[..., :2], axis=-1)
 
 
 def make_motion_check(

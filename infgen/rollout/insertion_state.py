@@ -1,0 +1,160 @@
+"""State of a batch while agents are inserted, kept on the host."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int16, Int64
+
+from infgen.rollout.insertion_mask import Circles, InsertionMask
+from infgen.rollout.population import (
+    EGO_ROW,
+    InsertedAgents,
+    Population,
+    place_inserted,
+)
+from infgen.rollout.random_streams import WORDS, Purpose, Streams
+from infgen.rollout.simulator import Simulator
+from infgen.tokens.grid import encode_cell, to_grid
+from infgen.tokens.scene_tokens import NO_CELL
+
+TURN_PURPOSES = (Purpose.ADD, Purpose.CELL, Purpose.AGENT_TYPE, Purpose.HEADING)
+"""What is sampled in one insertion."""
+
+
+@dataclass(frozen=True, slots=True)
+class InsertionRequest:
+    """What insertion needs besides the agents: network, random numbers and limits.
+
+    Attributes:
+        simulator: The network.
+        streams: Random numbers of the rollouts.
+        insertion_mask: Rejects positions; None allows all.
+        most: Most agents of each rollout at any one time.
+        wanted: Number of other agents wanted around each ego; None for no control.
+    """
+
+    simulator: Simulator
+    streams: Streams
+    insertion_mask: InsertionMask | None
+    most: Int64[np.ndarray, " rollout"]
+    wanted: Float64[np.ndarray, " rollout"] | None = None
+
+    @property
+    def attempts(self) -> int:
+        """Number of positions sampled for one insertion before it is given up."""
+        if self.insertion_mask is None:
+            return 1
+        return self.simulator.settings.max_insertion_attempts
+
+
+@dataclass(slots=True)
+class TurnNumbers:
+    """The uniform numbers of one insertion of some rollouts.
+
+    Attributes:
+        streams: Random numbers of these rollouts.
+        token: Token step.
+        turn: Which insertion of it.
+        block: Block of four attempts whose numbers are held.
+        places: Rollouts, among these, that numbers are held of, in order.
+        numbers: The numbers [purpose, place, attempt].
+    """
+
+    streams: Streams
+    token: int
+    turn: int
+    block: int = -1
+    places: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    numbers: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, WORDS)))
+
+    def of(
+        self, purpose: Purpose, places: Int64[np.ndarray, " asked"], attempt: int = 0
+    ) -> Float64[np.ndarray, " asked"]:
+        """Return the numbers of one attempt; later ones may ask for fewer rollouts only."""
+        if attempt // WORDS != self.block:
+            self.block, self.places = attempt // WORDS, places
+            self.numbers = self.streams.take(places).uniform_block(
+                self.token, TURN_PURPOSES, self.block, self.turn
+            )
+        held = np.searchsorted(self.places, places)
+        return self.numbers[TURN_PURPOSES.index(purpose), held, attempt % WORDS]
+
+
+@dataclass(slots=True)
+class InsertionState:
+    """All rollouts of a batch while agents are inserted; changes in place.
+
+    Attributes:
+        request: What insertion needs.
+        population: All agents, those inserted so far included.
+        cells: Cell of each agent, or ``NO_CELL``.
+        occupied: Cells that hold an agent: no other is inserted there.
+        num_agents: Agents of each rollout.
+        num_others: Agents around each ego, itself excluded.
+        circles: Circles that hold the boxes; None without an insertion mask.
+    """
+
+    request: InsertionRequest
+    population: Population
+    cells: Int16[np.ndarray, "rollout row"]
+    occupied: Bool[np.ndarray, "rollout cell"]
+    num_agents: Int64[np.ndarray, " rollout"]
+    num_others: Int64[np.ndarray, " rollout"]
+    circles: Circles | None
+
+    @classmethod
+    def of(cls, request: InsertionRequest, population: Population) -> "InsertionState":
+        """Begin with all agents after they have moved."""
+        grid, mask = request.simulator.grid, request.insertion_mask
+        cells = population.cells(grid)
+        return cls(
+            request,
+            population.copy(),
+            cells,
+            _occupied(cells, grid.num_cells),
+            population.num_agents,
+            population.count_others(grid.radius_m),
+            None if mask is None else mask.circles(population),
+        )
+
+    def add_bias(
+        self, rollouts: Int64[np.ndarray, " asked"]
+    ) -> Float64[np.ndarray, " asked"]:
+        """Return what is added to the logit of ADD, with density control."""
+        settings, wanted = self.request.simulator.settings, self.request.wanted
+        bias = np.full(len(rollouts), settings.add_bias)
+        if wanted is not None:
+            there = self.num_others[rollouts]
+            # Insertions are sampled one by one: their number is proportional to the odds.
+            bias += settings.density_control * np.log((wanted[rollouts] + 1) / (there + 1))
+        return bias
+
+    def add(
+        self, rollouts: Int64[np.ndarray, " inserted"], inserted: InsertedAgents
+    ) -> Int64[np.ndarray, " inserted"]:
+        """Insert agents; return the row of each, -1 in a full rollout."""
+        grid, everyone = self.request.simulator.grid, self.population
+        row = place_inserted(everyone, rollouts, inserted)
+        at = (rollouts[row >= 0], row[row >= 0])
+        away_m = everyone.pose[at][:, :2] - everyone.pose[at[0], EGO_ROW, :2]
+        self.num_agents[at[0]] += 1
+        self.num_others[at[0]] += np.hypot(*away_m.T) < grid.radius_m
+        cell = encode_cell(
+            to_grid(everyone.pose[at][:, :2], everyone.pose[at[0], EGO_ROW]), grid
+        )
+        self.cells[at] = cell
+        self.occupied[at[0][cell != NO_CELL], cell[cell != NO_CELL]] = True
+        mask, circles = self.request.insertion_mask, self.circles
+        if mask is not None and circles is not None:
+            circles.put(at, mask.circles(everyone, at))
+        return row
+
+
+def _occupied(
+    cells: Int16[np.ndarray, "rollout row"], count: int
+) -> Bool[np.ndarray, "rollout cell"]:
+    """Mark the cells that hold an agent."""
+    occupied = np.zeros((len(cells), count), dtype=bool)
+    rollout, row = np.nonzero(cells != NO_CELL)
+    occupied[rollout, cells[rollout, row]] = True
+    return occupied
