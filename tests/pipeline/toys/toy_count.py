@@ -1,6 +1,7 @@
 """Counts the words of every source file. A file that says ``fail`` makes its unit fail, one
-that says ``die`` ends its process, one that says ``hoard`` fills its memory, and one that says
-``assert`` (or, the first time only, ``assert-once``) fails as CUDA does on a failed device."""
+that says ``die`` ends its process, one that says ``hoard`` fills its memory, and one that
+says ``assert`` (or, the first time only, ``assert-once``) fails as CUDA does on a failed
+device."""
 
 import os
 import time

@@ -45,9 +45,11 @@ def test_words_name_a_kind_of_workers(words, parts):
 
 @pytest.mark.parametrize(
     "words",
-    ["", "locl", "local:0", "local:x", "tcp:", "file:"]
-    + ["gpu:a", "gpu:", "gpu*0", "gpu*", "gpu:0*0", "gpu:0*", "gpu:*2", "gpu:0*2*3"]
-    + ["gpu:0,", "gpu*2:0", "gpu:-1", "gpu:0*1.5", "gpux2"],
+    [
+        *("", "locl", "local:0", "local:x", "tcp:", "file:"),
+        *("gpu:a", "gpu:", "gpu*0", "gpu*", "gpu:0*0", "gpu:0*", "gpu:*2", "gpu:0*2*3"),
+        *("gpu:0,", "gpu*2:0", "gpu:-1", "gpu:0*1.5", "gpux2"),
+    ],
 )
 def test_other_words_are_refused_with_the_grammar_before_anything_runs(words):
     with pytest.raises(ConfigError, match=r"expected none \| local.*gpu:0\[\*N\],1\[\*N\]"):
