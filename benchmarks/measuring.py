@@ -40,10 +40,21 @@ def read_scene() -> Scene:
     return max(read_split("training"), key=lambda scene: len(scene.tracks.id))
 
 
+def is_cpu(device: str) -> bool:
+    """Whether this is no accelerator."""
+    return torch.device(device).type == "cpu"
+
+
+def await_device(device: str) -> None:
+    """Wait until a device has done all that it was asked for."""
+    if not is_cpu(device):
+        torch.get_device_module(device).synchronize()
+
+
 def used_s(device: str) -> float:
     """Seconds used so far: of the processor, or of the clock for a GPU."""
-    if device != "cpu":
-        torch.cuda.synchronize()
+    if not is_cpu(device):
+        await_device(device)
         return time.perf_counter()
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
@@ -59,9 +70,15 @@ def seconds(work: Callable[[], object], times: int, device: str) -> float:
 
 def peak_mib(device: str) -> float:
     """Most memory that this process has held: of the machine, or of the GPU."""
-    if device != "cpu":
-        return torch.cuda.max_memory_allocated() / 2**20
+    if not is_cpu(device):
+        return float(torch.get_device_module(device).max_memory_allocated()) / 2**20
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def multiplies_bf16(device: str) -> bool:
+    """Whether products of a GPU are at their fastest in bfloat16."""
+    is_cuda = torch.device(device).type == "cuda"
+    return is_cuda and torch.cuda.is_bf16_supported()
 
 
 def peak_flops(device: str, *, bf16: bool) -> float:

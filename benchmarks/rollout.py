@@ -30,6 +30,7 @@ from made_vocabularies import made_vocabularies
 from measuring import (
     SIZES,
     in_own_process,
+    multiplies_bf16,
     peak_flops,
     peak_mib,
     read_scene,
@@ -213,8 +214,7 @@ def measure(case: Case) -> dict[str, float]:
     spent_s, passed_s = used_s(case.device) - start_s, time.perf_counter() - start
     memory_mib = peak_mib(case.device)
     flops = _flops_of_a_step(session) * len(frames)
-    bf16 = case.device != "cpu" and torch.cuda.is_bf16_supported()
-    peak = peak_flops(case.device, bf16=bf16)
+    peak = peak_flops(case.device, bf16=multiplies_bf16(case.device))
     return {
         "agents": float(
             np.mean([(frame.agent_number >= 0).sum(axis=1) for frame in frames])
