@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,21 +24,33 @@ RECORD = SHARED.parents[1] / "golden" / "wosac" / SCENE / "scenario.tfrecord"
 _SMALL = ModelSettings(
     width=48, heads=4, map_blocks=1, motion_blocks=2, scene_blocks=1, fourier_bands=16
 )
+_TINY = ModelSettings(
+    width=16, heads=2, map_blocks=1, motion_blocks=1, scene_blocks=1, fourier_bands=4
+)
 SIZES = {
     "paper": ModelSettings(),
     "paper-narrow": ModelSettings(relation_width=32),
     "small": _SMALL,
     "small-narrow": replace(_SMALL, relation_width=16),
+    "tiny": _TINY,
 }
-"""Sizes of the network by name; the narrow ones have narrow features of relative poses."""
+"""Sizes of the network by name; the narrow ones have narrow features of relative poses, and
+the tiny one is for tests."""
 PEAK_SIDE = 2048
 
 
+@cache
 def read_scene() -> Scene:
     """Read the scene that figures are about, or the largest built-in one."""
     if RECORD.is_file():
         return next(s for s in iter_scenes(RECORD) if isinstance(s, Scene))
     return max(read_split("training"), key=lambda scene: len(scene.tracks.id))
+
+
+@cache
+def read_small_scene() -> Scene:
+    """Read the built-in scene with the fewest agents, for tests."""
+    return min(read_split("training"), key=lambda scene: len(scene.tracks.id))
 
 
 def is_cpu(device: str) -> bool:
@@ -81,10 +94,11 @@ def multiplies_bf16(device: str) -> bool:
     return is_cuda and torch.cuda.is_bf16_supported()
 
 
-def peak_flops(device: str, *, bf16: bool) -> float:
+def peak_flops(device: str, *, bf16: bool, side: int | None = None) -> float:
     """Operations a second (of the clock) of a product of large matrices."""
+    side = side or PEAK_SIDE
     dtype = torch.bfloat16 if bf16 else torch.float32
-    one = torch.randn(PEAK_SIDE, PEAK_SIDE, device=device, dtype=dtype)
+    one = torch.randn(side, side, device=device, dtype=dtype)
     other, best = one.clone(), 0.0
 
     def product() -> Tensor:
@@ -94,7 +108,7 @@ def peak_flops(device: str, *, bf16: bool) -> float:
     for _ in range(5):
         start = time.perf_counter()
         seconds(product, 4, device)
-        best = max(best, 4 * 2 * PEAK_SIDE**3 / (time.perf_counter() - start))
+        best = max(best, 4 * 2 * side**3 / (time.perf_counter() - start))
     return best
 
 
