@@ -94,7 +94,9 @@ class Place:
         """Model of the device, or how many threads of a CPU."""
         if torch.device(self.device).type == "cuda":
             return torch.cuda.get_device_name(self.device)
-        return self.device if not is_cpu(self.device) else f"CPU, {self.threads} threads"
+        if not is_cpu(self.device):
+            return self.device
+        return f"CPU, {self.threads} thread" + ("s" if self.threads > 1 else "")
 
     def scene(self) -> Scene:
         """The scene of all rows."""

@@ -311,11 +311,28 @@ def benchmarks(name: str) -> Found:
     return row
 
 
+def gpu_rows() -> Found:
+    """Measure small rows of ``benchmarks/gpu.py``."""
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    rows = importlib.import_module("gpu_rows")
+    place = rows.Place(str(DEVICE), 1, 0.0, small=True)
+    asked = [
+        rows.Row("logits", "tiny", 1, "float32"),
+        rows.Row("choices", "builtin", 2, "float32"),
+        rows.Row("choices", "builtin", 2, "bf16"),
+        rows.Row("rollouts", "tiny", 2, "bf16"),
+        rows.Row("training", "tiny", 1, "bf16"),
+    ]
+    with StandIn():
+        return {row.name: rows.measure(row, place) for row in asked}
+
+
 CASES: dict[str, Callable[..., Found]] = {
     "benchmarks": benchmarks,
     "compiled": compiled,
     "counts": counts,
     "device": device,
+    "gpu_rows": gpu_rows,
     "resuming": resuming,
     "rollout": rollout,
     "training": training,
