@@ -1,6 +1,5 @@
 """Doing one unit of work: the same code in the driver's process and on any worker."""
 
-import os
 import socket
 import time
 import traceback
@@ -192,12 +191,10 @@ def device_failure(error: BaseException | None) -> str:
 
 def _device_lost(unit: str, reason: str) -> DeviceLostError:
     devices = ", ".join(machine.describe()["gpus"]) or "unknown"
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    only = "" if visible is None else f", CUDA_VISIBLE_DEVICES={visible}"
     return DeviceLostError(
-        f"unit {unit}: the device (of {socket.gethostname()}: {devices}{only}) failed, and "
-        f"this process can do nothing more on it: {reason}; what is done is kept: run "
-        "again, with CUDA_LAUNCH_BLOCKING=1 to see in the log where it happens"
+        f"unit {unit}: the device (of {socket.gethostname()}: {devices}) failed, and this "
+        f"process can do nothing more on it: {reason}; what is done is kept: run again, "
+        "with CUDA_LAUNCH_BLOCKING=1 to see in the log where it happens"
     )
 
 

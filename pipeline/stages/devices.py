@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 from infgen.config import RolloutSettings
 from pipeline.engine.stage import FinishedUnit
-from pipeline.workers.gpus import WORKERS_OF_DEVICE
+from pipeline.workers.gpus import DEVICE_SHARE
 
 if TYPE_CHECKING:
     import torch
@@ -102,9 +102,9 @@ def limit_memory(device: "torch.device") -> None:
     """Leave the other workers of a device their part of its memory."""
     import torch  # noqa: PLC0415
 
-    workers = int(os.environ.get(WORKERS_OF_DEVICE, "1"))
-    if device.type == "cuda" and workers > 1:
-        torch.cuda.set_per_process_memory_fraction(SHARE / workers)
+    share = DEVICE_SHARE.get()
+    if device.type == "cuda" and share < 1:
+        torch.cuda.set_per_process_memory_fraction(SHARE * share)
 
 
 def name_device(device: "torch.device", precision: str) -> str:

@@ -29,7 +29,7 @@ from pipeline.engine.units import (
 )
 from pipeline.workers.gpus import (
     GRAMMAR,
-    device_environment,
+    VISIBLE_DEVICES,
     is_gpu_words,
     select_gpus,
     worker_names,
@@ -45,7 +45,12 @@ from pipeline.workers.scheduling import (
     WorkerLost,
     WorkerMemoryFull,
 )
-from pipeline.workers.worker_side import DEVICE_TOPIC, PROGRESS_TOPIC, run_with_progress
+from pipeline.workers.worker_side import (
+    DEVICE,
+    DEVICE_TOPIC,
+    PROGRESS_TOPIC,
+    run_with_progress,
+)
 
 HELP = f"none | local[:N] | {GRAMMAR} | tcp://HOST:PORT | file:scheduler.json"
 LOOPBACK = "127.0.0.1"  # Dask runs what anyone who connects sends it.
@@ -232,11 +237,8 @@ def gpu_workers(devices: Sequence[str]) -> dict[str, dict[str, Any]]:
                 "host": LOOPBACK,
                 "nthreads": 1,
                 "memory_limit": _memory_bytes(len(devices)),
-                "resources": {"GPU": 1},
-                "env": {
-                    **WORKER_ENVIRONMENT,
-                    **device_environment(device, devices.count(device)),
-                },
+                "resources": {DEVICE: 1 / devices.count(device)},
+                "env": {**WORKER_ENVIRONMENT, VISIBLE_DEVICES: device},
             },
         }
         for name, device in worker_names(devices).items()
@@ -276,7 +278,7 @@ class DaskPool:
         """Submit a task as an attempt of that name."""
         key = f"{name}-{self._mark}"
         future = self._client.submit(
-            run_with_progress, task, key, self._mark, key=key, retries=RETRIES, pure=False
+            _run_on_worker, task, key, self._mark, key=key, retries=RETRIES, pure=False
         )
         self._futures[key] = future
         future.add_done_callback(lambda _: self._inbox.put(TaskEnded(name)))
@@ -346,3 +348,8 @@ class DaskPool:
         about = event[1]
         name = str(about["key"]).removesuffix(f"-{self._mark}")
         self._inbox.put(DeviceFailed(name, str(about["reason"])))
+
+
+def _run_on_worker(task: Task, key: str, mark: str) -> Outcome:
+    """Do a task on the worker that this runs on."""
+    return run_with_progress(_dask().get_worker(), task, key, mark)

@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextvars import ContextVar
 
 from infgen.errors import ConfigError
 
@@ -10,8 +11,8 @@ GRAMMAR = "gpu[*N] | gpu:0[*N],1[*N]"
 """``gpu``: one worker per device; ``*N``: so many on each, or on the device before it."""
 WORDS = r"gpu(\*[1-9]\d*)?|gpu:\d+(\*[1-9]\d*)?(,\d+(\*[1-9]\d*)?)*"
 VISIBLE_DEVICES = "CUDA_VISIBLE_DEVICES"
-WORKERS_OF_DEVICE = "INFGEN_WORKERS_OF_DEVICE"
-"""Number of workers that share the device of a process, in its environment."""
+DEVICE_SHARE = ContextVar("DEVICE_SHARE", default=1.0)
+"""The part of its device that the worker which does the present task may use."""
 MAX_WORKERS = 48
 """Clients of one device under CUDA MPS (NVIDIA's manual, Volta and later)."""
 
@@ -85,11 +86,6 @@ def worker_names(devices: Sequence[str]) -> dict[str, str]:
         seen[device] += 1
         found[name] = device
     return found
-
-
-def device_environment(device: str, workers: int) -> dict[str, str]:
-    """Environment of a worker on a device that it shares with others of our own."""
-    return {VISIBLE_DEVICES: device, WORKERS_OF_DEVICE: str(workers)}
 
 
 def is_gpu_words(words: str) -> bool:

@@ -20,7 +20,7 @@ from pipeline.stages.devices import (
     name_device,
     on_device,
 )
-from pipeline.workers.gpus import WORKERS_OF_DEVICE
+from pipeline.workers.gpus import DEVICE_SHARE
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 
@@ -111,15 +111,15 @@ def test_a_cuda_device_is_named_by_its_model(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("device", "workers", "limits"),
-    [(CUDA, "6", [0.15]), (CUDA, "1", []), (CUDA, None, []), (CPU, "6", [])],
+    ("device", "share", "limits"),
+    [(CUDA, 1 / 6, [0.15]), (CUDA, 1.0, []), (CPU, 1 / 6, [])],
 )
-def test_workers_of_one_device_share_its_memory(monkeypatch, device, workers, limits):
+def test_workers_of_one_device_share_its_memory(monkeypatch, device, share, limits):
     found = []
     monkeypatch.setattr("torch.cuda.set_per_process_memory_fraction", found.append)
-    if workers is not None:
-        monkeypatch.setenv(WORKERS_OF_DEVICE, workers)
+    before = DEVICE_SHARE.set(share)
 
     limit_memory(device)
 
+    DEVICE_SHARE.reset(before)
     assert found == pytest.approx(limits)

@@ -15,7 +15,6 @@ from pipeline.engine.runner import RunOptions
 from pipeline.engine.units import InProcess, WorkersLostError
 from pipeline.workers.dask_cluster import DaskWorkers, gpu_workers, parse, select_gpus
 from pipeline.workers.gpus import VISIBLE_DEVICES
-from pipeline.workers.gpus import WORKERS_OF_DEVICE as WORKERS_OF
 from tests.clusters import Cluster
 
 # Dask leaves sockets and child processes to the garbage collector when it closes.
@@ -118,17 +117,16 @@ def test_workers_of_one_device_share_it_and_all_share_the_memory():
     described = gpu_workers(["0", "0", "GPU-ab12"])
 
     assert list(described) == ["0-0", "0-1", "GPU-ab12"]
-    seen = {
-        name: (each["options"]["env"][VISIBLE_DEVICES], each["options"]["env"][WORKERS_OF])
-        for name, each in described.items()
-    }
-    assert seen == {"0-0": ("0", "2"), "0-1": ("0", "2"), "GPU-ab12": ("GPU-ab12", "1")}
+    options = [each["options"] for each in described.values()]
+    assert [each["env"][VISIBLE_DEVICES] for each in options] == ["0", "0", "GPU-ab12"]
+    assert [each["resources"]["GPU"] for each in options] == [0.5, 0.5, 1.0]
     (limit,) = {each["options"]["memory_limit"] for each in described.values()}
     assert limit * 3 <= distributed.system.MEMORY_LIMIT < (limit + 1) * 3
 
 
 def seen_by_this_process():
-    return os.environ["CUDA_VISIBLE_DEVICES"], "torch" in sys.modules
+    share = distributed.get_worker().state.total_resources["GPU"]
+    return os.environ["CUDA_VISIBLE_DEVICES"], share, "torch" in sys.modules
 
 
 @pytest.mark.slow
@@ -136,8 +134,8 @@ def test_each_gpu_worker_sees_its_own_device_before_it_imports_anything():
     web = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
     options = {"host": "127.0.0.1", **web}
     scheduler = {"cls": distributed.Scheduler, "options": options}
-    workers = gpu_workers(["4", "GPU-ab12"])
-    assert workers["4"]["options"]["nthreads"] == 1
+    workers = gpu_workers(["4", "4", "GPU-ab12"])
+    assert workers["4-0"]["options"]["nthreads"] == 1
 
     with (
         distributed.SpecCluster(workers=workers, scheduler=scheduler) as started,
@@ -145,7 +143,11 @@ def test_each_gpu_worker_sees_its_own_device_before_it_imports_anything():
     ):
         found = client.run(seen_by_this_process)
 
-    assert sorted(found.values()) == [("4", False), ("GPU-ab12", False)]
+    assert sorted(found.values()) == [
+        ("4", 0.5, False),
+        ("4", 0.5, False),
+        ("GPU-ab12", 1.0, False),
+    ]
 
 
 @pytest.mark.slow
