@@ -124,8 +124,8 @@ def test_workers_of_one_device_share_it_and_all_share_the_memory():
     assert limit * 3 <= distributed.system.MEMORY_LIMIT < (limit + 1) * 3
 
 
-def seen_by_this_process():
-    share = distributed.get_worker().state.total_resources["GPU"]
+def seen_by_this_process(dask_worker):
+    share = dask_worker.state.total_resources["GPU"]
     return os.environ["CUDA_VISIBLE_DEVICES"], share, "torch" in sys.modules
 
 
