@@ -3,6 +3,8 @@
 What a step costs does not depend on which moves there are, so benchmarks need no data.
 """
 
+from functools import cache
+
 import numpy as np
 
 from infgen.config import VocabSettings
@@ -15,6 +17,7 @@ FAN_SPACING_M, ARC_SPACING_M = (0.1, 0.025, 0.05), 0.05
 """By kind: fine enough to fill a vocabulary."""
 
 
+@cache
 def made_vocabularies() -> tuple[MotionVocabulary, MapVocabulary]:
     """Make vocabularies of the default sizes."""
     settings = VocabSettings()

@@ -30,6 +30,7 @@ from made_vocabularies import made_vocabularies
 from measuring import (
     SIZES,
     in_own_process,
+    multiplies_bf16,
     peak_flops,
     peak_mib,
     read_scene,
@@ -41,7 +42,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from infgen.clock import CLOCK
 from infgen.config import RolloutSettings, TokenSettings
 from infgen.model.network import Network
-from infgen.model.stepping import Stepper
+from infgen.rollout.precision import Precision, make_stepper
 from infgen.rollout.recording import Frame, RolloutStart
 from infgen.rollout.session import Session
 from infgen.rollout.simulator import Simulator
@@ -84,6 +85,7 @@ class Case:
         roads: Map tokens, the nearest to the ego; 0 for all.
         device: Where.
         threads: Of the processor.
+        precision: As in ``RolloutSettings``.
     """
 
     size: str
@@ -95,6 +97,7 @@ class Case:
     roads: int
     device: str
     threads: int
+    precision: Precision = "auto"
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,9 +159,9 @@ def _last_layer(head: nn.Module) -> nn.Linear:
     return last
 
 
-def make_session(case: Case) -> tuple[Session, SceneTokens]:
-    """Start a batch of rollouts of the scene."""
-    scene, (motion, roads) = read_scene(), made_vocabularies()
+def make_session(case: Case, scene: Scene | None = None) -> tuple[Session, SceneTokens]:
+    """Start a batch of rollouts of a scene, or of the one that figures are about."""
+    scene, (motion, roads) = scene or read_scene(), made_vocabularies()
     tokens = TokenSettings()
     network = make_network(
         case, ThroughputMeter.of(tokenize_scene(scene, motion, roads, tokens))
@@ -172,9 +175,8 @@ def make_session(case: Case) -> tuple[Session, SceneTokens]:
         batch_rollouts=case.batch,
         **PLAYED[case.played],
     )
-    simulator = Simulator(
-        Stepper(network), motion, roads, tokens, settings, torch.device(case.device)
-    )
+    stepper, device = make_stepper(network, case.precision), torch.device(case.device)
+    simulator = Simulator(stepper, motion, roads, tokens, settings, device)
     starts = [RolloutStart(scene, history, at, settings.seed) for at in range(case.batch)]
     return Session(simulator, starts), history
 
@@ -213,8 +215,7 @@ def measure(case: Case) -> dict[str, float]:
     spent_s, passed_s = used_s(case.device) - start_s, time.perf_counter() - start
     memory_mib = peak_mib(case.device)
     flops = _flops_of_a_step(session) * len(frames)
-    bf16 = case.device != "cpu" and torch.cuda.is_bf16_supported()
-    peak = peak_flops(case.device, bf16=bf16)
+    peak = peak_flops(case.device, bf16=multiplies_bf16(case.device))
     return {
         "agents": float(
             np.mean([(frame.agent_number >= 0).sum(axis=1) for frame in frames])

@@ -43,6 +43,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from infgen.config import TokenSettings, TrainSettings
 from infgen.model.batching.batch import Batch, Limits, collate, to_device
 from infgen.model.network import Network
+from infgen.scene import Scene
 from infgen.tokens.tokenizer import tokenize_scene
 from pipeline.commands.screen import show_table
 from pipeline.stages.train.optimizer_step import OptimizerStep
@@ -83,14 +84,21 @@ class Case:
     meeting: str = ""
 
 
-def prepare(case: Case) -> tuple[OptimizerStep, Batch, TrainingState]:
-    """Make the network, its optimiser, and a batch of one scene several times."""
+def prepare(
+    case: Case, scene: Scene | None = None
+) -> tuple[OptimizerStep, Batch, TrainingState]:
+    """Make the network, its optimiser, and a batch of one scene several times.
+
+    Args:
+        case: The row.
+        scene: The scene; None for the one that figures are about.
+    """
     model = SIZES[case.size]
     if case.neighbours:
         model = replace(model, map_agent_neighbours=case.neighbours)
     grid, how = TokenSettings(), TrainSettings(precision=case.precision)
     motion, roads = made_vocabularies()
-    tokens = tokenize_scene(read_scene(), motion, roads, grid)
+    tokens = tokenize_scene(scene or read_scene(), motion, roads, grid)
     batch = collate([tokens] * case.scenes, Limits.of(model, how, grid), 0)
     torch.manual_seed(0)
     team = _join(case)

@@ -126,6 +126,17 @@ def test_a_failed_unit_is_named_and_the_exit_code_is_1(infgen):
     assert "skipped" in out
 
 
+def test_a_failed_device_ends_a_run_with_a_line_and_exit_code_1(infgen):
+    Path("texts/a.txt").write_text("assert")
+
+    code, out, err = infgen(*RUN, "--keep-going")
+
+    assert code == 1
+    assert "infgen: unit a.txt: the device (of " in err
+    assert "CUDA error: device-side assert triggered; what is done is kept" in err
+    assert "Traceback" not in out + err
+
+
 def test_force_and_from_make_again(infgen):
     infgen(*RUN)
 

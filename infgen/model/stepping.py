@@ -20,6 +20,7 @@ Row 0 is always the ego. A row that is ABSENT costs nothing. A row that is INSER
 with an empty past, so a freed row can be given to an inserted agent as it is.
 """
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import torch
@@ -66,6 +67,15 @@ class _InsertionBlocks:
             details.map_reach(),
             details.agents_reach(),
         )
+
+
+def _full_precision(x: Tensor) -> AbstractContextManager[object]:
+    """Compute logits in float32 under autocast too: rounded ones choose otherwise.
+
+    In bf16 they are off by up to 0.25, and one in four choices of motion tokens differs
+    from float32; with heads in float32 it is one in 25 (``tests/rollout/test_precision``).
+    """
+    return torch.autocast(x.device.type, enabled=False)
 
 
 class Stepper:
@@ -151,9 +161,9 @@ class Stepper:
         memory.pose[:, :, place] = token_step.pose
         memory.visible[:, :, place] = visible
         memory.columns += 1
-        return MotionStep(
-            motion.foretell(rows, x, rows.pack(token_step.agent_type), self._shapes)
-        )
+        agent_type = rows.pack(token_step.agent_type)
+        with _full_precision(x):
+            return MotionStep(motion.foretell(rows, x.float(), agent_type, self._shapes))
 
     @torch.no_grad()
     def entry_begin(
@@ -242,7 +252,9 @@ class Stepper:
         roads, cell_features = entries.around()
         x = cells(occupied[:, None], roads, agents)[:, 0]
         each = torch.arange(len(x), device=x.device)
-        said = cells.answer(Rows(each, each), x[:, None], cell_features)
+        rows, queries = Rows(each, each), x[:, None].float()
+        with _full_precision(x):
+            said = cells.answer(rows, queries, cell_features)
         return PositionOutputs(
             said.add_logit[:, 0],
             None if said.position_logits is None else said.position_logits[:, 0],
@@ -284,7 +296,8 @@ class Stepper:
         x = details(cell, roads, around.seen(entries.raw.flatten(0, 1)))
         kinds = torch.arange(details.given_kind.num_embeddings, device=cell.device)
         near = CellSources.near(entries.map, roads)
-        said = details.answer(rows, x[:, None], kinds, pose[:, 0], near)
+        with _full_precision(x):
+            said = details.answer(rows, x[:, None].float(), kinds, pose[:, 0], near)
         return InsertionDetails(
             said.agent_type_logits[:, 0],
             said.size_log_m.exp(),

@@ -65,7 +65,17 @@ class RolloutSettings:
     scenes_per_unit: AtLeastOne = 8
     """Scenes of one unit of work."""
     batch_rollouts: AtLeastOne = 32
-    """Rollouts that are simulated at once."""
+    """Rollouts that are simulated at once. A batch that does not fit into the memory of a
+    CUDA device is simulated as smaller ones."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where the network computes. `auto` is `cuda` if the process that plans the rollouts
+    has a CUDA device, else `cpu`. All units of one run use devices of one type; a worker
+    without it refuses its units."""
+    precision: Literal["auto", "float32", "bf16"] = "auto"
+    """Precision of matrix products. `auto` is float32 on a CPU and TF32 on a CUDA device,
+    `float32` is exact on both, `bf16` is bfloat16 by autocast on both. Poses, distances and
+    sampling are float32 or float64 in all of them. Choices differ between precisions, as
+    between devices, where two are about equally likely."""
     all_agents: Bool | None = None
     """Whether to simulate all agents that the log has at the end of the history, however
     far from the ego, or those within `tokenize.max_ego_distance_m`; as the mode says if not

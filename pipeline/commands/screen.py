@@ -182,6 +182,8 @@ _LINES = {
     "worker-full": "{stage}: worker {worker} is restarted, as it fills its memory "
     "({memory_gib} GiB)",
     "worker-lost": "{stage}: worker {worker} is lost; what it had under way begins again",
+    "device-failed": "{stage}: a worker is restarted, as its device failed in unit {unit}: "
+    "{reason}",
     "workers-missing": "{stage}: there are no workers; waiting {timeout_min:g} minutes "
     "for one",
     "stage-done": "{stage}: made; {figures}",

@@ -149,7 +149,7 @@ def clock_time(seconds: float) -> str:
     return f"{hour}:{minute:02}:{second:02}" if hour else f"{minute}:{second:02}"
 
 
-def figures(report: dict[str, Any], most: int = 6) -> str:
+def figures(report: dict[str, Any], most: int = 7) -> str:
     """Format the scalar figures of a report in one line."""
     plain = {
         name: value

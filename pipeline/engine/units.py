@@ -1,5 +1,6 @@
 """Doing one unit of work: the same code in the driver's process and on any worker."""
 
+import socket
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from pipeline.engine import signals
+from pipeline.engine import machine, signals
 from pipeline.engine.atomic import MANIFEST, publish
 from pipeline.engine.manifest import Run, read_manifest, split_report, write_manifest
 from pipeline.engine.registry import load_stage
@@ -21,6 +22,14 @@ class WorkersLostError(OSError):
 
     Finished units are on disk; the next run continues from there.
     """
+
+
+class DeviceLostError(WorkersLostError):
+    """The device of this process failed, and all later work on it would fail too."""
+
+
+DEVICE_FAILURES = ("CUDA error", "device-side assert", "illegal memory access")
+"""Words of errors after which CUDA refuses all later work of a process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,11 +144,18 @@ class DriverWorkers:
 
 
 def attempt(task: Task, progress: Progress) -> Outcome:
-    """Do a task; turn an exception into a failed outcome."""
+    """Do a task; turn an exception into a failed outcome.
+
+    Raises:
+        DeviceLostError: if the device failed: other units would fail on it too.
+    """
     begun = time.monotonic()
     try:
         return do(task, progress)
     except Exception as error:  # Other units go on, whatever the error.
+        reason = device_failure(error)
+        if reason:
+            raise _device_lost(task.unit.name, reason) from error
         seconds = time.monotonic() - begun
         return failure(task.unit.name, error, traceback.format_exc(), seconds)
 
@@ -148,6 +164,38 @@ def failure(name: str, error: BaseException, trace: str, seconds: float) -> Outc
     """Build the outcome of a failed unit: the error in one line, and its traceback."""
     line = f"{type(error).__name__}: {error}".splitlines()[0]
     return Outcome(name, None, seconds, line, trace)
+
+
+def device_failure(error: BaseException | None) -> str:
+    """Return the first line of the device failure that an error is, or comes from.
+
+    A failed assertion or a bad address in a CUDA kernel leaves a process without its
+    device: every later call fails. Errors are told by name, as this package does without
+    torch.
+
+    Returns:
+        The line; empty if the device is not to blame.
+    """
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        words, name = str(error), type(error).__name__
+        failed = name == "AcceleratorError" or any(
+            each in words for each in DEVICE_FAILURES
+        )
+        if isinstance(error, RuntimeError) and failed:
+            return f"{name}: {words}".splitlines()[0]
+        error = error.__cause__ or error.__context__
+    return ""
+
+
+def _device_lost(unit: str, reason: str) -> DeviceLostError:
+    devices = ", ".join(machine.describe()["gpus"]) or "unknown"
+    return DeviceLostError(
+        f"unit {unit}: the device (of {socket.gethostname()}: {devices}) failed, and this "
+        f"process can do nothing more on it: {reason}; what is done is kept: run again, "
+        "with CUDA_LAUNCH_BLOCKING=1 to see in the log where it happens"
+    )
 
 
 def do(task: Task, progress: Progress) -> Outcome:

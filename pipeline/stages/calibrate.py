@@ -16,8 +16,16 @@ from typing import TYPE_CHECKING, Any
 from infgen.clock import CLOCK
 from infgen.config import CalibrateSettings, RolloutSettings, TokenSettings
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
+from pipeline.stages.batch_memory import BatchSize
 from pipeline.stages.calibration import Biases, read_biases, write_found
-from pipeline.stages.simulation import begin, load_simulator, read_some, simulate_all
+from pipeline.stages.devices import decide_device, device_of_units, on_device
+from pipeline.stages.simulation import (
+    about_run,
+    begin,
+    load_simulator,
+    read_some,
+    simulate_all,
+)
 from pipeline.storage.splits import files_of_split, spread_evenly
 
 if TYPE_CHECKING:
@@ -62,7 +70,7 @@ def plan(inputs: Inputs, settings: Settings) -> list[Unit]:
     weights = inputs.folder("train")
     identity = inputs.content("train", "model.safetensors", "model.json")
     reach = _reach(weights, how)
-    units = []
+    units, device = [], decide_device(settings["rollout"])
     for point, (add, leave) in enumerate(DESIGN):
         biases = asdict(reach.at(add, leave))
         for part, pieces in enumerate(_parts(inputs, how)):
@@ -76,6 +84,7 @@ def plan(inputs: Inputs, settings: Settings) -> list[Unit]:
                     task={
                         "weights": str(weights),
                         "biases": biases,
+                        "device": device,
                         "point": point,
                         "pieces": [
                             {"scenes": str(done.path), "rows": rows}
@@ -123,7 +132,9 @@ def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Re
 
     target.mkdir(parents=True, exist_ok=True)
     how: CalibrateSettings = settings["calibrate"]
-    played = Biases(**unit.task["biases"]).over(settings["rollout"])
+    played = on_device(
+        Biases(**unit.task["biases"]).over(settings["rollout"]), unit.task["device"]
+    )
     folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
     simulator, weights = load_simulator(folder, identity, played)
     starts, played_on, logs, refused = [], [], [], []
@@ -142,7 +153,8 @@ def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Re
     def tell(done: float) -> None:
         progress(done, len(starts), "rollouts")
 
-    rollouts = chain.from_iterable(simulate_all(simulator, starts, weights, tell))
+    size = BatchSize(played.batch_rollouts)
+    rollouts = chain.from_iterable(simulate_all(simulator, starts, weights, tell, size))
     # Beyond the end of a map no agent enters: biases must not compensate for that.
     plays = [
         count_flow(on_map(from_rollout(rollout), lanes), how.count_radius_m, length)
@@ -154,6 +166,8 @@ def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Re
         "played": asdict(add_up(plays)),
         "logged": asdict(add_up(logs)),
         "refused": refused,
+        "device": played.device,
+        "run": about_run(simulator, size),
     }
 
 
@@ -197,7 +211,11 @@ def _find(
     write_json(target / "plays.json", {"logs": _rates(logs), "plays": lines})
     refused = sorted({line for done in units for line in done.report["refused"]})
     scenes = sum(done.report["scenes"] for done in units if done.report["point"] == 0)
-    about: Report = {"scenes": scenes, "refused": refused}
+    about: Report = {
+        "scenes": scenes,
+        "refused": refused,
+        "device": device_of_units(units),
+    }
     best = find_best(plays, logs, reach)
     if best is None:
         # No insertions, or too few to decide.
@@ -235,7 +253,7 @@ def _rates(counts: "FlowCounts") -> dict[str, float | None]:
 
 STAGE = Stage(
     name="calibrate",
-    version=6,
+    version=7,
     settings={
         "tokenize": TokenSettings,
         "rollout": RolloutSettings,
@@ -246,8 +264,10 @@ STAGE = Stage(
     finish=finish,
     normalize=normalize,
     modules=(
+        "pipeline.stages.batch_memory",
         "pipeline.stages.calibrate",
         "pipeline.stages.calibration",
+        "pipeline.stages.devices",
         "pipeline.stages.simulation",
         "pipeline.stages.flow_response",
     ),

@@ -14,8 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 from infgen.config import RolloutSettings
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
+from pipeline.stages.batch_memory import BatchSize
 from pipeline.stages.calibration import Biases, read_found
-from pipeline.stages.simulation import begin, load_simulator, read_some, simulate_all
+from pipeline.stages.devices import decide_device, device_of_units, on_device
+from pipeline.stages.simulation import (
+    about_run,
+    begin,
+    load_simulator,
+    read_some,
+    simulate_all,
+)
 from pipeline.storage.parquet import Fields, make_table, read_tables
 from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
 from pipeline.storage.splits import files_of_split, spread_evenly
@@ -74,7 +82,7 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
         add=found.add if settings.inserts else 0.0,
         leave=found.leave if settings.removes else 0.0,
     )
-    every = inputs.units("ingest")
+    every, device = inputs.units("ingest"), decide_device(settings)
     shards = files_of_split(every, settings.split, to="simulate", setting="rollout.split")
     units = []
     for done, rows in zip(shards, spread_evenly(shards, settings.max_scenes), strict=True):
@@ -87,6 +95,7 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
                         "scenes": str(done.path),
                         "weights": str(weights),
                         "biases": asdict(biases),
+                        "device": device,
                         "rows": rows[first:after],
                     },
                 )
@@ -108,24 +117,30 @@ def simulate(
     from pipeline.storage.zarr_store import write_records  # noqa: PLC0415
 
     biases = Biases(**unit.task["biases"])
-    settings = biases.over(settings)
+    settings = on_device(biases.over(settings), unit.task["device"])
     folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
     simulator, weights = load_simulator(folder, identity, settings)
     starts, refused = _starts(unit, simulator)
-    begun = time.monotonic()
+    begun, size = time.monotonic(), BatchSize(settings.batch_rollouts)
+    where = "" if settings.device == "cpu" else f" on {settings.device}"
 
     def tell(played: float) -> None:
-        progress(played, len(starts), f"{_rate(played, begun):.3g} rollouts/s")
+        progress(played, len(starts), f"{_rate(played, begun):.3g} rollouts/s{where}")
 
     rows: list[dict[str, Any]] = []
-    for group, rollouts in enumerate(simulate_all(simulator, starts, weights, tell)):
+    for group, rollouts in enumerate(simulate_all(simulator, starts, weights, tell, size)):
         path = target / f"rollouts-{group:03d}.zarr"
         write_records(path, rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True)
         rows += [_row(unit.name, group, at, done) for at, done in enumerate(rollouts)]
     make_table(rows, INDEX).write_parquet(target / "index.parquet")
     pace = {"rollouts_per_s": round(_rate(len(rows), begun), 4)}
-    told = {"add_bias": settings.add_bias, "remove_bias": settings.remove_bias}
-    return {**_report(rows, refused), **told, "simulates": simulator.simulates, "run": pace}
+    run = {**pace, **about_run(simulator, size)}
+    told = {
+        "add_bias": settings.add_bias,
+        "remove_bias": settings.remove_bias,
+        "device": settings.device,
+    }
+    return {**_report(rows, refused), **told, "simulates": simulator.simulates, "run": run}
 
 
 def _rate(played: float | int, begun: float) -> float:
@@ -156,6 +171,7 @@ def finish(
     biases = {name: units[0].report[name] for name in ("add_bias", "remove_bias") if units}
     return {
         "rollouts": count,
+        "device": device_of_units(units),
         "simulates": "; ".join(simulates),
         **means,
         **biases,
@@ -198,14 +214,16 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=7,
+    version=8,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=simulate,
     finish=finish,
     normalize=normalize,
     modules=(
+        "pipeline.stages.batch_memory",
         "pipeline.stages.calibration",
+        "pipeline.stages.devices",
         "pipeline.stages.simulation",
         "pipeline.stages.rollout",
     ),

@@ -3,12 +3,13 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from itertools import groupby, islice
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from infgen.clock import CLOCK
 from infgen.config import RolloutSettings
+from pipeline.stages.batch_memory import BatchSize, simulate_in_memory
+from pipeline.stages.devices import decide_device, find_device, limit_memory, name_device
 
 if TYPE_CHECKING:
     from infgen.rollout.recording import RolloutStart
@@ -28,17 +29,19 @@ def load_simulator(
 
     Returns:
         The simulator, and the fingerprint of the weights.
-    """
-    import torch  # noqa: PLC0415
 
-    from infgen.model.stepping import Stepper  # noqa: PLC0415
+    Raises:
+        DeviceError: if this process lacks the device that the settings name.
+    """
+    from infgen.rollout.precision import make_stepper  # noqa: PLC0415
     from infgen.rollout.simulator import Simulator  # noqa: PLC0415
     from pipeline.storage.weights import load_network, read_description  # noqa: PLC0415
 
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = find_device(decide_device(settings), settings.device)
+    limit_memory(device)
     network = load_network(weights).to(device).eval()
     simulator = Simulator(
-        stepper=Stepper(network),
+        stepper=make_stepper(network, settings.precision),
         vocabulary=network.motion_vocabulary(),
         roads=network.map_vocabulary(),
         tokens=network.grid_settings,
@@ -84,6 +87,7 @@ def simulate_all(
     starts: "Sequence[RolloutStart]",
     weights: str,
     tell: Callable[[float], None],
+    size: BatchSize | None = None,
 ) -> "Iterator[list[Rollout]]":
     """Simulate rollouts in batches, and collect them a few at a time.
 
@@ -92,25 +96,32 @@ def simulate_all(
         starts: Where they begin.
         weights: Fingerprint of the weights.
         tell: Called with the number of simulated rollouts at every token step of a batch.
-    """
-    from infgen.rollout.recording import Frame, collect  # noqa: PLC0415
-    from infgen.rollout.simulate import simulate  # noqa: PLC0415
+        size: Rollouts of a batch, for those who want to know how many it came to; else as
+            in the settings.
 
-    duration_s, done = simulator.settings.duration_s, 0
-    few = max(1, int(TOGETHER_S / duration_s))
-    for batch in _batches(starts, simulator.settings.batch_rollouts):
-        frames: list[Frame] = []
-        for frame in simulate(simulator, batch):
-            frames.append(frame)
-            tell(done + len(batch) * len(frames) * CLOCK.token_s / duration_s)
-        done += len(batch)
+    Raises:
+        SimulationMemoryError: if a single rollout is too large for the device.
+    """
+    from infgen.rollout.recording import collect  # noqa: PLC0415
+
+    size = size or BatchSize(simulator.settings.batch_rollouts)
+    few = max(1, int(TOGETHER_S / simulator.settings.duration_s))
+    for batch, frames in simulate_in_memory(simulator, starts, size, tell):
         for first in range(0, len(batch), few):
             places = range(len(batch))[first : first + few]
             yield collect(batch, frames, weights, places)
 
 
-def _batches(starts: "Sequence[RolloutStart]", size: int) -> "Iterator[list[RolloutStart]]":
-    """Cut into batches whose histories are of one length."""
-    for _, group in groupby(starts, key=lambda start: start.history.now):
-        alike = list(group)
-        yield from (alike[at : at + size] for at in range(0, len(alike), size))
+def about_run(simulator: "Simulator", size: BatchSize) -> dict[str, Any]:
+    """Name the device of a unit, and the batches that did fit into its memory.
+
+    For the part of a report that differs from run to run.
+    """
+    from infgen.rollout.precision import describe_precision  # noqa: PLC0415
+
+    device = simulator.device
+    precision = describe_precision(simulator.settings.precision, device.type)
+    found: dict[str, Any] = {"device": name_device(device, precision)}
+    if size.halvings:
+        found |= {"batch_rollouts": size.rollouts, "out_of_memory": size.halvings}
+    return found

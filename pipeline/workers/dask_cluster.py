@@ -18,7 +18,6 @@ from queue import SimpleQueue
 from typing import Any
 
 from infgen.errors import ConfigError
-from pipeline.engine.stage import Progress
 from pipeline.engine.units import (
     DriverWorkers,
     Executor,
@@ -27,10 +26,17 @@ from pipeline.engine.units import (
     Task,
     Workers,
     WorkersLostError,
-    do,
+)
+from pipeline.workers.gpus import (
+    GRAMMAR,
+    VISIBLE_DEVICES,
+    is_gpu_words,
+    select_gpus,
+    worker_names,
 )
 from pipeline.workers.scheduling import (
     RETRIES,
+    DeviceFailed,
     PoolExecutor,
     TaskEnded,
     TaskFailure,
@@ -39,15 +45,20 @@ from pipeline.workers.scheduling import (
     WorkerLost,
     WorkerMemoryFull,
 )
+from pipeline.workers.worker_side import (
+    DEVICE,
+    DEVICE_TOPIC,
+    PROGRESS_TOPIC,
+    run_with_progress,
+)
 
-HELP = "none | local[:N] | gpu[:0,1] | tcp://HOST:PORT | file:scheduler.json"
+HELP = f"none | local[:N] | {GRAMMAR} | tcp://HOST:PORT | file:scheduler.json"
 LOOPBACK = "127.0.0.1"  # Dask runs what anyone who connects sends it.
 WEB: dict[str, Any] = {"dashboard": False, "dashboard_address": f"{LOOPBACK}:0"}
 """A free port for the scheduler's web server: another cluster may use the default one."""
 SCHEDULER_TIMEOUT_S = 60.0
 """Longest wait for an answer of the scheduler."""
 CLOSE_S, POLL_S = 10.0, 0.1
-PROGRESS_EVERY_S = 2.0
 CONFIG = {
     # A worker that is just being restarted when this time is up is given up for good; with
     # the usual 15 seconds a few crashes leave a cluster without workers.
@@ -56,10 +67,8 @@ CONFIG = {
     "distributed.scheduler.allowed-failures": 1,
 }
 WORKER_ENVIRONMENT = {"ZARR_ASYNC__CONCURRENCY": "4", "ZARR_THREADING__MAX_WORKERS": "2"}
-VISIBLE_DEVICES = "CUDA_VISIBLE_DEVICES"
 WORKERS_TOPIC, MEMORY_TOPIC = "all", "worker-restart-memory"
 """Dask's topics for workers that start and end, and for those it restarts."""
-PROGRESS_TOPIC = "infgen-progress"
 
 
 def choose_workers(words: str, visible_devices: str | None = None) -> Workers:
@@ -128,12 +137,14 @@ class OpenDaskWorkers:
 
 
 def parse(words: str) -> tuple[str, str]:
-    """Split ``local:4`` into kind and rest.
+    """Split ``local:4`` into kind and rest; of ``gpu*2`` the rest is ``*2``.
 
     Raises:
         ConfigError: for words that name no kind of workers.
     """
-    if not re.fullmatch(r"local(:[1-9]\d*)?|gpu(:\d+(,\d+)*)?|(tcp|tls|file):.+", words):
+    if is_gpu_words(words):
+        return "gpu", words.removeprefix("gpu").removeprefix(":")
+    if not re.fullmatch(r"local(:[1-9]\d*)?|(tcp|tls|file):.+", words):
         raise ConfigError(f"--dask {words}: expected {HELP}")
     kind, _, rest = words.partition(":")
     return kind, rest
@@ -212,51 +223,26 @@ def _gpus(devices: Sequence[str]) -> Any:
 
 
 def gpu_workers(devices: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Describe one worker process per device, which sees that device alone.
+    """Describe one worker process per name of a device, which sees that device alone.
 
     The environment is set before anything is imported there.
+
+    Args:
+        devices: The device of every worker; repeated where it gets several.
     """
     return {
-        device: {
+        name: {
             "cls": _dask().Nanny,
             "options": {
                 "host": LOOPBACK,
                 "nthreads": 1,
                 "memory_limit": _memory_bytes(len(devices)),
-                "resources": {"GPU": 1},
+                "resources": {DEVICE: 1 / devices.count(device)},
                 "env": {**WORKER_ENVIRONMENT, VISIBLE_DEVICES: device},
             },
         }
-        for device in devices
+        for name, device in worker_names(devices).items()
     }
-
-
-def select_gpus(wanted: str, visible: str | None) -> list[str]:
-    """Return the devices to start workers for.
-
-    Args:
-        wanted: Numbers with commas, as this process counts them; empty for all.
-        visible: ``CUDA_VISIBLE_DEVICES`` of this process, by which devices are renumbered.
-
-    Raises:
-        ConfigError: if there is no such device.
-    """
-    import torch  # noqa: PLC0415
-
-    count = torch.cuda.device_count()
-    numbers = [int(word) for word in wanted.split(",")] if wanted else list(range(count))
-    if not count:
-        raise ConfigError(
-            f"--dask gpu{wanted and ':'}{wanted}: this machine has no CUDA device that "
-            "torch can use; try --dask local"
-        )
-    if max(numbers) >= count or len(set(numbers)) < len(numbers):
-        raise ConfigError(
-            f"--dask gpu:{wanted}: expected different numbers from 0 to {count - 1}, one "
-            "per CUDA device"
-        )
-    names = visible.split(",") if visible else [str(number) for number in range(count)]
-    return [names[number].strip() for number in numbers]
 
 
 class DaskPool:
@@ -272,6 +258,7 @@ class DaskPool:
             WORKERS_TOPIC: self._on_worker_event,
             MEMORY_TOPIC: self._on_memory_full,
             f"{PROGRESS_TOPIC}-{self._mark}": self._on_progress,
+            f"{DEVICE_TOPIC}-{self._mark}": self._on_device_failed,
         }
         for topic, hear in self._topics.items():
             client.subscribe_topic(topic, hear)
@@ -291,7 +278,7 @@ class DaskPool:
         """Submit a task as an attempt of that name."""
         key = f"{name}-{self._mark}"
         future = self._client.submit(
-            _run_with_progress, task, key, self._mark, key=key, retries=RETRIES, pure=False
+            _run_on_worker, task, key, self._mark, key=key, retries=RETRIES, pure=False
         )
         self._futures[key] = future
         future.add_done_callback(lambda _: self._inbox.put(TaskEnded(name)))
@@ -357,20 +344,12 @@ class DaskPool:
         name = str(about["key"]).removesuffix(f"-{self._mark}")
         self._inbox.put(TaskProgress(name, about["done"], about["total"], about["note"]))
 
+    def _on_device_failed(self, event: tuple[float, Mapping[str, Any]]) -> None:
+        about = event[1]
+        name = str(about["key"]).removesuffix(f"-{self._mark}")
+        self._inbox.put(DeviceFailed(name, str(about["reason"])))
 
-def _run_with_progress(task: Task, key: str, mark: str) -> Outcome:
-    """Do a task on a worker, and send its progress to the driver now and then."""
-    return do(task, _progress_sender(key, mark))
 
-
-def _progress_sender(key: str, mark: str) -> Progress:
-    worker, told = _dask().get_worker(), time.monotonic()
-
-    def tell(done: float | int, total: float | int, note: str = "") -> None:
-        nonlocal told
-        if time.monotonic() - told >= PROGRESS_EVERY_S:
-            told = time.monotonic()
-            about = {"key": key, "done": float(done), "total": float(total), "note": note}
-            worker.log_event(f"{PROGRESS_TOPIC}-{mark}", about)
-
-    return tell
+def _run_on_worker(task: Task, key: str, mark: str) -> Outcome:
+    """Do a task on the worker that this runs on."""
+    return run_with_progress(_dask().get_worker(), task, key, mark)

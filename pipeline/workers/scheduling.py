@@ -57,7 +57,15 @@ class WorkerLost:
     names: tuple[str, ...]
 
 
-WorkerEvent = TaskEnded | TaskProgress | WorkerMemoryFull | WorkerLost
+@dataclass(frozen=True, slots=True)
+class DeviceFailed:
+    """The device of a worker failed during an attempt, and the worker ends."""
+
+    name: str
+    reason: str
+
+
+WorkerEvent = TaskEnded | TaskProgress | WorkerMemoryFull | WorkerLost | DeviceFailed
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +161,7 @@ class _Schedule:
     _tried_again: set[str] = field(default_factory=set)
     _memory_full: set[str] = field(default_factory=set)
     _filled_memory: set[str] = field(default_factory=set)
+    _device_failures: dict[str, str] = field(default_factory=dict)
     _counted_at: float = -math.inf
     _workers_seen_at: float = field(default_factory=time.monotonic)
     _workers_missing: bool = False
@@ -189,6 +198,8 @@ class _Schedule:
             self.tell("worker-full", worker=news.worker, memory_gib=memory_gib)
         elif isinstance(news, WorkerLost):
             self._emit_worker_lost(news)
+        elif isinstance(news, DeviceFailed):
+            self._emit_device_failed(news)
         elif news.name in self.under_way:
             self.progress_of[news.name] = news
             self.emit_progress()
@@ -204,10 +215,21 @@ class _Schedule:
             self.suspects.append(task)
             return None
         outcome = failure(task.unit.name, found.error, found.trace, 0.0)
-        if task.unit.name in self._filled_memory:
+        name = task.unit.name
+        if name in self._filled_memory:
             more = f"{outcome.error} (a worker that did it filled its memory)"
             return replace(outcome, error=more)
+        if found.killed and name in self._device_failures:
+            why = self._device_failures[name]
+            more = f"{outcome.error} (it failed the device of its workers: {why})"
+            return replace(outcome, error=more)
         return outcome
+
+    def _emit_device_failed(self, news: DeviceFailed) -> None:
+        if news.name in self.under_way:
+            unit = self.under_way[news.name].unit.name
+            self._device_failures[unit] = news.reason
+            self.tell("device-failed", unit=unit, reason=news.reason)
 
     def _emit_worker_lost(self, news: WorkerLost) -> None:
         names = [name for name in news.names if name in self.under_way]

@@ -3,6 +3,7 @@
 ``python -m tests.standin.cases NAME [ARGUMENTS]`` prints what it found as one line of JSON.
 """
 
+import importlib
 import json
 import sys
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.standin.device import (
+    ROOT,
     MixedDevicesError,
     StandIn,
     Tally,
@@ -329,10 +331,50 @@ def device() -> Found:
     return {"refused": refused, "counts": found, "gradient": gradient}
 
 
+def benchmarks(name: str) -> Found:
+    """Measure a small row of a benchmark, as its process on a GPU would."""
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    measuring = importlib.import_module("measuring")
+    measuring.PEAK_SIDE = 64
+    benchmark = importlib.import_module(name)
+    device = str(DEVICE)
+    cases = {
+        "rollout": {
+            "size": "small", "batch": 2, "mode": "long", "played": "masked",
+            "seconds": 1.0, "agents": 6, "roads": 100, "device": device, "threads": 1,
+        },
+        "training": {
+            "size": "small", "scenes": 1, "neighbours": 5, "device": device, "threads": 1,
+            "precision": "float32",
+        },
+    }  # fmt: skip
+    with StandIn():
+        row: Found = benchmark.measure(benchmark.Case(**cases[name]))
+    return row
+
+
+def gpu_rows() -> Found:
+    """Measure small rows of ``benchmarks/gpu.py``."""
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    rows = importlib.import_module("gpu_rows")
+    place = rows.Place(str(DEVICE), 1, 0.0, small=True)
+    asked = [
+        rows.Row("logits", "tiny", 1, "float32"),
+        rows.Row("choices", "builtin", 2, "float32"),
+        rows.Row("choices", "builtin", 2, "bf16"),
+        rows.Row("rollouts", "tiny", 2, "bf16"),
+        rows.Row("training", "tiny", 1, "bf16"),
+    ]
+    with StandIn():
+        return {row.name: rows.measure(row, place) for row in asked}
+
+
 CASES: dict[str, Callable[..., Found]] = {
+    "benchmarks": benchmarks,
     "compiled": compiled,
     "counts": counts,
     "device": device,
+    "gpu_rows": gpu_rows,
     "insertion": insertion,
     "resuming": resuming,
     "rollout": rollout,

@@ -327,6 +327,9 @@ class _Module:
     def synchronize(self, device: Any = None) -> None:
         pass
 
+    def max_memory_allocated(self, device: Any = None) -> int:
+        return 0  # It has no memory of its own.
+
 
 def set_up() -> torch.device:
     """Register the device; to be called before ``infgen`` is imported."""

@@ -6,6 +6,7 @@ report shows where it lies beside it.
 """
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -110,9 +111,24 @@ def times(inputs: "Inputs", stages: Sequence[str]) -> list[Table]:
         rows.append([name, min(begun, default=None), _sum(seconds), longest, last])
     columns = ["stage", "begun", "seconds of all units", "longest unit", "gathering"]
     return [
+        _devices(inputs, stages),
         Table("Seconds", columns, rows, note="Units may have been made side by side."),
         Table("Machines", _MACHINE, [_row(*each) for each in machines.items()]),
     ]
+
+
+def _devices(inputs: "Inputs", stages: Sequence[str]) -> Table:
+    """On which devices the network computed, in training and in rollouts."""
+    found: Counter[tuple[str, str]] = Counter()
+    for name in stages:
+        for done in inputs.units(name):
+            device = _run(done.path).get("report", {}).get("device")
+            if device is not None:
+                found[name, str(device)] += 1
+    rows: list[Sequence[Cell]] = [
+        [stage, device, units] for (stage, device), units in found.items()
+    ]
+    return Table("Devices", ["stage", "device and precision", "units"], rows)
 
 
 _MACHINE = ["host", "processor", "cores", "memory, GiB", "graphics", "stages"]

@@ -24,6 +24,7 @@ from pipeline.engine.stage import (
     Stage,
     Unit,
 )
+from pipeline.stages.devices import name_device
 from pipeline.storage.initial_weights import (
     DESCRIPTION,
     INITIAL_WEIGHTS,
@@ -129,13 +130,14 @@ def _train(
         "validation_split": len(setup.validation_split),
         "parameters": sum(p.numel() for p in training.network.parameters()),
         "weights": weights,
+        "device": group.device.type,
         "validation": found.validation,
         "run": {
             **found.run,
             "seconds": round(time.monotonic() - begun, 1),
             "threads": torch.get_num_threads(),
             "processes": group.size,
-            "device": group.device.type,
+            "device": name_device(group.device, "bf16" if found.run["bf16"] else "float32"),
             "peak_memory_mib": round(peak_memory_mib(), 1),
         },
     }
@@ -200,6 +202,7 @@ STAGE = Stage(
     finish=finish,
     reads=reads,
     modules=(
+        "pipeline.stages.devices",
         "pipeline.storage.checkpoint",
         "pipeline.stages.train.setup",
         "pipeline.stages.train.optimizer_step",

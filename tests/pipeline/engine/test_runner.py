@@ -4,14 +4,18 @@ import shutil
 from dataclasses import replace
 
 import pytest
+import torch
 
+from pipeline.commands.verbs import exit_code
 from pipeline.engine.atomic import MANIFEST
 from pipeline.engine.locks import LockedError, locked
+from pipeline.engine.machine import describe
 from pipeline.engine.manifest import read_manifest, verify
 from pipeline.engine.plan import PlanError
 from pipeline.engine.registry import load_stage
 from pipeline.engine.runner import RunOptions
 from pipeline.engine.stage import Unit
+from pipeline.engine.units import DeviceLostError, device_failure
 
 
 def states(results):
@@ -355,3 +359,54 @@ def test_progress_is_logged_where_the_log_was_silent_for_long(workshop, monkeypa
     events = [json.loads(line) for line in log.read_text().splitlines()]
     told = [(e["done"], e["total"]) for e in events if e["event"] == "progress"]
     assert told == [(1, 3), (2, 3), (3, 3)] * 2
+
+
+def test_a_failed_device_ends_the_run_instead_of_failing_unit_after_unit(
+    workshop, monkeypatch
+):
+    monkeypatch.setitem(describe(), "gpus", ["NVIDIA H100 80GB HBM3"])
+    workshop.text("b.txt", "assert-once")
+    workshop.text("c.txt", "never begun")
+    events = []
+
+    with pytest.raises(DeviceLostError) as lost:
+        workshop.run(run_options=RunOptions(keep_going=True), events=events)
+
+    assert "unit b.txt: the device" in str(lost.value)
+    assert f"{os.uname().nodename}: NVIDIA H100 80GB HBM3) failed" in str(lost.value)
+    assert "AcceleratorError: CUDA error: device-side assert triggered;" in str(lost.value)
+    assert exit_code(lost.value) == 1
+    ends = [
+        event["event"] for event in events if event["event"].startswith(("unit", "run"))
+    ]
+    assert ends == ["run-started", "unit-done", "run-stopped"]
+    assert workshop.run()["count"].made == 2, "what was done is kept"
+
+
+def chained(error, cause):
+    error.__cause__ = cause
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (
+            torch.AcceleratorError("CUDA error: unspecified launch failure\nMore."),
+            "AcceleratorError: CUDA error: unspecified launch failure",
+        ),
+        (
+            RuntimeError("CUDA error: CUBLAS_STATUS_EXECUTION_FAILED"),
+            "RuntimeError: CUDA error: CUBLAS_STATUS_EXECUTION_FAILED",
+        ),
+        (
+            chained(ValueError("a file"), torch.AcceleratorError("CUDA error: x")),
+            "AcceleratorError: CUDA error: x",
+        ),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"), ""),
+        (ValueError("the log of a CUDA error: x"), ""),
+        (RuntimeError("mat1 and mat2 shapes cannot be multiplied"), ""),
+    ],
+)
+def test_errors_after_which_a_device_refuses_all_work_are_told_from_others(error, reason):
+    assert device_failure(error) == reason

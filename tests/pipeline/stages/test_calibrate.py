@@ -64,6 +64,7 @@ def told(point, played, logged=None):
         "played": dataclasses.asdict(played),
         "logged": dataclasses.asdict(logged or FlowCounts(1000, 1000, 9000, 1000)),
         "refused": ["scene 1: too short"],
+        "device": "cpu",
     }
     return FinishedUnit(f"biases-{point}-000", "key", Path(), report)
 
@@ -137,6 +138,8 @@ def test_a_unit_counts_rollouts_and_logs_and_names_what_cannot_be_played(
     assert report["logged"]["agents"] > 0
     assert len(report["refused"]) == 1
     assert "the history ends at step 13" in report["refused"][0]
+    assert report["device"] == "cpu"
+    assert report["run"]["device"].startswith("CPU, ")
     assert stage.work(unit, tmp_path / "again", every, quiet) == report
 
 
@@ -196,6 +199,7 @@ def test_the_biases_with_which_plays_are_as_logs_are_left_for_rollouts(
     assert read_found(tmp_path / "out") == Biases(add=0.4, leave=0.0)
     assert (report["method"], report["scenes"]) == ("simulate", 2)
     assert report["refused"] == ["scene 1: too short"]
+    assert report["device"] == "cpu"
     assert report["came_expected"] == pytest.approx(1, abs=0.01)
     about = json.loads((tmp_path / "out" / "plays.json").read_text())
     assert about["logs"] == {

@@ -4,6 +4,7 @@ from itertools import chain
 import numpy as np
 import polars as pl
 import pytest
+import torch
 
 from infgen.config import RolloutSettings, TokenSettings
 from infgen.model.network import Network
@@ -11,6 +12,7 @@ from infgen.scene import Scene
 from pipeline.engine.stage import FinishedUnit
 from pipeline.stages import rollout as stage
 from pipeline.stages.calibration import Biases, write_found
+from pipeline.stages.devices import DeviceError
 from pipeline.storage.rollouts import read_rollouts
 from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.weights import save_network, state_dict_of
@@ -93,6 +95,31 @@ def test_the_pace_is_told_and_kept_apart_from_what_is_reproducible(inputs, tmp_p
     assert [step[0] for step in told] == [0.5, 1.0, 1.5, 2.0]
     assert all(step[2].endswith(" rollouts/s") for step in told)
     assert report["run"]["rollouts_per_s"] > 0
+
+
+def test_units_on_another_type_of_device_are_other_units(inputs, monkeypatch, tmp_path):
+    settings = dataclasses.replace(SETTINGS, max_scenes=1, seconds=1.0)
+    (here,) = stage.STAGE.plan(inputs, settings)
+    monkeypatch.setattr(stage, "decide_device", lambda settings: "cuda")
+    (there,) = stage.STAGE.plan(inputs, settings)
+
+    assert (here.task["device"], there.task["device"]) == ("cpu", "cuda")
+    assert dataclasses.replace(there, task={**there.task, "device": "cpu"}) == here
+    with pytest.raises(DeviceError, match="has no CUDA device"):
+        play(there, tmp_path / "there", settings)
+
+
+def test_the_report_names_the_type_of_device_and_the_run_record_the_device(
+    inputs, tmp_path
+):
+    settings = dataclasses.replace(SETTINGS, max_scenes=1, seconds=1.0, precision="bf16")
+    (unit,) = stage.STAGE.plan(inputs, settings)
+
+    report, _ = play(unit, tmp_path / "out", settings)
+
+    threads = torch.get_num_threads()
+    assert report["device"] == "cpu"
+    assert report["run"]["device"] == f"CPU, {threads} thread{'s'[: threads - 1]}, bf16"
 
 
 def test_the_calibrated_biases_are_added_to_those_of_the_settings(inputs, tmp_path):
@@ -252,6 +279,7 @@ def test_the_stage_sums_up_its_units(inputs, tmp_path):
     report = stage.STAGE.finish(inputs, done, target, SETTINGS, no_progress)
 
     assert report["rollouts"] == 8
+    assert report["device"] == "cpu"
     assert report["simulates"] == "motion, entries, exits"
     assert len(report["refused"]) == 1
     assert len(pl.read_parquet(target / "index.parquet")) == 8

@@ -1,5 +1,7 @@
 """Counts the words of every source file. A file that says ``fail`` makes its unit fail, one
-that says ``die`` ends its process, one that says ``hoard`` fills its memory."""
+that says ``die`` ends its process, one that says ``hoard`` fills its memory, and one that
+says ``assert`` (or, the first time only, ``assert-once``) fails as CUDA does on a failed
+device."""
 
 import os
 import time
@@ -26,6 +28,10 @@ def work(unit, target, settings, progress):
     words = Path(unit.task["url"]).read_text().split()
     if "die" in words:
         os._exit(1)
+    if "assert" in words or ("assert-once" in words and _first(Path(unit.task["url"]))):
+        import torch  # noqa: PLC0415
+
+        raise torch.AcceleratorError("CUDA error: device-side assert triggered\nMore.")
     if "fail" in words:
         raise ValueError(f"{unit.name} says fail")
     if "hoard" in words:
@@ -38,6 +44,15 @@ def work(unit, target, settings, progress):
     lengths = [len(word) for word in words if len(word) <= settings.longest]
     write_json(target / "count.json", {"words": len(lengths), "letters": sum(lengths)})
     return {"words": len(lengths), "run": {"letters_per_s": time.monotonic()}}
+
+
+def _first(text):
+    """Whether nobody has asked this for that text before."""
+    try:
+        text.with_suffix(".asked").touch(exist_ok=False)
+    except FileExistsError:
+        return False
+    return True
 
 
 def finish(inputs, units, target, settings, progress):

@@ -14,6 +14,7 @@ from pipeline.engine.locks import LockedError
 from pipeline.engine.runner import RunOptions
 from pipeline.engine.units import InProcess, WorkersLostError
 from pipeline.workers.dask_cluster import DaskWorkers, gpu_workers, parse, select_gpus
+from pipeline.workers.gpus import VISIBLE_DEVICES
 from tests.clusters import Cluster
 
 # Dask leaves sockets and child processes to the garbage collector when it closes.
@@ -29,7 +30,10 @@ pytestmark = [
     [
         ("local", ("local", "")),
         ("local:4", ("local", "4")),
+        ("gpu", ("gpu", "")),
         ("gpu:0,1", ("gpu", "0,1")),
+        ("gpu*4", ("gpu", "*4")),
+        ("gpu:0*6,1*6", ("gpu", "0*6,1*6")),
         ("tcp://host:8786", ("tcp", "//host:8786")),
         ("file:scheduler.json", ("file", "scheduler.json")),
     ],
@@ -39,10 +43,15 @@ def test_words_name_a_kind_of_workers(words, parts):
 
 
 @pytest.mark.parametrize(
-    "words", ["", "locl", "local:0", "local:x", "gpu:a", "tcp:", "file:"]
+    "words",
+    [
+        *("", "locl", "local:0", "local:x", "tcp:", "file:"),
+        *("gpu:a", "gpu:", "gpu*0", "gpu*", "gpu:0*0", "gpu:0*", "gpu:*2", "gpu:0*2*3"),
+        *("gpu:0,", "gpu*2:0", "gpu:-1", "gpu:0*1.5", "gpux2"),
+    ],
 )
-def test_other_words_are_refused_before_anything_runs(words):
-    with pytest.raises(ConfigError, match=r"expected none \| local"):
+def test_other_words_are_refused_with_the_grammar_before_anything_runs(words):
+    with pytest.raises(ConfigError, match=r"expected none \| local.*gpu:0\[\*N\],1\[\*N\]"):
         DaskWorkers(words)
 
 
@@ -69,6 +78,8 @@ def test_without_a_device_gpu_workers_are_refused():
         ("0,2", None, ["0", "2"]),
         ("", "5,6,7", ["5", "6", "7"]),
         ("1", "5, GPU-ab12 ,7", ["GPU-ab12"]),
+        ("*2", None, ["0", "0", "1", "1", "2", "2"]),
+        ("0*3,2", "5,6,7", ["5", "5", "5", "7"]),
     ],
 )
 def test_devices_are_named_as_this_process_sees_them(monkeypatch, wanted, visible, names):
@@ -77,16 +88,45 @@ def test_devices_are_named_as_this_process_sees_them(monkeypatch, wanted, visibl
     assert select_gpus(wanted, visible) == names
 
 
-@pytest.mark.parametrize("wanted", ["3", "0,0"])
-def test_devices_that_are_not_there_are_refused(monkeypatch, wanted):
+@pytest.mark.parametrize("wanted", ["3", "0,0", "0*2,3*2", "1*2,1"])
+def test_devices_that_are_not_there_or_named_twice_are_refused(monkeypatch, wanted):
     monkeypatch.setattr("torch.cuda.device_count", lambda: 3)
 
-    with pytest.raises(ConfigError, match=f"--dask gpu:{wanted}: expected .* from 0 to 2"):
+    with pytest.raises(
+        ConfigError, match=f"--dask gpu:{re.escape(wanted)}: expected .* from 0 to 2"
+    ):
         select_gpus(wanted, None)
 
 
-def seen_by_this_process():
-    return os.environ["CUDA_VISIBLE_DEVICES"], "torch" in sys.modules
+def test_whoever_names_a_device_twice_is_told_how_to_have_two_workers_on_it(monkeypatch):
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 3)
+
+    with pytest.raises(ConfigError, match=r"; gpu:1\*N starts N workers on a device"):
+        select_gpus("0,1,1", None)
+
+
+@pytest.mark.parametrize(("wanted", "words"), [("*49", "gpu*49"), ("0,1*49", "gpu:0,1*49")])
+def test_more_workers_than_a_device_takes_are_refused(monkeypatch, wanted, words):
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 3)
+
+    with pytest.raises(ConfigError, match=f"--dask {re.escape(words)}: 49 .* expected 48"):
+        select_gpus(wanted, None)
+
+
+def test_workers_of_one_device_share_it_and_all_share_the_memory():
+    described = gpu_workers(["0", "0", "GPU-ab12"])
+
+    assert list(described) == ["0-0", "0-1", "GPU-ab12"]
+    options = [each["options"] for each in described.values()]
+    assert [each["env"][VISIBLE_DEVICES] for each in options] == ["0", "0", "GPU-ab12"]
+    assert [each["resources"]["GPU"] for each in options] == [0.5, 0.5, 1.0]
+    (limit,) = {each["options"]["memory_limit"] for each in described.values()}
+    assert limit * 3 <= distributed.system.MEMORY_LIMIT < (limit + 1) * 3
+
+
+def seen_by_this_process(dask_worker):
+    share = dask_worker.state.total_resources["GPU"]
+    return os.environ["CUDA_VISIBLE_DEVICES"], share, "torch" in sys.modules
 
 
 @pytest.mark.slow
@@ -94,8 +134,8 @@ def test_each_gpu_worker_sees_its_own_device_before_it_imports_anything():
     web = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
     options = {"host": "127.0.0.1", **web}
     scheduler = {"cls": distributed.Scheduler, "options": options}
-    workers = gpu_workers(["4", "GPU-ab12"])
-    assert workers["4"]["options"]["nthreads"] == 1
+    workers = gpu_workers(["4", "4", "GPU-ab12"])
+    assert workers["4-0"]["options"]["nthreads"] == 1
 
     with (
         distributed.SpecCluster(workers=workers, scheduler=scheduler) as started,
@@ -103,7 +143,11 @@ def test_each_gpu_worker_sees_its_own_device_before_it_imports_anything():
     ):
         found = client.run(seen_by_this_process)
 
-    assert sorted(found.values()) == [("4", False), ("GPU-ab12", False)]
+    assert sorted(found.values()) == [
+        ("4", 0.5, False),
+        ("4", 0.5, False),
+        ("GPU-ab12", 1.0, False),
+    ]
 
 
 @pytest.mark.slow
@@ -135,6 +179,27 @@ def test_a_unit_that_fails_or_kills_its_worker_is_recorded_and_the_rest_goes_on(
     assert errors["c.txt"] == "ValueError: c.txt says fail"
     assert "KilledWorker" in errors["d.txt"]
     assert not list(workshop.root.store.rglob("c.txt*"))
+
+
+@pytest.mark.slow
+def test_a_failed_device_ends_its_worker_and_not_the_queue(workshop):
+    workshop.text("c.txt", "assert")
+    workshop.text("d.txt", "assert-once and no more")
+    for number in range(4):
+        workshop.text(f"{number}.txt", "word " * number)
+    events, run_options = [], RunOptions(workers=DaskWorkers("local:2"), keep_going=True)
+
+    results = workshop.run(run_options=run_options, targets=("count",), events=events)
+
+    assert results["count"].made == 7
+    assert list(results["count"].errors) == ["c.txt"]
+    failure = results["count"].errors["c.txt"]
+    assert "KilledWorker" in failure
+    assert "AcceleratorError: CUDA error: device-side assert triggered" in failure
+    told = [event for event in events if event["event"] == "device-failed"]
+    assert {event["unit"] for event in told} == {"c.txt", "d.txt"}
+    lost = [unit for e in events if e["event"] == "worker-lost" for unit in e["units"]]
+    assert {"c.txt", "d.txt"} <= set(lost)
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from pipeline.engine.stage import Unit
 from pipeline.engine.units import Outcome, Task, WorkersLostError
 from pipeline.workers import scheduling
 from pipeline.workers.scheduling import (
+    DeviceFailed,
     PoolExecutor,
     TaskEnded,
     TaskFailure,
@@ -225,6 +226,30 @@ def test_a_unit_that_filled_the_memory_of_workers_fails_with_that_reason():
     assert failed.error == (
         "KilledError: four times (a worker that did it filled its memory)"
     )
+
+
+def test_a_unit_that_failed_the_device_of_its_workers_fails_with_that_reason():
+    def fail(name):
+        pool.inbox.put(DeviceFailed(name, "CUDA error: an illegal memory access"))
+        pool.inbox.put(DeviceFailed("another run's", "CUDA error"))
+        raise KilledError("four times")
+
+    def fail_once(name):
+        if not name.endswith("-alone"):
+            fail(name)
+
+    told, pool = [], Threads(size=1, jobs={"u0": fail, "u1": fail_once})
+
+    outcomes = {outcome.name: outcome.error for outcome in run(pool, 2, told=told)}
+
+    reason = "CUDA error: an illegal memory access"
+    assert outcomes == {
+        "u0": f"KilledError: four times (it failed the device of its workers: {reason})",
+        "play-k1-alone": "",
+    }
+    assert told == [
+        ("device-failed", {"unit": unit, "reason": reason}) for unit in ("u0", "u1", "u0")
+    ]
 
 
 def test_progress_of_several_units_is_one_sum():

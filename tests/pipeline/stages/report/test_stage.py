@@ -126,7 +126,10 @@ def manifest(root: Path, stage: Stage | str, settings, told, units=(), sources=(
     for number, folder in enumerate([root / name, *[unit.path for unit in units]]):
         if number:
             write_json(folder / "manifest.json", {"files": {"y": [500, "c4c"]}})
-        write_json(folder / "run.json", {**RUN, "seconds": 2.5 * (number + 1)})
+        about = {**RUN, "seconds": 2.5 * (number + 1)}
+        if name == "rollout" and number:
+            about["report"] = {"device": "NVIDIA <H100> 80GB HBM3, TF32"}
+        write_json(folder / "run.json", about)
 
 
 def finished(root: Path) -> Inputs:
@@ -185,7 +188,11 @@ def finished(root: Path) -> Inputs:
     (root / "calibrate").mkdir()
     manifest(root, "calibrate", {"calibrate": {"by": "odds"}}, {"add_bias": 0.25})
     manifest(
-        root, "rollout", {"rollout": asdict(RolloutSettings())}, {"rollouts": 4}, [played]
+        root,
+        "rollout",
+        {"rollout": asdict(RolloutSettings())},
+        {"rollouts": 4, "device": "cuda"},
+        [played],
     )
     return inputs
 
@@ -391,6 +398,15 @@ def test_machines_and_times_stand_on_a_page_beside_the_report(written):
     for words in ("A CPU", "A GPU", "31.40", "2026-01-01T00:00:00+00:00"):
         assert words in page
     assert re.search(r"ingest</td>.*?5.0000</td><td>5.0000</td><td>2.5000", page)
+
+
+def test_the_type_of_device_is_in_the_report_and_its_name_on_the_page_beside_it(written):
+    counts = written[1]["tables/counts.csv"].splitlines()
+    page = written[1]["run/passport.html"]
+
+    assert "rollout: device,cuda" in counts
+    assert "NVIDIA &lt;H100&gt; 80GB HBM3, TF32" in page
+    assert not [name for name in written[1] if "H100" in written[1][name]][1:]
 
 
 def test_the_lowest_rollouts_are_linked_to_pages_that_play_them(written):

@@ -75,6 +75,8 @@ def test_a_run_leaves_weights_their_page_and_their_log(whole):
     assert report["weights"] == read_description(folder)["weights"]
     assert report["validation"]["total"] > 0
     assert report["run"]["processes"] == 1
+    assert report["device"] == "cpu"
+    assert report["run"]["device"].startswith("CPU, ")
     assert report["run"]["scenes_per_s"] > 0
 
 
