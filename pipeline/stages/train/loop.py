@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from signal import SIGTERM
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from infgen.model.batching.perturbation import Perturbation, make_perturbation
@@ -149,9 +150,18 @@ def _run_steps(
 def _step(
     optimizer_step: OptimizerStep, recipe: Recipe, parts: list[Any], step: int
 ) -> StepResult:
-    """Do a step; if its loss is not finite, say of which scenes."""
+    """Do a step; say which scenes have a loss that is not finite, or too much memory."""
     try:
         return optimizer_step.step(parts, recipe.own, step)
+    except torch.OutOfMemoryError as error:
+        most = max(len(part.scenario_ids) for part in parts)
+        why = str(error).splitlines()[0]
+        raise TrainingError(
+            f"step {step}: out of memory with {most} scenes at once; the steps before are "
+            "saved. Free memory and run again, or begin anew with a larger "
+            "train.gradient_accumulation (the batch in smaller parts, with the same "
+            f"gradient) or a smaller train.batch_scenes: {why}"
+        ) from error
     except NotFiniteError as error:
         bad = error.parts or range(recipe.parts)
         rows = [row for part in bad for row in recipe.rows(step, part)]
