@@ -64,12 +64,17 @@ def dropout_factors(like: Tensor, share: float) -> Tensor:
     """Draw 0 for about a share of the places, else what makes up for the zeros.
 
     One random byte decides a place, an eighth of the numbers that a draw for each would
-    take; so the share is rounded to 1/256.
+    take; so the share is rounded to 1/256. A GPU draws as fast as it writes, with fewer
+    launches. Factors are of the precision of the features, which so keep theirs.
     """
     cut = round(share * 256)
+    if like.device.type != "cpu":
+        kept = 1 - cut / 256
+        return torch.empty_like(like).bernoulli_(kept).div_(kept)
     words = torch.empty(-(-like.numel() // 8), dtype=torch.int64, device=like.device)
     drawn = words.random_(-(1 << 63), None).view(torch.uint8)[: like.numel()]
-    return (drawn.view(like.shape) >= cut).float().div_(1 - cut / 256)
+    factors = (drawn.view(like.shape) >= cut).float().div_(1 - cut / 256)
+    return factors.to(like.dtype)
 
 
 class Dropout(nn.Module):

@@ -175,6 +175,8 @@ def _back_to_rows(pull: Tensor, nodes: Tensor, shares: Tensor, rows: int) -> Ten
 
     The same sum the other way round: every row of the table collects those it was part of.
     """
+    if pull.device.type != "cpu":
+        return _back_in_segments(pull, nodes, shares, rows)
     ordered, order = nodes.flatten().sort(stable=True)
     ends = torch.arange(rows, device=nodes.device)
     return functional.embedding_bag(
@@ -184,6 +186,25 @@ def _back_to_rows(pull: Tensor, nodes: Tensor, shares: Tensor, rows: int) -> Ten
         mode="sum",
         per_sample_weights=shares.flatten()[order],
     )
+
+
+def _back_in_segments(pull: Tensor, nodes: Tensor, shares: Tensor, rows: int) -> Tensor:
+    """The same sum for a GPU, where one thread would add up all of a row's pairs in turn.
+
+    Thousands of pairs share the hottest row. The gradient of an embedding cuts such rows
+    into segments, in a fixed order. Each scalar lies between a node and the next one.
+    """
+    scalars = nodes.shape[1] // 2
+    pairs = shares.view(-1, 2, scalars)
+    found = pull.new_zeros((rows, pull.shape[1]))
+    for scalar in range(scalars):
+        both = (pull[:, None] * pairs[..., scalar, None]).flatten(1)  # [N, 2 D]
+        lower, upper = torch.ops.aten.embedding_dense_backward(
+            both, nodes[:, scalar], rows, -1, False
+        ).chunk(2, dim=1)
+        found += lower
+        found[1:] += upper[:-1]
+    return found
 
 
 def _through_norm(pull: Tensor, normal: Tensor) -> Tensor:

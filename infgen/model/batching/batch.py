@@ -126,6 +126,13 @@ class MapTokens:
     follows: Bool[Tensor, "scene road"]
     picked: Bool[Tensor, "scene road"]
 
+    @property
+    def predicted(self) -> Bool[Tensor, "scene road"]:
+        """Which are predicted: those hidden whose predecessor is not."""
+        wanted = self.real & self.picked & self.follows
+        wanted[:, 1:] &= ~self.picked[:, :-1]
+        return wanted
+
 
 @dataclass(frozen=True, slots=True)
 class Insertions:
