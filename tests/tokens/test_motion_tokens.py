@@ -63,7 +63,9 @@ def test_the_nearest_move_is_the_one_that_measuring_all_corners_finds(seed, stra
     st.sampled_from([0.01, 3.0, 300.0]),
 )
 @settings(deadline=None)
-def test_the_token_of_a_rank_is_the_one_that_measuring_all_corners_finds(seed, count, stray):
+def test_the_token_of_a_rank_is_the_one_that_measuring_all_corners_finds(
+    seed, count, stray
+):
     rng = np.random.default_rng(seed)
     vocabulary = random_codebook(rng)
     rows = 20

@@ -247,9 +247,7 @@ def collate(
         windows = [each.window for each in begun]
         chances = [each.chance for each in begun]
         strays = perturb(windows, noise, make_grid(limits.grid), chances)
-        begun = [
-            each._replace(window=w) for each, w in zip(begun, strays, strict=True)
-        ]
+        begun = [each._replace(window=w) for each, w in zip(begun, strays, strict=True)]
     scenes = [_arrays(each, limits, draw, noise) for each in begun]
     return Batch(
         scenario_ids=tuple(record.scenario_id for record in records),

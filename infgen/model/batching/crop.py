@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float32, Int8, Int16, Int64, UInt8
 
 from infgen.model.batching.perturbation import (
     LoggedMotion,
-    PerturbedMotion,
     Perturbation,
+    PerturbedMotion,
     perturb_scenes,
 )
 from infgen.tokens.grid import Grid, encode_cell, to_grid

@@ -121,13 +121,14 @@ def train_batches(
             nothing to start, and hands batches over for nothing.
     """
     if workers:
-        made = _made_by_processes(recipe, steps, workers)
+        made = made_by_processes(recipe, steps, workers)
     else:
         made = map(recipe.__getitem__, steps)
     yield from _prefetched(map(_pin, made))
 
 
-def _made_by_processes(recipe: Recipe, steps: range, workers: int) -> Iterator[list[Made]]:
+def made_by_processes(recipe: Recipe, steps: range, workers: int) -> Iterator[list[Made]]:
+    """Make the batches of some steps in processes of their own."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])  # Torch is imported once, not by each.
     loader = DataLoader(

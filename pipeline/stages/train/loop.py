@@ -21,6 +21,8 @@ from pipeline.stages.train.setup import TrainingError, TrainingSetup, repeatable
 from pipeline.stages.train.validation import validate
 from pipeline.storage.checkpoint import TrainingState, load_checkpoint
 
+WORKERS_OF_A_GPU = 2
+
 
 @dataclass(frozen=True, slots=True)
 class Trained:
@@ -126,7 +128,8 @@ def _run_steps(
     steps = range(first, setup.train.steps)
     stop: Stopped | None = None
     try:
-        with closing(train_batches(recipe, steps, setup.train.loader_workers)) as batches:
+        workers = _loader_workers(setup.train.loader_workers, group.device)
+        with closing(train_batches(recipe, steps, workers)) as batches:
             for step, parts in zip(steps, batches, strict=True):
                 if group.any(stop is not None or signals.pending_signal() > 0):
                     stop = stop or Stopped(signals.pending_signal() or SIGTERM)
@@ -145,6 +148,13 @@ def _run_steps(
         if run is not None:
             run.recorder.save()
         raise stop
+
+
+def _loader_workers(asked: int | None, device: torch.device) -> int:
+    """Processes that prepare batches."""
+    if asked is not None:
+        return asked
+    return 0 if device.type == "cpu" else WORKERS_OF_A_GPU
 
 
 def _step(

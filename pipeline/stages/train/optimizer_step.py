@@ -112,7 +112,7 @@ class OptimizerStep:
             PeerError: if another process is gone. In both cases the weights are as before.
         """
         training, settings = self._training, self._settings
-        network = training.network.train()
+        training.network.train()
         batches = [self._prepared(part) for part in parts]
         weights = [supervised(each.batch, settings) for each in batches]
         weight = torch.stack(weights).sum(dim=0)

@@ -150,7 +150,7 @@ def test_poses_follow_moves_and_labels_are_the_nearest_moves(seed, few):
     vocabulary = straight_moves()
     noise = noise_of(vocabulary, few)
     drives = random_drives(vocabulary, seed)
-    agent_type, pose, motion_token, moving = drives
+    agent_type, pose, _, moving = drives
 
     strays = stray(drives, noise, seed)
 
