@@ -5,7 +5,7 @@ of relations, H heads, C width of one head, F scalars, P nodes of a table.
 """
 
 import math
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -88,6 +88,9 @@ class Dropout(nn.Module):
         """Drop features of any shape."""
         if not (self.training and self.share):
             return x
+        if x.device.type != "cpu":
+            found: Tensor = torch.native_dropout(x, round(self.share * 256) / 256, True)[0]
+            return found
         return x * dropout_factors(x, self.share)
 
 
@@ -206,6 +209,7 @@ class Attention(nn.Module):
             nn.LayerNorm(width),
         )
         self._kept_fold: tuple[Hashable, _Folded] | None = None
+        self.fused: Callable[[Tensor, AttentionSources], Tensor] | None = None
 
     def train(self, mode: bool = True) -> "Attention":
         """Switch between training and evaluation; forget what was made of the weights."""
@@ -214,6 +218,8 @@ class Attention(nn.Module):
 
     def forward(self, target: Tensor, seen: AttentionSources) -> Tensor:
         """Update targets [N, D], or [N, S, D] whose slots share their neighbours."""
+        if self.fused is not None:
+            return self.fused(target, seen)
         slots = target if target.dim() == 3 else target[:, None]
         present = seen.present if seen.present.dim() == 3 else seen.present[:, None]
         normal = self.norm_target(slots)

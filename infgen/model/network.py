@@ -11,6 +11,7 @@ from infgen.model.agents import AgentContext, AgentEmbedding, AgentRows, MotionS
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.batching.index import BatchIndex
 from infgen.model.cell_features import CellSources
+from infgen.model.fused.together import launched_together
 from infgen.model.insertion import CellStack, DetailStack
 from infgen.model.layers import initialise, normed
 from infgen.model.logits import (
@@ -103,6 +104,14 @@ class Network(nn.Module):
                 are predicted in a pass of their own.
             index: Which places of the batch hold something, if that is known already.
         """
+        with launched_together(
+            self, together=self.training and batch.agents.pose.device.type != "cpu"
+        ):
+            return self._outputs(batch, hidden_roads, index)
+
+    def _outputs(
+        self, batch: Batch, hidden_roads: bool, index: BatchIndex | None
+    ) -> Outputs:
         of_map = None if index is None else index.roads
         sight = self.roads.look(batch.roads, of_map)
         covered = sight.covered(batch.roads) if hidden_roads else sight

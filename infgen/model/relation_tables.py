@@ -64,12 +64,16 @@ class RelationEmbedding(FourierEmbedding):
             ("starts", starts),
         ):
             self.register_buffer(name, values, persistent=False)
+        self.evaluated: Tensor | None = None
+        self._padded: dict[tuple[int, int, torch.device], Tensor] = {}
 
     def table(self) -> Tensor:
         """Evaluate all scalars at their nodes: [P, D], one scalar after the other.
 
         In float32 also under autocast, as ``look_up``: geometry needs its digits.
         """
+        if self.evaluated is not None:  # By ``fused.tables``, for all embeddings at once.
+            return self.evaluated
         with torch.autocast(self.frequency.weight.device.type, enabled=False):
             return torch.cat([self._nodes(i, span) for i, span in enumerate(self.spans)])
 
@@ -81,6 +85,16 @@ class RelationEmbedding(FourierEmbedding):
             return values
         middle = (values[:1] + values[-1:]) / 2
         return torch.cat([middle, values[1:-1], middle])
+
+    def padded_nodes(self, number: int, count: int) -> Tensor:
+        """Where the nodes of a scalar are [count], the last one repeated; made once."""
+        key = number, count, self.frequency.weight.device
+        if key not in self._padded:
+            span = self.spans[number]
+            at = torch.linspace(span.first, span.last, span.nodes)
+            at = functional.pad(at, (0, count - span.nodes), value=span.last)
+            self._padded[key] = at.to(key[2])
+        return self._padded[key]
 
     def look_up(self, values: Tensor, table_PD: Tensor) -> Tensor:
         """Embed relations [N, K, F] by a table: normed features [N, K, D]."""
