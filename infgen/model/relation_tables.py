@@ -18,6 +18,8 @@ from infgen.model.layers import FourierEmbedding
 
 NORM_EPS = 1e-5
 """What norms add to a variance, as torch's do."""
+SUM = 0
+"""Of bags of embeddings: torch's number of the mode."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,26 +151,50 @@ class _LookUp(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, pull: Tensor) -> tuple[Tensor | None, ...]:
         nodes, shares, table_PD, gain, shift, weight, found, scale = ctx.saved_tensors
+        learned = table_PD, gain, shift, weight
+
+        def pulled(part: slice) -> tuple[Tensor, ...]:
+            """Gradients before the linear layer, and what is summed up within it."""
+            to_raw = _through_norm(pull[part], found[part]).mul_(scale[part])
+            return to_raw, *_through_rows(to_raw, nodes[part], shares[part], *learned)
+
+        if nodes.device.type != "cpu":  # All at once.
+            to_raw, hidden, to_summed, gains, shifts = pulled(slice(None))
+            table = _back_in_segments(to_summed, nodes, shares, len(table_PD))
+            return None, None, table, gains, shifts, to_raw.T @ hidden, to_raw.sum(dim=0)
         table, gains, shifts, weights, biases = (
-            torch.zeros_like(like) for like in (table_PD, gain, shift, weight, shift)
+            torch.zeros_like(like) for like in (*learned, shift)
         )
         for part in _parts(nodes, table_PD):
-            summed = _weighted_rows(table_PD, nodes[part], shares[part])
-            normal, mean, spread = torch.native_layer_norm(
-                summed, gain.shape, gain, shift, NORM_EPS
-            )
-            hidden = normal.relu()
-            to_raw = _through_norm(pull[part], found[part]).mul_(scale[part])
+            to_raw, hidden, to_summed, to_gain, to_shift = pulled(part)
             weights.addmm_(to_raw.T, hidden)
             biases += to_raw.sum(dim=0)
-            to_normal = (to_raw @ weight).mul_(hidden > 0)
-            to_summed, to_gain, to_shift = torch.ops.aten.native_layer_norm_backward(
-                to_normal, summed, gain.shape, mean, spread, gain, shift, [True] * 3
-            )
             gains += to_gain
             shifts += to_shift
             table += _back_to_rows(to_summed, nodes[part], shares[part], len(table))
         return None, None, table, gains, shifts, weights, biases
+
+
+def _through_rows(
+    to_raw: Tensor,
+    nodes: Tensor,
+    shares: Tensor,
+    table_PD: Tensor,
+    gain: Tensor,
+    shift: Tensor,
+    weight: Tensor,
+) -> tuple[Tensor, ...]:
+    """Pull a gradient back to before the first norm; what was hidden comes first."""
+    summed = _weighted_rows(table_PD, nodes, shares)
+    normal, mean, spread = torch.native_layer_norm(
+        summed, gain.shape, gain, shift, NORM_EPS
+    )
+    hidden = normal.relu()
+    to_normal = (to_raw @ weight).mul_(hidden > 0)
+    back = torch.ops.aten.native_layer_norm_backward(
+        to_normal, summed, gain.shape, mean, spread, gain, shift, [True] * 3
+    )
+    return hidden, *back
 
 
 def _parts(nodes: Tensor, table_PD: Tensor) -> list[slice]:
@@ -189,8 +215,6 @@ def _back_to_rows(pull: Tensor, nodes: Tensor, shares: Tensor, rows: int) -> Ten
 
     The same sum the other way round: every row of the table collects those it was part of.
     """
-    if pull.device.type != "cpu":
-        return _back_in_segments(pull, nodes, shares, rows)
     ordered, order = nodes.flatten().sort(stable=True)
     ends = torch.arange(rows, device=nodes.device)
     return functional.embedding_bag(
@@ -205,20 +229,16 @@ def _back_to_rows(pull: Tensor, nodes: Tensor, shares: Tensor, rows: int) -> Ten
 def _back_in_segments(pull: Tensor, nodes: Tensor, shares: Tensor, rows: int) -> Tensor:
     """The same sum for a GPU, where one thread would add up all of a row's pairs in turn.
 
-    Thousands of pairs share the hottest row. The gradient of an embedding cuts such rows
-    into segments, in a fixed order. Each scalar lies between a node and the next one.
+    Thousands of pairs share the hottest row. The gradient of a bag of embeddings cuts such
+    rows into segments, in a fixed order.
     """
-    scalars = nodes.shape[1] // 2
-    pairs = shares.view(-1, 2, scalars)
-    found = pull.new_zeros((rows, pull.shape[1]))
-    for scalar in range(scalars):
-        both = (pull[:, None] * pairs[..., scalar, None]).flatten(1)  # [N, 2 D]
-        lower, upper = torch.ops.aten.embedding_dense_backward(
-            both, nodes[:, scalar], rows, -1, False
-        ).chunk(2, dim=1)
-        found += lower
-        found[1:] += upper[:-1]
-    return found
+    count, each = nodes.shape
+    bag = torch.arange(count * each, device=nodes.device) // each
+    sizes, most = nodes.new_full((count,), each), nodes.new_empty(0)
+    table: Tensor = torch.ops.aten._embedding_bag_dense_backward(
+        *(pull, nodes.flatten(), bag, sizes, most, rows, False, SUM, shares.flatten(), -1)
+    )
+    return table
 
 
 def _through_norm(pull: Tensor, normal: Tensor) -> Tensor:

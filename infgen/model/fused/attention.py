@@ -34,10 +34,14 @@ class Folded(NamedTuple):
     Attributes:
         query: From a head of a query to features and relations [H, C, D + R].
         value: From what a query sees to a head of its value [H, E, C].
+        gate: From what a target saw and is to its gate and itself [2 D, 2 D] ...
+        gate_bias: ... and their biases.
     """
 
     query: Tensor
     value: Tensor
+    gate: Tensor
+    gate_bias: Tensor
 
 
 @contextmanager
@@ -74,12 +78,17 @@ def _fold(blocks: Sequence[Attention]) -> list[Folded]:
         torch.cat([value * gain[:, None], bias], dim=2), (0, ALIGNED - 1)
     )
     shape = (len(blocks), heads, width // heads, -1)
-    pairs = zip(
-        (query * scaled[:, None]).view(shape).unbind(),
-        value.view(shape).mT.unbind(),
-        strict=True,
+    gate = torch.stack([block.gate.weight for block in blocks])
+    itself = functional.pad(
+        torch.stack([block.itself.weight for block in blocks]), (width, 0)
     )
-    return [Folded(*pair) for pair in pairs]
+    parts = (
+        (query * scaled[:, None]).view(shape),
+        value.view(shape).mT,
+        torch.cat([gate, itself], dim=1),
+        torch.stack([torch.cat([b.gate.bias, b.itself.bias]) for b in blocks]),
+    )
+    return [Folded(*each) for each in zip(*(x.unbind() for x in parts), strict=True)]
 
 
 def attend(
@@ -89,11 +98,43 @@ def attend(
     slots = target if target.dim() == 3 else target[:, None]
     normal = block.norm_target(slots)
     looked = _look(block, folded, normal, seen)
-    gate = torch.sigmoid(block.gate(torch.cat([looked, normal], dim=-1)))
-    update = torch.lerp(looked, block.itself(normal), gate)
+    update = _Gate.apply(  # type: ignore[no-untyped-call]
+        looked.flatten(0, 1), normal.flatten(0, 1), folded.gate, folded.gate_bias
+    ).view_as(slots)
     slots = slots + block.norm_out(block.out(update))
     slots = slots + block.feed_forward(slots)
     return slots.view_as(target)
+
+
+class _Gate(torch.autograd.Function):
+    """Between what targets saw [N, D] and what they are themselves, as a gate says."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, looked: Tensor, normal: Tensor, weight: Tensor, bias: Tensor
+    ) -> Tensor:
+        kind = looked.dtype
+        both = torch.cat([looked, normal.to(kind)], dim=1)
+        weight = weight.to(kind)
+        gate, itself = torch.addmm(bias.to(kind), both, weight.T).chunk(2, dim=1)
+        gate = gate.sigmoid()
+        ctx.save_for_backward(both, weight, gate, itself)
+        return torch.lerp(looked, itself, gate)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, pull: Tensor) -> tuple[Tensor, ...]:
+        both, weight, gate, itself = ctx.saved_tensors
+        width = pull.shape[1]
+        through = pull.new_empty((len(pull), 2 * width))
+        torch.mul(pull, gate, out=through[:, width:])
+        opened = (itself - both[:, :width]).mul_(pull)
+        torch.ops.aten.sigmoid_backward(opened, gate, grad_input=through[:, :width])
+        to_both = through @ weight
+        to_both[:, :width] += pull
+        to_both[:, :width] -= through[:, width:]
+        to_looked, to_normal = to_both.chunk(2, dim=1)
+        return to_looked, to_normal, through.T @ both, through.sum(dim=0)
 
 
 def _look(
