@@ -26,6 +26,8 @@ from infgen.model.neighbour_attention import HIDDEN_SCORE, Shared
 
 ALIGNED = 8
 """Columns that hold the sum of the weights, and zeros."""
+FULL_BYTES = 4
+"""Of a float32; numbers of fewer bytes are products only."""
 
 
 class Folded(NamedTuple):
@@ -252,7 +254,7 @@ def _products(by_both: Tensor, near: Tensor, relation: Tensor, more: Tensor) -> 
     """Products of queries with features and relations, and more: float32 [N, Q, K]."""
     width = near.shape[2]
     one, other = by_both[..., :width], by_both[..., width:]
-    if near.dtype == torch.float32:
+    if near.dtype.itemsize >= FULL_BYTES:
         wide = more.expand(*one.shape[:2], near.shape[1])
         return torch.baddbmm(wide, one, near.mT).baddbmm_(other, relation.mT)
     return (torch.bmm(one, near.mT) + more.float()).add_(torch.bmm(other, relation.mT))
@@ -260,9 +262,11 @@ def _products(by_both: Tensor, near: Tensor, relation: Tensor, more: Tensor) -> 
 
 def _add_products(pulled: Any, pair: Tensor, queries: Tensor) -> None:
     """Add products [N, K, R] to a sum in float32."""
+    full = pair.dtype.itemsize >= FULL_BYTES
     if pulled.tensor is None:
-        pulled.tensor = torch.bmm(pair, queries).float()
-    elif pair.dtype == torch.float32:
+        found = torch.bmm(pair, queries)
+        pulled.tensor = found if full else found.float()
+    elif full:
         pulled.tensor.baddbmm_(pair, queries)
     else:
         pulled.tensor.add_(torch.bmm(pair, queries))

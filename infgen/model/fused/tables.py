@@ -70,23 +70,24 @@ def _tables(embeddings: Sequence[RelationEmbedding]) -> list[Tensor]:
 def _evaluate(scalars: Sequence[_Scalar]) -> Tensor:
     """Values [scalar, node, D] at the nodes; what is beyond a scalar's nodes is padding."""
     most = max(scalar.nodes for scalar in scalars)
-    heads = [scalar.embedding.scalars[scalar.number] for scalar in scalars]
+    heads = [list(each.embedding.scalars[each.number].children()) for each in scalars]
     at = torch.stack([s.embedding.padded_nodes(s.number, most) for s in scalars])
     frequency = torch.stack([s.embedding.frequency.weight[s.number] for s in scalars])
     phase = (2 * math.pi * at[..., None]) * frequency[:, None]
     waves = torch.cat([phase.cos(), phase.sin(), at[..., None]], dim=-1)
-    hidden = _linear([head[0] for head in heads], waves)
+    first, norm, _, last = zip(*heads, strict=True)
+    hidden = _linear(first, waves)
     normal = functional.layer_norm(hidden, hidden.shape[-1:])
-    gain = torch.stack([head[1].weight for head in heads])[:, None]
-    shift = torch.stack([head[1].bias for head in heads])[:, None]
-    values = _linear([head[3] for head in heads], torch.addcmul(shift, normal, gain).relu())
+    gain = torch.stack([each.get_parameter("weight") for each in norm])[:, None]
+    shift = torch.stack([each.get_parameter("bias") for each in norm])[:, None]
+    values = _linear(last, torch.addcmul(shift, normal, gain).relu())
     if not scalars[0].closed:
         return values
     middle = (values[:, :1] + values[:, -1:]) / 2
     return torch.cat([middle, values[:, 1:-1], middle], dim=1)
 
 
-def _linear(layers: Sequence[nn.Linear], values: Tensor) -> Tensor:
-    weight = torch.stack([layer.weight for layer in layers])
-    bias = torch.stack([layer.bias for layer in layers])
+def _linear(layers: Sequence[nn.Module], values: Tensor) -> Tensor:
+    weight = torch.stack([layer.get_parameter("weight") for layer in layers])
+    bias = torch.stack([layer.get_parameter("bias") for layer in layers])
     return torch.baddbmm(bias[:, None], values, weight.mT)

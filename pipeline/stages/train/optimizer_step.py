@@ -87,14 +87,15 @@ class OptimizerStep:
         self.forward = Pass(training.network, settings)
         self._parameters = parameters = list(training.network.parameters())
         sizes = [p.numel() for p in parameters]
-        tail = (len(TERMS) * len(FIGURES), 2, parts)
+        tail = [len(TERMS) * len(FIGURES), 2, parts]
         self._sums = parameters[0].new_zeros(sum(sizes) + sum(tail))
         self._gradient, self._figures = torch.split(self._sums, [sum(sizes), sum(tail)])
         terms, self._surprise, self._bad = torch.split(self._figures, tail)
         self._terms = terms.view(len(TERMS), len(FIGURES))
-        own = torch.split(self._gradient, sizes)
-        for parameter, part in zip(parameters, own, strict=True):
-            parameter.grad = part.view_as(parameter)
+        cut = zip(torch.split(self._gradient, sizes), parameters, strict=True)
+        self._own = [part.view_as(parameter) for part, parameter in cut]
+        for parameter, own in zip(parameters, self._own, strict=True):
+            parameter.grad = own
         self._on_cpu = self._sums.device.type == "cpu"
 
     def step(
@@ -161,12 +162,13 @@ class OptimizerStep:
             loss.backward()  # type: ignore[no-untyped-call]
             return
         found = torch.autograd.grad(loss, self._parameters, allow_unused=True)
-        pairs = [
-            (parameter.grad, gradient)
-            for parameter, gradient in zip(self._parameters, found, strict=True)
-            if gradient is not None
-        ]
-        torch._foreach_add_([sums for sums, _ in pairs], [each for _, each in pairs])
+        sums: list[Tensor] = []
+        more: list[Tensor] = []
+        for own, gradient in zip(self._own, found, strict=True):
+            if gradient is not None:
+                sums.append(own)
+                more.append(gradient)
+        torch._foreach_add_(sums, more)
 
     def _clip(self) -> Tensor:
         """Clip the gradient; return its norm before that."""
