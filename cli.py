@@ -46,7 +46,13 @@ from pipeline.settings.request import OWN_FILE, find_file, named_weights
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
 from pipeline.stages.train.launch import run as run_command
 
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+ENVIRONMENT = {
+    # One thread each: results then do not depend on the worker.
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+    "CUBLAS_WORKSPACE_CONFIG": ":4096:8",  # Equal runs on a GPU give equal bits.
+    "TORCH_NCCL_BLOCKING_WAIT": "1",  # A lost process is an error, not the end of all.
+}
+"""Variables that are set unless they are set already; some are read but once."""
 
 FIRST_STEP = """\
 To begin with: `infgen demo` runs every stage on built-in records, in minutes.
@@ -358,8 +364,8 @@ app.add_typer(tools.app)
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command; a known error is one line and an exit code."""
-    for name in THREADS:  # One thread each: results then do not depend on the worker.
-        os.environ.setdefault(name, "1")
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     words = sys.argv[1:] if arguments is None else arguments
     try:
         run_command(lambda: app(args=arguments), os.environ)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from infgen.model.batching.batch import MapTokens
+from infgen.model.batching.index import MapIndex
 from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.map_grid import MapGrid
 from infgen.model.neighbours import MapFeatures, NeighbourRows, NeighbourSpec, SignalStates
@@ -20,11 +21,19 @@ from infgen.tokens.vocabulary import MapVocabulary
 
 @dataclass(frozen=True, slots=True)
 class MapContext:
-    """Neighbours of map tokens: the rows, and the neighbours of each."""
+    """Neighbours of map tokens.
+
+    Attributes:
+        rows: The map tokens.
+        neighbours: Those of each.
+        grid: The map tokens by where they are.
+        index: All places of the maps, if they are known already.
+    """
 
     rows: Rows
     neighbours: NeighbourRows
     grid: MapGrid
+    index: MapIndex | None = None
 
     def covered(self, roads: MapTokens) -> "MapContext":
         """Exclude hidden tokens as sources: their positions would reveal them."""
@@ -58,9 +67,12 @@ class MapEncoder(nn.Module):
         )
         self.next_token = mlp(width, width, vocabulary.num_map_tokens)
 
-    def look(self, roads: MapTokens) -> MapContext:
-        """Find the neighbours of all map tokens."""
-        rows, grid = Rows.where(roads.real), MapGrid.of(roads.pose, roads.real)
+    def look(self, roads: MapTokens, index: MapIndex | None = None) -> MapContext:
+        """Find the neighbours of all map tokens; ``index`` if it is known already."""
+        if index is None:
+            rows, grid = Rows.where(roads.real), MapGrid.of(roads.pose, roads.real)
+        else:
+            rows, grid = index.rows, index.grid
         reach = NeighbourSpec.of(self.radius_m, self.neighbours, self.relation)
         pose, count = rows.pack(roads.pose), roads.real.shape[1]
         scene = rows.at // max(1, count)
@@ -74,7 +86,7 @@ class MapEncoder(nn.Module):
             present=present,
             place=place,
         )
-        return MapContext(rows, neighbours, grid)
+        return MapContext(rows, neighbours, grid, index)
 
     def forward(self, roads: MapTokens, sight: MapContext) -> MapFeatures:
         """Encode every map token."""
@@ -84,15 +96,17 @@ class MapEncoder(nn.Module):
             x = block(x, neighbours.seen(normed(x)))
         rows, features, signal_states = sight.rows, normed(x), None
         if self.signals_each_step:
-            looks, signal_states = self._signal_states(roads, rows, x)
+            looks, signal_states = self._signal_states(roads, sight, x)
             features = torch.cat([features, looks])
-        lines = StopLines.of(roads) if self.stop_lines else None
+        lines = None
+        if self.stop_lines:
+            lines = StopLines.of(roads) if sight.index is None else sight.index.lines
         return MapFeatures(
             rows, features, roads.pose, roads.real, sight.grid, signal_states, lines
         )
 
     def predict_hidden(
-        self, roads: MapTokens, covered: MapFeatures
+        self, roads: MapTokens, covered: MapFeatures, index: MapIndex | None = None
     ) -> tuple[Tensor, Tensor]:
         """Predict hidden map tokens from their predecessors, which did not see them.
 
@@ -101,12 +115,15 @@ class MapEncoder(nn.Module):
         Args:
             roads: The maps.
             covered: Features of a pass in which hidden tokens were not seen.
+            index: Their places, if they are known already.
 
         Returns:
             Logits [prediction, token] and the true tokens [prediction].
         """
-        wanted = roads.real & roads.picked & roads.follows
-        wanted[:, 1:] &= ~roads.picked[:, :-1]
+        if index is not None:
+            logits = self.next_token(gather(covered.features, index.before))
+            return logits, roads.token.flatten()[index.hidden]
+        wanted = roads.predicted
         before = covered.rows.number.roll(1, dims=1)[wanted]
         return self.next_token(covered.features[before]), roads.token[wanted]
 
@@ -121,12 +138,15 @@ class MapEncoder(nn.Module):
         return embedded + self.signal(rows.pack(roads.signal))
 
     def _signal_states(
-        self, roads: MapTokens, rows: Rows, x: Tensor
+        self, roads: MapTokens, sight: MapContext, x: Tensor
     ) -> tuple[Tensor, SignalStates]:
         """Say what map tokens with a light look like under each class of it."""
-        lit = rows.pack(roads.light).nonzero()[:, 0]
+        if sight.index is None:
+            lit = sight.rows.pack(roads.light).nonzero()[:, 0]
+        else:
+            lit = sight.index.lit
         looks = normed(x[lit, None] + self.signal.weight)  # [lit, class, D]
-        first = torch.zeros_like(rows.at)
+        first = torch.zeros_like(sight.rows.at)
         behind = torch.arange(len(lit), device=x.device) * looks.shape[1]
         first[lit] = len(x) + behind
         return looks.flatten(0, 1), SignalStates(first, roads.light, roads.shown)

@@ -61,6 +61,11 @@ class MapGrid:
         ordered_m = xy_m.gather(1, order[..., None].expand_as(xy_m))
         return cls(corner_m, (columns, rows), start, order, ordered_m)
 
+    def measure(self, squares: int) -> None:
+        """Find the most tokens of up to so many consecutive squares, on the host."""
+        for each in range(1, squares + 1):
+            self._most_held(each)
+
     @torch.no_grad()
     def nearest(
         self,
@@ -141,6 +146,9 @@ class MapGrid:
         """
         if length.device.type == "cpu":
             return max(1, int(length.max())) if length.numel() else 1
+        return self._most_held(squares)
+
+    def _most_held(self, squares: int) -> int:
         if squares not in self.longest:
             ends = self.start[:, min(squares, self.start.shape[1] - 1) :]
             held = ends - self.start[:, : ends.shape[1]]

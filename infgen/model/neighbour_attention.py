@@ -38,12 +38,14 @@ class Shared:
             through it, so their gradients are complete when its own arrives.
         pulled: Where layers add their gradients to.
         copies: The values in other precisions, made on first use.
+        covers: Who is present, and what hides the others: of ``fused.attention``.
     """
 
     values: Tensor
     ticket: Tensor
     pulled: "_Sum"
     copies: dict[torch.dtype, Tensor] = field(default_factory=dict)
+    covers: tuple[Tensor, Tensor, Tensor] | None = None
 
     @classmethod
     def of(cls, tensor: Tensor) -> "Shared":

@@ -9,7 +9,9 @@ from torch.nn import functional
 from infgen.clock import CLOCK
 from infgen.model.agents import AgentContext, AgentEmbedding, AgentRows, MotionStack
 from infgen.model.batching.batch import Agents, Batch
+from infgen.model.batching.index import BatchIndex
 from infgen.model.cell_features import CellSources
+from infgen.model.fused.together import launched_together
 from infgen.model.insertion import CellStack, DetailStack
 from infgen.model.layers import initialise, normed
 from infgen.model.logits import (
@@ -86,7 +88,13 @@ class Network(nn.Module):
         names = ("road_curve_m", "road_real")
         return MapVocabulary(*(self.get_buffer(n).numpy(force=True) for n in names))
 
-    def forward(self, batch: Batch, *, hidden_roads: bool = False) -> Outputs:
+    def forward(
+        self,
+        batch: Batch,
+        *,
+        hidden_roads: bool = False,
+        index: BatchIndex | None = None,
+    ) -> Outputs:
         """Compute all logits, every token given the true ones before it.
 
         Args:
@@ -94,22 +102,38 @@ class Network(nn.Module):
             hidden_roads: Also predict hidden map tokens. While training, everyone sees the
                 features of the pass that hides them, as a kind of dropout; otherwise they
                 are predicted in a pass of their own.
+            index: Which places of the batch hold something, if that is known already.
         """
-        sight = self.roads.look(batch.roads)
+        with launched_together(
+            self, together=self.training and batch.agents.pose.device.type != "cpu"
+        ):
+            return self._outputs(batch, hidden_roads, index)
+
+    def _outputs(
+        self, batch: Batch, hidden_roads: bool, index: BatchIndex | None
+    ) -> Outputs:
+        of_map = None if index is None else index.roads
+        sight = self.roads.look(batch.roads, of_map)
         covered = sight.covered(batch.roads) if hidden_roads else sight
         roads = self.roads(batch.roads, covered if self.training else sight)
         agents = batch.agents
-        rows = Rows.where(agents.visible)
+        rows = Rows.where(agents.visible) if index is None else index.visible
+        asked = Rows.where(batch.entries.asked) if index is None else index.asked
+        told = Rows.where(batch.details.present) if index is None else index.described
         x = self.embed(_agent_rows(agents, rows), self.embed.tables())
         raw, cells, details = normed(x), self.cells, self.details
         hidden = None
         if hidden_roads:
             known = roads if self.training else self.roads(batch.roads, covered)
-            hidden = self.roads.predict_hidden(batch.roads, known)
+            hidden = self.roads.predict_hidden(batch.roads, known, of_map)
         return Outputs(
             motion=self._motion(agents, rows, x, roads),
-            entries=None if cells is None else _entries(cells, batch, rows, raw, roads),
-            details=None if details is None else _details(details, batch, rows, raw, roads),
+            entries=None
+            if cells is None
+            else _entries(cells, batch, asked, rows, raw, roads),
+            details=None
+            if details is None
+            else _details(details, batch, told, rows, raw, roads),
             roads=None if hidden is None else MapOutputs(*hidden),
         )
 
@@ -165,11 +189,15 @@ class Network(nn.Module):
 
 
 def _entries(
-    stack: CellStack, batch: Batch, rows: Rows, raw: Tensor, roads: MapFeatures
+    stack: CellStack,
+    batch: Batch,
+    asked: Rows,
+    rows: Rows,
+    raw: Tensor,
+    roads: MapFeatures,
 ) -> InsertionOutputs:
     """Ask for the inserted agents of every token, each slot seeing those before it."""
     agents, entries = batch.agents, batch.entries
-    asked = Rows.where(entries.asked)
     alone = Rows(asked.at, asked.number.flatten()[:, None])
     ego_pose = agents.pose[:, :, EGO]
     around = find_neighbours(
@@ -204,11 +232,15 @@ def _entries(
 
 
 def _details(
-    stack: DetailStack, batch: Batch, rows: Rows, raw: Tensor, roads: MapFeatures
+    stack: DetailStack,
+    batch: Batch,
+    wanted: Rows,
+    rows: Rows,
+    raw: Tensor,
+    roads: MapFeatures,
 ) -> DetailOutputs:
     """Describe agents where they enter, without seeing them."""
     agents, details = batch.agents, batch.details
-    wanted = Rows.where(details.present)
     scene = wanted.at // details.present.shape[1]
     token, cell = wanted.pack(details.token), wanted.pack(details.cell)
     ego_pose = agents.pose[scene, token, EGO]

@@ -19,6 +19,8 @@ NORM_EPS = 1e-5
 """What norms add to a variance, as torch's do."""
 CACHED_NUMBERS = 1 << 18
 """Numbers of relations that are held at once on a CPU: some of its cache."""
+SUM = 0
+"""Of bags of embeddings: torch's number of the mode."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +67,16 @@ class RelationEmbedding(FourierEmbedding):
             ("starts", starts),
         ):
             self.register_buffer(name, values, persistent=False)
+        self.evaluated: Tensor | None = None
+        self._padded: dict[tuple[int, int, torch.device], Tensor] = {}
 
     def table(self) -> Tensor:
         """Evaluate all scalars at their nodes: [P, D], one scalar after the other.
 
         In float32 also under autocast, as ``look_up``: geometry needs its digits.
         """
+        if self.evaluated is not None:  # By ``fused.tables``, for all embeddings at once.
+            return self.evaluated
         with torch.autocast(self.frequency.weight.device.type, enabled=False):
             return torch.cat([self._nodes(i, span) for i, span in enumerate(self.spans)])
 
@@ -82,6 +88,16 @@ class RelationEmbedding(FourierEmbedding):
             return values
         middle = (values[:1] + values[-1:]) / 2
         return torch.cat([middle, values[1:-1], middle])
+
+    def padded_nodes(self, number: int, count: int) -> Tensor:
+        """Where the nodes of a scalar are [count], the last one repeated; made once."""
+        key = number, count, self.frequency.weight.device
+        if key not in self._padded:
+            span = self.spans[number]
+            at = torch.linspace(span.first, span.last, span.nodes)
+            at = functional.pad(at, (0, count - span.nodes), value=span.last)
+            self._padded[key] = at.to(key[2])
+        return self._padded[key]
 
     def look_up(self, values: Tensor, table_PD: Tensor) -> Tensor:
         """Embed relations [N, K, F] by a table: normed features [N, K, D]."""
@@ -136,26 +152,50 @@ class _LookUp(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, pull: Tensor) -> tuple[Tensor | None, ...]:
         nodes, shares, table_PD, gain, shift, weight, found, scale = ctx.saved_tensors
+        learned = table_PD, gain, shift, weight
+
+        def pulled(part: slice) -> tuple[Tensor, ...]:
+            """Gradients before the linear layer, and what is summed up within it."""
+            to_raw = _through_norm(pull[part], found[part]).mul_(scale[part])
+            return to_raw, *_through_rows(to_raw, nodes[part], shares[part], *learned)
+
+        if nodes.device.type != "cpu":  # All at once.
+            to_raw, hidden, to_summed, gains, shifts = pulled(slice(None))
+            table = _back_in_segments(to_summed, nodes, shares, len(table_PD))
+            return None, None, table, gains, shifts, to_raw.T @ hidden, to_raw.sum(dim=0)
         table, gains, shifts, weights, biases = (
-            torch.zeros_like(like) for like in (table_PD, gain, shift, weight, shift)
+            torch.zeros_like(like) for like in (*learned, shift)
         )
         for part in _parts(nodes, table_PD):
-            summed = _weighted_rows(table_PD, nodes[part], shares[part])
-            normal, mean, spread = torch.native_layer_norm(
-                summed, gain.shape, gain, shift, NORM_EPS
-            )
-            hidden = normal.relu()
-            to_raw = _through_norm(pull[part], found[part]).mul_(scale[part])
+            to_raw, hidden, to_summed, to_gain, to_shift = pulled(part)
             weights.addmm_(to_raw.T, hidden)
             biases += to_raw.sum(dim=0)
-            to_normal = (to_raw @ weight).mul_(hidden > 0)
-            to_summed, to_gain, to_shift = torch.ops.aten.native_layer_norm_backward(
-                to_normal, summed, gain.shape, mean, spread, gain, shift, [True] * 3
-            )
             gains += to_gain
             shifts += to_shift
             table += _back_to_rows(to_summed, nodes[part], shares[part], len(table))
         return None, None, table, gains, shifts, weights, biases
+
+
+def _through_rows(
+    to_raw: Tensor,
+    nodes: Tensor,
+    shares: Tensor,
+    table_PD: Tensor,
+    gain: Tensor,
+    shift: Tensor,
+    weight: Tensor,
+) -> tuple[Tensor, ...]:
+    """Pull a gradient back to before the first norm; what was hidden comes first."""
+    summed = _weighted_rows(table_PD, nodes, shares)
+    normal, mean, spread = torch.native_layer_norm(
+        summed, gain.shape, gain, shift, NORM_EPS
+    )
+    hidden = normal.relu()
+    to_normal = (to_raw @ weight).mul_(hidden > 0)
+    back = torch.ops.aten.native_layer_norm_backward(
+        to_normal, summed, gain.shape, mean, spread, gain, shift, [True] * 3
+    )
+    return hidden, *back
 
 
 def _parts(nodes: Tensor, table_PD: Tensor) -> list[slice]:
@@ -185,6 +225,21 @@ def _back_to_rows(pull: Tensor, nodes: Tensor, shares: Tensor, rows: int) -> Ten
         mode="sum",
         per_sample_weights=shares.flatten()[order],
     )
+
+
+def _back_in_segments(pull: Tensor, nodes: Tensor, shares: Tensor, rows: int) -> Tensor:
+    """The same sum for a GPU, where one thread would add up all of a row's pairs in turn.
+
+    Thousands of pairs share the hottest row. The gradient of a bag of embeddings cuts such
+    rows into segments, in a fixed order.
+    """
+    count, each = nodes.shape
+    bag = torch.arange(count * each, device=nodes.device) // each
+    sizes, most = nodes.new_full((count,), each), nodes.new_empty(0)
+    table: Tensor = torch.ops.aten._embedding_bag_dense_backward(
+        *(pull, nodes.flatten(), bag, sizes, most, rows, False, SUM, shares.flatten(), -1)
+    )
+    return table
 
 
 def _through_norm(pull: Tensor, normal: Tensor) -> Tensor:

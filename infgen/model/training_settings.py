@@ -110,8 +110,9 @@ class TrainSettings:
     """Scenes are simulated before they are learned from, with the one of so many most
     likely motion tokens that is nearest to the log (CatK, SPEC 7.1); 0 for scenes as
     logged."""
-    loader_workers: Annotated[Count, NOT_IN_KEY] = 0
-    """Processes that prepare batches; 0 for a thread."""
+    loader_workers: Annotated[Count | None, NOT_IN_KEY] = None
+    """Processes that prepare batches, 0 for a thread; by default two on a GPU, whose
+    launches keep this process busy, and a thread on a CPU."""
     tensorboard: Annotated[Bool, NOT_IN_KEY] = False
     """Whether to write event files for TensorBoard."""
     peer_timeout_s: Annotated[Float, Field(ge=1), NOT_IN_KEY] = 600.0

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int8, Int16
+from jaxtyping import Float32, Float64, Int8, Int16, Int64
 
 from infgen.geometry import box_corners, to_local, to_world
 from infgen.tokens.vocabulary import MotionVocabulary
 
-_BLOCK_ROWS = 4096
-"""Keeps the table of distances (rows x motion tokens) within 32 MiB."""
+_BLOCK_ROWS = 512
+"""Keeps the table of distances (rows x motion tokens) within 4 MiB."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -56,20 +56,24 @@ def make_match_table(vocabulary: MotionVocabulary) -> MatchTable:
     )
 
 
-@lru_cache(maxsize=4)
-def neighbour_tokens(table: MatchTable, count: int) -> Int16[np.ndarray, "3 motion near"]:
-    """Return the motion tokens that end nearest to each, itself (or an equal one) included.
+@lru_cache(maxsize=16)
+def neighbour_reach_m(
+    table: MatchTable, count: int
+) -> Float64[np.ndarray, "3 motion count"]:
+    """Return how far from each motion token's spread those of the nearest few are.
 
     Args:
         table: The motion tokens.
-        count: How many.
+        count: How many, itself (or an equal one) included, nearest first.
     """
-    near = []
-    for weights in table.weights:
-        spread = np.concatenate([weights[:4] / -2, np.ones_like(weights[:1])])
-        gap = spread.T @ weights  # [motion, motion], less the square of the row
-        near.append(np.argpartition(gap, count - 1, axis=1)[:, :count])
-    return np.stack(near).astype(np.int16)
+    found = []
+    for corners_m in table.corners_m:
+        # A quarter of the squared distance of all corners is that of the spreads.
+        square = (corners_m**2).sum(axis=1)
+        gap = square[:, None] + square - 2 * corners_m @ corners_m.T
+        few = np.sort(np.partition(gap, count - 1, axis=1)[:, :count], axis=1)
+        found.append(np.sqrt(few.clip(min=0) / 4) + 1e-5)  # With room for rounding.
+    return np.stack(found)
 
 
 def nearest_motion_tokens(
@@ -89,29 +93,29 @@ def nearest_motion_tokens(
         agent_type: ``AgentType`` of each agent.
         table: The motion tokens to choose from.
     """
-    return nearest_k_motion_tokens(target, pose, agent_type, table, 1)[:, 0]
+    rank = np.zeros(len(agent_type), dtype=np.int64)
+    return ranked_motion_tokens(target, pose, agent_type, rank, table)[0]
 
 
-def nearest_k_motion_tokens(
+def ranked_motion_tokens(
     target: Float32[np.ndarray, "row 3"],
     pose: Float32[np.ndarray, "row 3"],
     agent_type: Int8[np.ndarray, " row"],
+    rank: Int64[np.ndarray, " row"],
     table: MatchTable,
-    count: int,
-) -> Int16[np.ndarray, "row near"]:
-    """Find the ``count`` motion tokens that end nearest to each target, nearest first.
+) -> tuple[Int16[np.ndarray, " row"], Int16[np.ndarray, " row"]]:
+    """Find the motion token that ends nearest to each target, and the one of a rank.
 
-    Distance and arguments are those of ``nearest_motion_tokens``; the vocabulary must hold
-    ``count`` tokens.
+    Distance and arguments are those of ``nearest_motion_tokens``; ``rank`` is the number
+    of motion tokens that are nearer, less than the vocabulary holds.
     """
     order = np.argsort(agent_type, kind="stable")
-    motion_token = np.empty((len(order), count), dtype=np.int16)
-    near = neighbour_tokens(table, count)
+    found = np.empty((2, len(order)), dtype=np.int16)
     for start in range(0, len(order), _BLOCK_ROWS):
         rows = order[start : start + _BLOCK_ROWS]
         wanted = to_local(target[rows], pose[rows])
-        motion_token[rows] = _nearest(wanted, agent_type[rows], table, near)
-    return motion_token
+        found[:, rows] = _ranked(wanted, agent_type[rows], rank[rows], table)
+    return found[0], found[1]
 
 
 def advance(
@@ -143,27 +147,43 @@ def follow(
     return motion_token, advance(pose, agent_type, motion_token, table.vocabulary)
 
 
-def _nearest(
-    wanted: np.ndarray, agent_type: np.ndarray, table: MatchTable, near: np.ndarray
+def _ranked(
+    wanted: np.ndarray, agent_type: np.ndarray, rank: np.ndarray, table: MatchTable
 ) -> np.ndarray:
-    """Return the nearest motion tokens [row, few] of each pose; ``agent_type`` ascends."""
+    """Return motion tokens [2, row], nearest and of a rank; ``agent_type`` ascends."""
     corners_m = _corners(wanted, table.vocabulary.size_lw_m[agent_type])  # [row, 8]
-    row, motion_token = _candidates(wanted, corners_m, agent_type, table, near)
+    row, motion_token = _candidates(wanted, corners_m, agent_type, rank, table)
     gap_m = _mean_gap(table.corners_m[agent_type[row], motion_token], corners_m[row])
 
-    order = np.lexsort([gap_m, row])  # Stable: of equally near ones the first.
-    first = np.searchsorted(row, np.arange(len(wanted)))
-    return motion_token[order[first[:, None] + np.arange(near.shape[2])]]
+    first = np.searchsorted(row, np.arange(len(wanted) + 1))
+    least = np.flatnonzero(gap_m == np.minimum.reduceat(gap_m, first[:-1])[row])
+    nearest = least[np.searchsorted(row[least], np.arange(len(wanted)))]
+    chosen, some = nearest.copy(), np.flatnonzero(rank)
+    if len(some):
+        size = np.diff(first)[some]
+        place = np.arange(size.max())
+        padded_m = np.full((len(some), len(place)), np.inf)
+        there = place < size[:, None]
+        padded_m[there] = gap_m[np.repeat(rank > 0, np.diff(first))]
+        chosen[some] = first[some] + _place_of_rank(padded_m, rank[some])
+    return motion_token[np.stack([nearest, chosen])]
+
+
+def _place_of_rank(values: np.ndarray, rank: np.ndarray) -> np.ndarray:
+    """Return where in each row the value of a rank is; of equal ones the first is less."""
+    value = np.sort(values, axis=1)[np.arange(len(rank)), rank, None]
+    skipped = rank - (values < value).sum(axis=1)
+    return ((values == value).cumsum(axis=1) > skipped[:, None]).argmax(axis=1)
 
 
 def _candidates(
     wanted: np.ndarray,
     corners_m: np.ndarray,
     agent_type: np.ndarray,
+    rank: np.ndarray,
     table: MatchTable,
-    near: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows and motion tokens, ascending, sure to hold each row's nearest few."""
+    """Return rows and motion tokens, ascending, sure to hold those up to a rank."""
     spread = _spread(wanted, table.reach_m[agent_type])
     square = (spread**2).sum(axis=-1)
     spread = np.column_stack([spread, np.ones_like(square)])
@@ -172,17 +192,40 @@ def _candidates(
     for number in np.flatnonzero(np.diff(ends)):
         rows = slice(ends[number], ends[number + 1])
         gap = spread[rows] @ table.weights[number]  # [row, motion], less square
-        guess = near[number, gap.argmin(axis=1)]  # [row, few]
-        guess_m = _mean_gap(table.corners_m[number, guess], corners_m[rows, None])
-        guess_m = guess_m.max(axis=1)
+        guess = gap.argmin(axis=1)
+        most_m = _most_m(corners_m[rows], guess, rank[rows], int(number), table)
 
-        # The nearest few are no farther than any few at most, their spreads 1.42 times.
-        twice = (2 * guess_m**2).astype(np.float32)
+        # Those up to the rank are no farther than that, their spreads 1.42 times.
+        twice = (2 * most_m**2).astype(np.float32)
         # Sixty roundings of a float32, relative to tokens about as long as the one wanted.
         slack = np.float32(5e-6) * (square[rows] + twice)
         flat = np.flatnonzero(gap <= (twice - square[rows] + slack)[:, None])
         found.append(flat + ends[number] * gap.shape[1])
     return np.divmod(np.concatenate(found), table.vocabulary.num_motion_tokens)
+
+
+def _most_m(
+    corners_m: np.ndarray,
+    guess: np.ndarray,
+    rank: np.ndarray,
+    number: int,
+    table: MatchTable,
+) -> np.ndarray:
+    """Return distances that the motion tokens up to a rank do not exceed.
+
+    The guess itself is as far as it is; those around it are, by their spreads, no farther
+    from the target than from the guess and the guess from the target.
+    """
+    ends_m = table.corners_m[number, guess]
+    most_m = _mean_gap(ends_m, corners_m)
+    some = np.flatnonzero(rank)
+    if len(some):
+        count = 1 << int(rank.max()).bit_length()  # A few tables do for all ranks.
+        count = min(count, table.vocabulary.num_motion_tokens)
+        reach_m = neighbour_reach_m(table, count)[number]
+        away_m = np.sqrt(((ends_m[some] - corners_m[some]) ** 2).sum(axis=1) / 4)
+        most_m[some] = away_m + reach_m[guess[some], rank[some]]
+    return most_m
 
 
 def _mean_gap(one_m: np.ndarray, other_m: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Stage ``tokenize``: scenes and vocabularies to tokens that training reads scene by scene.
 
-One unit per ingested file. Groups are uncompressed, so their chunk files are the arrays. A
-scene that cannot be written as tokens is a named row of ``refused.parquet``.
+One unit per ingested file. Groups are uncompressed, and each scene lies in one piece, to be
+read at once. A scene that cannot be written as tokens is a named row of
+``refused.parquet``.
 """
 
 import json
@@ -25,9 +26,9 @@ from pipeline.storage.parquet import make_table, read_tables
 from pipeline.storage.splits import split_of
 
 if TYPE_CHECKING:
-    from pipeline.storage.columns import PackedRecords
+    from pipeline.storage.whole_records import WholeRecords
 
-SCHEMA = "infgen.tokens/2"
+SCHEMA = "infgen.tokens/3"
 SCENES_PER_GROUP = 500
 VOCABULARIES = ("motion.zarr", "roads.zarr")
 
@@ -46,16 +47,16 @@ _INDEX = {
 _REFUSED = {"scenario_id": str, "split": str, "unit": str, "reason": str}
 
 
-def open_tokens(unit_folder: Path) -> "list[PackedRecords[SceneTokens]]":
+def open_tokens(unit_folder: Path) -> "list[WholeRecords[SceneTokens]]":
     """Open the tokens of one unit, group by group; nothing of them is read yet.
 
     Raises:
         StoreError: if a group is damaged.
     """
-    from pipeline.storage.zarr_store import read_records  # noqa: PLC0415
+    from pipeline.storage.whole_records import read_whole_records  # noqa: PLC0415
 
     return [
-        read_records(path, SceneTokens, SCHEMA, whole=False)
+        read_whole_records(path, SceneTokens, SCHEMA)
         for path in sorted(unit_folder.glob("tokens-*.zarr"))
     ]
 
@@ -181,12 +182,12 @@ class _Shard:
         return f"tokens-{self._groups:03d}.zarr"
 
     def _flush(self) -> None:
-        from pipeline.storage.zarr_store import write_records  # noqa: PLC0415
+        from pipeline.storage.whole_records import write_whole_records  # noqa: PLC0415
 
         if not self._pending:
             return
         path = self._target / self._group_name
-        write_records(path, self._pending, SceneTokens, SCHEMA, compress=False)
+        write_whole_records(path, self._pending, SceneTokens, SCHEMA)
         self._pending = []
         self._groups += 1
 
@@ -201,7 +202,7 @@ def _read_figures(unit_folder: Path) -> TokenStatistics:
 
 STAGE = Stage(
     name="tokenize",
-    version=2,
+    version=3,
     settings={"tokenize": TokenSettings},
     plan=plan,
     work=work,
@@ -209,6 +210,7 @@ STAGE = Stage(
     modules=(
         "pipeline.storage.columns",
         "pipeline.storage.duplicates",
+        "pipeline.storage.whole_records",
         "pipeline.storage.zarr_store",
         "pipeline.stages.tokenize",
     ),

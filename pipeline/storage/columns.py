@@ -8,8 +8,7 @@ values of every field (``tracks.xyz_m``), and the size of every named dimension 
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
 from functools import cache
 from typing import (
@@ -99,7 +98,7 @@ def pack(records: Sequence[Any], kind: type) -> dict[str, np.ndarray]:
     sizes: dict[str, np.ndarray] = {}
     for leaf in leaves(kind):
         values = [_value(record, leaf) for record in records]
-        _note_sizes(sizes, leaf.name, _dims(leaf), values)
+        _note_sizes(sizes, leaf.name, dims_of(leaf), values)
         flat = [value.reshape(-1) for value in values]
         columns[leaf.name] = np.concatenate([np.empty(0, leaf.dtype), *flat])
     return {**{f"dim.{dim}": size for dim, size in sizes.items()}, **columns}
@@ -135,11 +134,11 @@ class _Slice(NamedTuple):
     kind: type | None
 
 
-class _Layout(NamedTuple):
+class Layout(NamedTuple):
     """A record type with its fields in order: a leaf's number, or a nested maker."""
 
     kind: Any
-    parts: "tuple[int | _Layout, ...]"
+    parts: "tuple[int | Layout, ...]"
 
 
 class PackedRecords(Generic[T], Sequence[T]):
@@ -149,20 +148,7 @@ class PackedRecords(Generic[T], Sequence[T]):
     depends on the type alone is computed once: training reads one record at a time.
     """
 
-    def __init__(
-        self,
-        columns: Columns,
-        kind: type[T],
-        reading: Callable[[], AbstractContextManager[object]] = nullcontext,
-    ) -> None:
-        """Find where each record is.
-
-        Args:
-            columns: Values of all records.
-            kind: Their type.
-            reading: Entered around reading a record: keeps the file of the columns open.
-        """
-        self._reading = reading
+    def __init__(self, columns: Columns, kind: type[T]) -> None:
         record: Any = (
             kind  # a type is hashable, whatever the type checker thinks of type[T]
         )
@@ -171,7 +157,7 @@ class PackedRecords(Generic[T], Sequence[T]):
         found: dict[tuple[str, ...], int] = {}
         self._slices = [self._slice(leaf, found) for leaf in leaves(record)]
         self._length = len(self._offsets[0].starts) - 1 if self._offsets else 0
-        self._layout = _layout(record, iter(range(len(self._slices))))
+        self._layout = layout_of(record, iter(range(len(self._slices))))
 
     def __len__(self) -> int:
         return self._length
@@ -186,9 +172,7 @@ class PackedRecords(Generic[T], Sequence[T]):
             (int(starts[row]), int(starts[row + 1]), [int(size[row]) for size in sizes])
             for starts, sizes in self._offsets
         ]
-        with self._reading():
-            values = [_value_at(cut, all_offsets) for cut in self._slices]
-        return _make(self._layout, values)
+        return make(self._layout, [_value_at(cut, all_offsets) for cut in self._slices])
 
     def __iter__(self) -> Iterator[T]:
         return (self[row] for row in range(len(self)))
@@ -203,7 +187,7 @@ class PackedRecords(Generic[T], Sequence[T]):
 
     def _slice(self, leaf: Column, found: dict[tuple[str, ...], int]) -> _Slice:
         values = self._columns[leaf.name]
-        dims = _dims(leaf)
+        dims = dims_of(leaf)
         named = tuple(dim for dim in dims if not dim.isdigit())
         factor = math.prod(int(dim) for dim in dims if dim.isdigit())
         if named not in found:
@@ -222,36 +206,38 @@ class PackedRecords(Generic[T], Sequence[T]):
         return _Offsets(np.concatenate([[0], np.cumsum(per_record)]), sizes)
 
     def _size(self, dim: str) -> np.ndarray:
-        name, more = _split(dim)
+        name, more = split_dim(dim)
         return self._columns[f"dim.{name}"][:] + more
 
 
 def names(kind: Any) -> frozenset[str]:
     """Names of all columns that records of a type have, sizes included."""
     named = {
-        f"dim.{_split(dim)[0]}"
+        f"dim.{split_dim(dim)[0]}"
         for leaf in leaves(kind)
-        for dim in _dims(leaf)
+        for dim in dims_of(leaf)
         if not dim.isdigit()
     }
     return frozenset(named | {leaf.name for leaf in leaves(kind)})
 
 
-def _layout(kind: Any, numbers: Iterator[int]) -> _Layout:
+def layout_of(kind: Any, numbers: Iterator[int]) -> Layout:
+    """Lay a record type out: which of its leaves' values makes which field."""
     hints = get_type_hints(kind, include_extras=True)
-    return _Layout(
+    return Layout(
         kind,
         tuple(
-            _layout(hint, numbers) if is_dataclass(hint) else next(numbers)
+            layout_of(hint, numbers) if is_dataclass(hint) else next(numbers)
             for hint in hints.values()
         ),
     )
 
 
-def _make(maker: _Layout, values: list[Any]) -> Any:
+def make(maker: Layout, values: list[Any]) -> Any:
+    """Make a record of the values of its leaves, in their order."""
     return maker.kind(
         *[
-            values[part] if isinstance(part, int) else _make(part, values)
+            values[part] if isinstance(part, int) else make(part, values)
             for part in maker.parts
         ]
     )
@@ -270,7 +256,8 @@ def _value_at(cut: _Slice, all_offsets: list[tuple[int, int, list[int]]]) -> Any
     return part.reshape([size if size >= 0 else sizes[-1 - size] for size in shape])
 
 
-def _dims(leaf: Column) -> tuple[str, ...]:
+def dims_of(leaf: Column) -> tuple[str, ...]:
+    """Dimensions of a leaf's array; a text has one of its own."""
     if leaf.dims is not None:
         return leaf.dims
     return (f"len({leaf.name})",) if leaf.kind is str else ()
@@ -290,14 +277,19 @@ def _note_sizes(
     for axis, dim in enumerate(dims):
         if dim.isdigit():
             continue
-        key, more = _split(dim)
+        key, more = split_dim(dim)
         found = np.array([value.shape[axis] - more for value in values], dtype=np.int64)
         known = sizes.setdefault(key, found)
         if not np.array_equal(known, found):
             raise ValueError(f"{name}: dimension {key!r} has two sizes in one record")
 
 
-def _split(dim: str) -> tuple[str, int]:
+def split_dim(dim: str) -> tuple[str, int]:
+    """Split a dimension such as ``feature+1`` into its name and what is added.
+
+    Raises:
+        TypeError: if it is none.
+    """
     match = re.fullmatch(r"(.+?)(?:\+(\d+))?", dim)
     if match is None:
         raise TypeError(f"cannot store dimension {dim!r}")

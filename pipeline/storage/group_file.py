@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
 
 from pipeline.engine.atomic import PARTIAL, StoreError
 
@@ -24,90 +23,51 @@ _MARK = b"PK\x03\x04"
 
 
 @dataclass(frozen=True, slots=True)
-class Extent:
-    """Where the bytes of a key are.
+class StoredKey:
+    """Where the bytes of one key of a group are.
+
+    No file is kept open: training reads scenes of all shards at once, and those of WOMD are
+    more files than most systems let a process open.
 
     Attributes:
-        offset: First byte in the file.
+        path: The file.
+        offset: First byte in it.
         length: Number of bytes.
     """
 
+    path: Path
     offset: int
     length: int
 
-
-class OpenedFile:
-    """A file that is opened when a part of it is read.
-
-    Between ``reading()`` and its end it stays open, however many parts are read; otherwise
-    no descriptor is kept: training reads scenes of all shards at once, and those of WOMD
-    are more files than most systems let a process open.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._lock, self._readers, self._handle = Lock(), 0, -1
-
-    @contextmanager
-    def reading(self) -> Iterator[None]:
-        """Keep the file open for several reads.
-
-        Raises:
-            StoreError: if it cannot be opened.
-        """
-        with self._lock:
-            if not self._readers:
-                self._handle = self._open()
-            self._readers += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._readers -= 1
-                if not self._readers:
-                    os.close(self._handle)
-
-    def read(self, offset: int, length: int) -> bytes:
-        """Read a part; shorter than asked for at the end of the file.
-
-        Raises:
-            StoreError: if it cannot be read.
-        """
-        with self.reading():
-            try:
-                return os.pread(self._handle, length, offset)
-            except OSError as error:
-                raise StoreError(f"{self.path} cannot be read: {error}") from error
-
-    def _open(self) -> int:
-        try:
-            return os.open(self.path, os.O_RDONLY)
-        except OSError as error:
-            raise StoreError(f"{self.path} cannot be read: {error}") from error
-
-
-@dataclass(frozen=True, slots=True)
-class StoredKey:
-    """The bytes of one key of a group."""
-
-    file: OpenedFile
-    extent: Extent
-
-    @classmethod
-    def nowhere(cls, path: Path) -> "StoredKey":
-        """Return the key of an array without values, which has no bytes."""
-        return cls(OpenedFile(path), Extent(0, 0))
-
-    def read(self) -> bytes:
-        """Read all of them.
+    def read(self, start: int = 0, length: int | None = None) -> bytes:
+        """Read a part, or all that follows ``start``.
 
         Raises:
             StoreError: if the file is missing or cut short.
         """
-        data = self.file.read(self.extent.offset, self.extent.length)
-        if len(data) != self.extent.length:
-            raise StoreError(f"{self.file.path} is cut short; `infgen verify` lists damage")
+        length = self.length - start if length is None else length
+        with _opened(self.path) as handle:
+            data = os.pread(handle, length, self.offset + start)
+        if len(data) != length:
+            raise StoreError(f"{self.path} is cut short; `infgen verify` lists damage")
         return data
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[int]:
+    """Open a file for some reads.
+
+    Raises:
+        StoreError: if it cannot be opened or read.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            yield handle
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise StoreError(f"{path} cannot be read: {error}") from error
 
 
 def write_group_file(path: Path, entries: Mapping[str, bytes]) -> None:
@@ -135,13 +95,10 @@ def open_group_file(path: Path) -> dict[str, StoredKey]:
     """
     if path.is_dir():
         return {
-            str(each.relative_to(path)): StoredKey(
-                OpenedFile(each), Extent(0, each.stat().st_size)
-            )
+            str(each.relative_to(path)): StoredKey(each, 0, each.stat().st_size)
             for each in sorted(path.rglob("*"))
             if each.is_file()
         }
-    file = OpenedFile(path)
     try:
         with zipfile.ZipFile(path) as archive:
             listed = archive.infolist()
@@ -149,17 +106,17 @@ def open_group_file(path: Path) -> dict[str, StoredKey]:
         raise StoreError(f"{path} is missing") from error
     except (OSError, zipfile.BadZipFile) as error:
         raise StoreError(f"{path} is damaged: {error}") from error
-    with file.reading():
-        return {info.filename: StoredKey(file, _extent(file, info)) for info in listed}
+    with _opened(path) as handle:
+        return {info.filename: _stored(path, handle, info) for info in listed}
 
 
-def _extent(file: OpenedFile, info: zipfile.ZipInfo) -> Extent:
+def _stored(path: Path, handle: int, info: zipfile.ZipInfo) -> StoredKey:
     """Find the bytes of an entry behind its own header."""
-    header = file.read(info.header_offset, _LOCAL_HEADER.size)
+    header = os.pread(handle, _LOCAL_HEADER.size, info.header_offset)
     if len(header) < _LOCAL_HEADER.size or info.compress_type != zipfile.ZIP_STORED:
-        raise StoreError(f"{file.path} is damaged: {info.filename} is not stored plainly")
+        raise StoreError(f"{path} is damaged: {info.filename} is not stored plainly")
     mark, name, more = _LOCAL_HEADER.unpack(header)
     if mark != _MARK:
-        raise StoreError(f"{file.path} is damaged: {info.filename} is not where it is said")
+        raise StoreError(f"{path} is damaged: {info.filename} is not where it is said")
     offset = info.header_offset + _LOCAL_HEADER.size + name + more
-    return Extent(offset, info.file_size)
+    return StoredKey(path, offset, info.file_size)

@@ -9,7 +9,7 @@ status`` nor reading in parts needs it.
 import json
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -51,10 +51,6 @@ class DiskColumn:
     def __len__(self) -> int:
         return self._length
 
-    def reading(self) -> AbstractContextManager[object]:
-        """Keep the file open while several parts of it are read."""
-        return self._chunk.file.reading()
-
     def __getitem__(self, part: slice) -> np.ndarray:
         """Read a part.
 
@@ -65,11 +61,7 @@ class DiskColumn:
         if stop <= start:
             return np.empty(0, self.dtype)
         size, chunk = self.dtype.itemsize, self._chunk
-        data = chunk.file.read(chunk.extent.offset + start * size, (stop - start) * size)
-        if len(data) != (stop - start) * size:
-            raise StoreError(
-                f"{chunk.file.path} is cut short; `infgen verify` lists damage"
-            )
+        data = chunk.read(start * size, (stop - start) * size)
         return np.frombuffer(data, self.dtype)
 
 
@@ -194,11 +186,7 @@ def read_records(
         StoreError: if the group holds another schema, or is damaged.
     """
     columns: Columns
-    opened: dict[str, DiskColumn] = {}
-    if whole:
-        columns, attributes = read_group(path)
-    else:
-        columns, attributes = opened, _ = open_group(path)
+    columns, attributes = read_group(path) if whole else open_group(path)
     if attributes.get("schema") != schema:
         found = attributes.get("schema")
         raise StoreError(
@@ -207,18 +195,17 @@ def read_records(
     lost = sorted(names(kind) - columns.keys())
     if lost:
         raise StoreError(f"{path} lacks {', '.join(lost)}; `infgen verify` lists damage")
-    reading = next((each.reading for each in opened.values()), nullcontext)
-    return PackedRecords(columns, kind, reading)
+    return PackedRecords(columns, kind)
 
 
 def _disk_column(
     path: Path, chunk: StoredKey | None, name: str, dtype: np.dtype, length: int
 ) -> DiskColumn:
     expected = length * dtype.itemsize + CHECKSUM_BYTES
-    found = None if chunk is None else chunk.extent.length
+    found = None if chunk is None else chunk.length
     if chunk is None or (length and found != expected):
         if not length:
-            return DiskColumn(StoredKey.nowhere(path), dtype, 0)
+            return DiskColumn(StoredKey(path, 0, 0), dtype, 0)
         raise StoreError(f"{path}: {_chunk(name)} holds {found} bytes, expected {expected}")
     return DiskColumn(chunk, dtype, length)
 

@@ -25,6 +25,7 @@ from pipeline.stages.tokenize import SCHEMA
 from pipeline.stages.train.loader import TokenScenes
 from pipeline.stages.train.setup import TrainingSetup
 from pipeline.storage.weights import save_network, state_dict_of
+from pipeline.storage.whole_records import write_whole_records
 from pipeline.storage.zarr_store import write_records
 from tests.pipeline.finished import TINY
 
@@ -160,7 +161,7 @@ def shards(tmp_path_factory, crossing, metre_moves, bent_roads):
         ]
         group = folder / name / "tokens-000.zarr"
         group.parent.mkdir()
-        write_records(group, tokens, SceneTokens, SCHEMA, compress=False)
+        write_whole_records(group, tokens, SceneTokens, SCHEMA)
     books = folder / "vocab"
     books.mkdir()
     for name, book, kind, schema in (

@@ -7,6 +7,7 @@ import importlib
 import json
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ from infgen.sources.towns import builtin_records  # noqa: E402
 from infgen.sources.womd import iter_scenes  # noqa: E402
 from infgen.tokens.tokenizer import tokenize_scene  # noqa: E402
 from pipeline.stages.train import setup  # noqa: E402
-from pipeline.stages.train.loader import TokenScenes  # noqa: E402
+from pipeline.stages.train.loader import TokenScenes, train_batches  # noqa: E402
 from pipeline.stages.train.optimizer_step import OptimizerStep, StepResult  # noqa: E402
 from pipeline.stages.train.process_group import ProcessGroup  # noqa: E402
 from pipeline.stages.train.setup import TrainingSetup  # noqa: E402
@@ -238,10 +239,11 @@ def begun(given: TrainingSetup, device: torch.device) -> TrainingState:
 def taken(given: TrainingSetup, state: TrainingState, steps: range) -> StepResult:
     """Do some optimizer steps; return the last one's losses."""
     parts = given.train.gradient_accumulation
-    stepper = OptimizerStep(state, given.train, ProcessGroup(), parts)
-    recipe = given.recipe(ProcessGroup())
-    for step in steps:
-        found = stepper.step(recipe[step], range(parts), step)
+    group = ProcessGroup(device=next(state.network.parameters()).device)
+    stepper = OptimizerStep(state, given.train, group, parts)
+    with closing(train_batches(given.recipe(group), steps, 0)) as batches:
+        for step, batch in zip(steps, batches, strict=True):
+            found = stepper.step(batch, range(parts), step)
     return found
 
 

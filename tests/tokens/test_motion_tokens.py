@@ -9,8 +9,8 @@ from infgen.tokens.motion_tokens import (
     advance,
     follow,
     make_match_table,
-    nearest_k_motion_tokens,
     nearest_motion_tokens,
+    ranked_motion_tokens,
 )
 from infgen.tokens.vocabulary import BOX_LW_M, MotionVocabulary
 
@@ -63,7 +63,9 @@ def test_the_nearest_move_is_the_one_that_measuring_all_corners_finds(seed, stra
     st.sampled_from([0.01, 3.0, 300.0]),
 )
 @settings(deadline=None)
-def test_the_nearest_few_are_those_that_measuring_all_corners_finds(seed, count, stray):
+def test_the_token_of_a_rank_is_the_one_that_measuring_all_corners_finds(
+    seed, count, stray
+):
     rng = np.random.default_rng(seed)
     vocabulary = random_codebook(rng)
     rows = 20
@@ -72,20 +74,28 @@ def test_the_nearest_few_are_those_that_measuring_all_corners_finds(seed, count,
     ahead = advance(pose, kind, rng.integers(0, 200, rows).astype(np.int16), vocabulary)
     target = ahead + (rng.normal(size=(rows, 3)) * stray).astype(np.float32)
 
-    few = nearest_k_motion_tokens(target, pose, kind, make_match_table(vocabulary), count)
+    rank = rng.integers(0, count, rows)
+    table = make_match_table(vocabulary)
+    nearest, ranked = ranked_motion_tokens(target, pose, kind, rank, table)
 
     gap_m = measure_them_all(target, pose, kind, vocabulary)
-    in_order = np.argsort(gap_m, axis=1, kind="stable")[:, :count]
-    np.testing.assert_array_equal(few, in_order)
+    in_order = np.argsort(gap_m, axis=1, kind="stable")
+    np.testing.assert_array_equal(nearest, in_order[:, 0])
+    np.testing.assert_array_equal(ranked, in_order[np.arange(rows), rank])
 
 
-def test_the_nearest_of_few_is_the_nearest():
+def test_tokens_of_different_ranks_differ():
     rng = np.random.default_rng(3)
     table = make_match_table(random_codebook(rng))
     target = rng.normal(size=(50, 3)).astype(np.float32)
     pose, kind = np.zeros_like(target), rng.integers(0, 3, 50).astype(np.int8)
 
-    few = nearest_k_motion_tokens(target, pose, kind, table, 7)
+    few = np.column_stack(
+        [
+            ranked_motion_tokens(target, pose, kind, np.full(50, rank), table)[1]
+            for rank in range(7)
+        ]
+    )
 
     np.testing.assert_array_equal(
         few[:, 0], nearest_motion_tokens(target, pose, kind, table)

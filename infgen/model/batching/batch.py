@@ -12,7 +12,7 @@ A batch is a function of its records, their draws and the limits: nothing is ran
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -126,6 +126,13 @@ class MapTokens:
     follows: Bool[Tensor, "scene road"]
     picked: Bool[Tensor, "scene road"]
 
+    @property
+    def predicted(self) -> Bool[Tensor, "scene road"]:
+        """Which are predicted: those hidden whose predecessor is not."""
+        wanted = self.real & self.picked & self.follows
+        wanted[:, 1:] &= ~self.picked[:, :-1]
+        return wanted
+
 
 @dataclass(frozen=True, slots=True)
 class Insertions:
@@ -235,7 +242,13 @@ def collate(
             draws, equal batches.
         noise: How tokens are disturbed, to learn from; None for scenes as they are.
     """
-    scenes = [_scene(record, limits, draw, noise) for record in records]
+    begun = [_begin(record, limits, draw) for record in records]
+    if noise and noise.moves:
+        windows = [each.window for each in begun]
+        chances = [each.chance for each in begun]
+        strays = perturb(windows, noise, make_grid(limits.grid), chances)
+        begun = [each._replace(window=w) for each, w in zip(begun, strays, strict=True)]
+    scenes = [_arrays(each, limits, draw, noise) for each in begun]
     return Batch(
         scenario_ids=tuple(record.scenario_id for record in records),
         agents=pad([scene[0] for scene in scenes], Agents),
@@ -278,22 +291,34 @@ def to_device(batch: T, device: torch.device) -> T:
     return map_tensors(batch, lambda x: x.to(device))
 
 
-def _scene(
-    record: SceneTokens, limits: Limits, draw: int, noise: Perturbation | None
-) -> tuple[Arrays, Arrays, Arrays, Arrays]:
-    """Arrays of agents, roads, entries and details of one scene."""
+class _Begun(NamedTuple):
+    """A scene of which a part is cut out, and its sources of random numbers."""
+
+    window: SceneWindow
+    random: np.random.Generator
+    chance: np.random.Generator
+
+
+def _begin(record: SceneTokens, limits: Limits, draw: int) -> _Begun:
+    """Cut a part out of a scene."""
     random = _keyed(f"{draw}/{record.scenario_id}")
     chance = _keyed(
         f"noise/{draw}/{record.scenario_id}"
     )  # Perturbation moves no other draw.
-    grid = make_grid(limits.grid)
     spare = max(0, record.num_tokens - limits.tokens)
     start = int(random.integers(spare + 1))
     window = cut_window(record, start, limits.tokens, limits.agents, limits.roads)
     if _keyed(f"rim/{draw}/{record.scenario_id}").random() < BARE_RIM_SHARE:
         window = hide_until_near(window, limits.grid, record.now + 1 - start)
-    if noise and noise.moves:
-        window = perturb(window, noise, grid, chance)
+    return _Begun(window, random, chance)
+
+
+def _arrays(
+    begun: _Begun, limits: Limits, draw: int, noise: Perturbation | None
+) -> tuple[Arrays, Arrays, Arrays, Arrays]:
+    """Arrays of agents, roads, entries and details of one scene."""
+    window, random, chance = begun
+    record, grid = window.record, make_grid(limits.grid)
     if _keyed(f"lights/{draw}/{record.scenario_id}").random() < FORGOTTEN_SHARE:
         window = hide_signals(window, record.now + 1)
     turn = insertion_turns(window)

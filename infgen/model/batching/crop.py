@@ -1,11 +1,17 @@
 """A part of one tokenized scene: some token steps, the nearest agents and roads."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int16, Int64, UInt8
 
-from infgen.model.batching.perturbation import Perturbation, perturb_motion
+from infgen.model.batching.perturbation import (
+    LoggedMotion,
+    Perturbation,
+    PerturbedMotion,
+    perturb_scenes,
+)
 from infgen.tokens.grid import Grid, encode_cell, to_grid
 from infgen.tokens.insertion import insertion_key
 from infgen.tokens.scene_tokens import FIRST_MOTION_TOKEN, NO_CELL, Presence, SceneTokens
@@ -92,16 +98,35 @@ def cut_window(
 
 
 def perturb(
-    window: SceneWindow, noise: Perturbation, grid: Grid, random: np.random.Generator
-) -> SceneWindow:
+    windows: Sequence[SceneWindow],
+    noise: Perturbation,
+    grid: Grid,
+    randoms: Sequence[np.random.Generator],
+) -> list[SceneWindow]:
     """Lead agents astray, the ego like all others.
 
     Who is absent, entering or not observed is where it was. Cells follow the poses, the
     ego's too; but an inserted agent is lost to none for it, and none is won.
+
+    Args:
+        windows: Scenes; none depends on another.
+        noise: How to draw.
+        grid: Cells.
+        randoms: Of each scene, the source of its draws.
     """
-    strays = perturb_motion(
-        window.agent_type, window.pose, window.motion_token, window.observed, noise, random
-    )
+    logged = [
+        LoggedMotion.drawn(
+            *(window.agent_type, window.pose, window.motion_token, window.observed),
+            noise,
+            random,
+        )
+        for window, random in zip(windows, randoms, strict=True)
+    ]
+    found = perturb_scenes(logged, noise)
+    return [_astray(*each, grid) for each in zip(windows, found, strict=True)]
+
+
+def _astray(window: SceneWindow, strays: PerturbedMotion, grid: Grid) -> SceneWindow:
     cell = encode_cell(to_grid(strays.pose[..., :2], strays.pose[0]), grid)
     entering = window.presence == Presence.INSERTED
     kept = entering & ((cell == NO_CELL) | (window.cell == NO_CELL))

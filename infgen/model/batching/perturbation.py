@@ -18,19 +18,20 @@ is within centimetres of the log's own.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int8, Int16
+from jaxtyping import Bool, Float, Float32, Float64, Int8, Int16, Int64
 
 from infgen.model.training_settings import TrainSettings
 from infgen.tokens.motion_tokens import (
     MatchTable,
     advance,
     make_match_table,
-    nearest_k_motion_tokens,
     nearest_motion_tokens,
+    ranked_motion_tokens,
 )
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
@@ -109,44 +110,94 @@ def make_perturbation(
     )
 
 
-def perturb_motion(
-    agent_type: Int8[np.ndarray, " agent"],
-    pose: Float32[np.ndarray, "agent token 3"],
-    motion_token: Int16[np.ndarray, "agent token"],
-    moving: Bool[np.ndarray, "agent token"],
-    noise: Perturbation,
-    random: np.random.Generator,
-) -> PerturbedMotion:
-    """Walk agents anew along motion tokens that are drawn.
+@dataclass(frozen=True, slots=True)
+class LoggedMotion:
+    """Agents on their ways, and what is drawn for them.
 
-    Args:
+    Attributes:
         agent_type: ``AgentType``.
         pose: Where each agent should be at each token's end.
         motion_token: What led it there.
         moving: Tokens at which it goes by motion tokens that may be drawn, none of them the
             first. At all others it is where it should be, and starts from there.
-        noise: How to draw.
-        random: Source of the draws.
+        rank: How many motion tokens are nearer to where it should be than the one drawn.
+        push: What leads it aside.
     """
-    turn = random.integers(noise.moves, size=moving.shape)
-    turn[random.random(moving.shape) >= noise.share] = 0
+
+    agent_type: Int8[np.ndarray, " agent"]
+    pose: Float32[np.ndarray, "agent token 3"]
+    motion_token: Int16[np.ndarray, "agent token"]
+    moving: Bool[np.ndarray, "agent token"]
+    rank: Int64[np.ndarray, "agent token"]
+    push: Float64[np.ndarray, "agent token"]
+
+    @classmethod
+    def drawn(
+        cls,
+        agent_type: Int8[np.ndarray, " agent"],
+        pose: Float32[np.ndarray, "agent token 3"],
+        motion_token: Int16[np.ndarray, "agent token"],
+        moving: Bool[np.ndarray, "agent token"],
+        noise: Perturbation,
+        random: np.random.Generator,
+    ) -> "LoggedMotion":
+        """Draw what is done to the agents of a scene."""
+        rank = random.integers(noise.moves, size=moving.shape)
+        rank[random.random(moving.shape) >= noise.share] = 0
+        push = _pushes(moving.shape, noise.drift, random)
+        return cls(agent_type, pose, motion_token, moving, rank, push)
+
+    @classmethod
+    def joined(cls, scenes: "Sequence[LoggedMotion]") -> "LoggedMotion":
+        """Put scenes one below the other; the shorter ones stand still in the end."""
+        tokens = max(scene.moving.shape[1] for scene in scenes)
+
+        def below(name: str) -> np.ndarray:
+            parts = [getattr(scene, name) for scene in scenes]
+            more = [(0, 0)] * (parts[0].ndim - 2)
+            return np.concatenate(
+                [np.pad(x, [(0, 0), (0, tokens - x.shape[1]), *more]) for x in parts]
+            )
+
+        agent_type = np.concatenate([scene.agent_type for scene in scenes])
+        rest = ("pose", "motion_token", "moving", "rank", "push")
+        return cls(agent_type, *(below(name) for name in rest))
+
+
+def perturb_scenes(
+    scenes: Sequence[LoggedMotion], noise: Perturbation
+) -> list[PerturbedMotion]:
+    """Walk the agents of all scenes anew, together: each call does for hundreds of them."""
+    if not scenes:
+        return []
+    strays, found, first = perturb_motion(LoggedMotion.joined(scenes), noise), [], 0
+    for scene in scenes:
+        agents, tokens = scene.moving.shape
+        part = slice(first, first + agents), slice(0, tokens)
+        found.append(PerturbedMotion(*(values[part] for values in strays)))
+        first += agents
+    return found
+
+
+def perturb_motion(logged: LoggedMotion, noise: Perturbation) -> PerturbedMotion:
+    """Walk agents anew along motion tokens that are drawn."""
+    agent_type, pose, motion_token = logged.agent_type, logged.pose, logged.motion_token
     strays = PerturbedMotion(
-        motion_token.copy(), pose.copy(), motion_token.copy(), np.zeros_like(moving)
+        motion_token.copy(), pose.copy(), motion_token.copy(), np.zeros_like(logged.moving)
     )
-    pushes = _pushes(moving.shape, noise.drift, random)
     aside_m = np.zeros(len(agent_type))
-    for token in range(1, moving.shape[1]):
-        rows = np.flatnonzero(moving[:, token])
+    for token in range(1, logged.moving.shape[1]):
+        rows = np.flatnonzero(logged.moving[:, token])
         before, wanted = strays.pose[rows, token - 1], pose[rows, token]
         way_m = np.hypot(*(wanted - pose[rows, token - 1])[:, :2].T)
         was_m, aside_m = aside_m, np.zeros(len(agent_type))
-        aside_m[rows] = _drifted(was_m[rows], way_m, pushes[rows, token])
+        aside_m[rows] = _drifted(was_m[rows], way_m, logged.push[rows, token])
         led = _drift_target(wanted, way_m, was_m[rows], aside_m[rows])
 
-        few = nearest_k_motion_tokens(
-            led, before, agent_type[rows], noise.table, noise.moves
+        rank = logged.rank[rows, token]
+        nearest, taken = ranked_motion_tokens(
+            led, before, agent_type[rows], rank, noise.table
         )
-        nearest, taken = few[:, 0].copy(), few[np.arange(len(rows)), turn[rows, token]]
         ends = advance(before, agent_type[rows], taken, noise.table.vocabulary)
         away_m = np.hypot(*(ends - led)[:, :2].T)
         far = np.flatnonzero(away_m > np.minimum(FARTHEST_M, FARTHEST_SHARE * way_m))

@@ -7,7 +7,7 @@ from torch.nn import functional
 
 from infgen.model.batching.batch import Batch
 from infgen.model.logits import Outputs
-from infgen.model.training.losses import motion_mask, stay_mask
+from infgen.model.training.losses import Chosen, motion_mask, stay_mask
 from infgen.tokens.scene_tokens import Presence
 
 BIN_EDGES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -21,12 +21,13 @@ def motion_surprise(outputs: Outputs, batch: Batch) -> Float32[Tensor, "2"]:
     Without label smoothing and weights: the exponential of their mean is the perplexity.
     """
     rows, agents = outputs.motion.rows, batch.agents
-    mask = rows.pack(motion_mask(agents))
-    target = rows.pack(agents.label.roll(-1, dims=1))[mask]
-    each = functional.cross_entropy(
-        outputs.motion.motion_logits[mask], target, reduction="none"
-    )
-    return torch.stack([each.sum(), mask.sum().to(each.dtype)])
+    chosen = Chosen.of(rows.pack(motion_mask(agents)))
+    target = chosen.take(rows.pack(agents.label.roll(-1, dims=1)))
+    if chosen.counted is not None:
+        target = target.clamp(min=0)  # Of rows that do not count.
+    logits = chosen.take(outputs.motion.motion_logits)
+    each = functional.cross_entropy(logits, target, reduction="none")
+    return torch.stack([chosen.sum(each), chosen.count(each)])
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ can divide every part by the weights of the whole before any of it is computed.
 import torch
 from torch import Tensor
 
-from infgen.model.batching.batch import Batch, MapTokens
+from infgen.model.batching.batch import Batch
 from infgen.model.training.losses import motion_mask, pattern_mask, stay_mask
 from infgen.model.training_settings import TrainSettings
 from infgen.tokens.scene_tokens import Presence
@@ -38,7 +38,7 @@ def supervised(batch: Batch, settings: TrainSettings) -> Tensor:
         **dict.fromkeys(("position", "position_regression"), num_inserted),
         **dict.fromkeys(("agent_type", "size"), real),
         **dict.fromkeys(("heading", "heading_regression", "offset"), described),
-        "map": _hidden(batch.roads).sum(),
+        "map": batch.roads.predicted.sum(),
     }
     return torch.stack([weight[name].float() for name in TERMS])
 
@@ -56,10 +56,3 @@ def _decided(batch: Batch) -> Tensor:
     entries = batch.entries
     slots = entries.agent.shape[2]
     return torch.where(entries.asked, (entries.count + 1).clamp(max=slots), 0).sum()
-
-
-def _hidden(roads: MapTokens) -> Tensor:
-    """Which map tokens are predicted [scene, road]: hidden ones after one that is not."""
-    wanted = roads.real & roads.picked & roads.follows
-    wanted[:, 1:] &= ~roads.picked[:, :-1]
-    return wanted

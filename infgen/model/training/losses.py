@@ -163,26 +163,32 @@ def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> 
     mask = rows.pack(motion_mask(agents))
     weight = torch.ones(agents.motion_token.shape, device=mask.device)
     entering = agents.presence[:, 1:] == int(Presence.INSERTED)
-    weight[:, 1:][entering] = settings.first_motion_weight  # At token 0 nobody comes in.
+    # At token 0 nobody comes in.
+    weight[:, 1:].masked_fill_(entering, settings.first_motion_weight)
     target = rows.pack(_next(agents.label, -1))
+    chosen = Chosen.of(mask)
     return _choice(
-        outputs.motion_logits[mask],
-        target[mask],
+        chosen,
+        chosen.take(outputs.motion_logits),
+        chosen.take(target),
         settings.label_smoothing,
-        rows.pack(weight)[mask],
+        chosen.take(rows.pack(weight)),
     )
 
 
 def _stay(rows: Rows, remove_logit: Tensor, agents: Agents) -> Term:
     mask = rows.pack(stay_mask(agents))
     following = rows.pack(_next(agents.presence, int(Presence.ABSENT)))
-    return _event(remove_logit[mask], following[mask] == int(Presence.REMOVED))
+    chosen = Chosen.of(mask)
+    leaves = chosen.take(following) == int(Presence.REMOVED)
+    return _event(chosen, chosen.take(remove_logit), leaves)
 
 
 def _pattern(rows: Rows, pattern_logits: Tensor, agents: Agents) -> Term:
     mask = rows.pack(pattern_mask(agents))
     target = rows.pack(_next(agents.pattern, 0))
-    return _choice(pattern_logits[mask], target[mask], 0.0)
+    chosen = Chosen.of(mask)
+    return _choice(chosen, chosen.take(pattern_logits), chosen.take(target), 0.0)
 
 
 def _entries(outputs: InsertionOutputs, batch: Batch, smoothing: float) -> Terms:
@@ -190,15 +196,17 @@ def _entries(outputs: InsertionOutputs, batch: Batch, smoothing: float) -> Terms
     entries = batch.entries
     count = outputs.rows.pack(entries.count)[:, None]
     slot = torch.arange(entries.agent.shape[2], device=count.device)
-    decided = slot <= count
     comes = outputs.rows.pack(entries.agent) >= 0
-    terms = {"add": _event(outputs.add_logit[decided], comes[decided])}
+    decided, inserted = Chosen.of(slot <= count), Chosen.of(comes)
+    happens = decided.take(comes)
+    terms = {"add": _event(decided, decided.take(outputs.add_logit), happens)}
     if outputs.position_logits is not None:
-        cell = outputs.rows.pack(entries.cell)
-        terms["position"] = _choice(outputs.position_logits[comes], cell[comes], smoothing)
+        cell = inserted.take(outputs.rows.pack(entries.cell))
+        logits = inserted.take(outputs.position_logits)
+        terms["position"] = _choice(inserted, logits, cell, smoothing)
     if outputs.position_m is not None:
-        gap_m = outputs.position_m - _places(outputs.rows, batch)
-        terms["position_regression"] = _distance(gap_m[comes] / outputs.radius_m)
+        gap_m = inserted.take(outputs.position_m - _places(outputs.rows, batch))
+        terms["position_regression"] = _distance(inserted, gap_m / outputs.radius_m)
     return terms
 
 
@@ -213,21 +221,21 @@ def _places(rows: Rows, batch: Batch) -> Tensor:
 def _details(outputs: DetailOutputs, batch: Batch) -> Terms:
     """Terms of agent type and size; heading and offset also of pseudo-insertions."""
     details, pack = batch.details, outputs.rows.pack
-    real = pack(details.inserted)
+    real = Chosen.of(pack(details.inserted))
     size_log_m = pack(details.size_lwh_m).clamp(min=0.05).log()
+    agent_type = real.take(pack(details.agent_type))
     terms = {
-        "agent_type": _choice(
-            outputs.agent_type_logits[real], pack(details.agent_type)[real], 0.0
-        ),
-        "size": _distance((outputs.size_log_m - size_log_m)[real]),
+        "agent_type": _choice(real, real.take(outputs.agent_type_logits), agent_type, 0.0),
+        "size": _distance(real, real.take(outputs.size_log_m - size_log_m)),
     }
     if outputs.heading_logits is not None:
-        terms["heading"] = _choice(outputs.heading_logits, pack(details.heading), 0.0)
+        heading = pack(details.heading)
+        terms["heading"] = _choice(ALL, outputs.heading_logits, heading, 0.0)
     if outputs.turned_rad is not None:
         gap_rad = wrap_angle(outputs.turned_rad - _turns(outputs.rows, batch))
-        terms["heading_regression"] = _distance(gap_rad[:, None] / math.pi)
+        terms["heading_regression"] = _distance(ALL, gap_rad[:, None] / math.pi)
     if outputs.offset_m is not None:
-        terms["offset"] = _distance(outputs.offset_m - pack(details.offset_m))
+        terms["offset"] = _distance(ALL, outputs.offset_m - pack(details.offset_m))
     return terms
 
 
@@ -240,38 +248,88 @@ def _turns(rows: Rows, batch: Batch) -> Tensor:
 
 
 def _roads(outputs: MapOutputs, smoothing: float) -> Term:
-    return _choice(outputs.logits, outputs.token, smoothing)
+    return _choice(ALL, outputs.logits, outputs.token, smoothing)
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """Which places of some arrays are supervised.
+
+    A CPU takes them out. Elsewhere the host would wait to know how many there are: there
+    all are kept, and ``counted`` says which of them count.
+
+    Attributes:
+        mask: The places that are taken out, if they are.
+        counted: 1 for rows that count, else 0; None where all that are there do.
+        dims: Dimensions of the mask.
+    """
+
+    mask: Tensor | None = None
+    counted: Tensor | None = None
+    dims: int = 1
+
+    @classmethod
+    def of(cls, mask: Tensor) -> "Chosen":
+        """Choose the true places of a mask."""
+        if mask.device.type == "cpu":
+            return cls(mask)
+        return cls(None, mask.flatten().float(), mask.dim())
+
+    def take(self, values: Tensor) -> Tensor:
+        """Rows of values whose first dimensions are the mask's."""
+        if self.mask is not None:
+            return values[self.mask]
+        return values.flatten(0, self.dims - 1) if self.dims > 1 else values
+
+    def sum(self, each: Tensor) -> Tensor:
+        """Sum what counts of a number per row."""
+        return each.sum() if self.counted is None else torch.dot(each.float(), self.counted)
+
+    def count(self, each: Tensor) -> Tensor:
+        """How many count."""
+        if self.counted is None:
+            return each.new_full((), float(len(each)))
+        return self.counted.sum()
+
+
+ALL = Chosen()
+"""All rows."""
 
 
 def _choice(
-    logits: Tensor, target: Tensor, smoothing: float, weight: Tensor | None = None
+    chosen: Chosen,
+    logits: Tensor,
+    target: Tensor,
+    smoothing: float,
+    weight: Tensor | None = None,
 ) -> Term:
     """Cross-entropy of [row, choice] logits."""
+    if chosen.counted is not None:
+        target = target.clamp(min=0)  # Of rows that do not count.
     each = functional.cross_entropy(
         logits, target, reduction="none", label_smoothing=smoothing
     )
-    weight = torch.ones_like(each) if weight is None else weight
-    right = (logits.argmax(dim=-1) == target).sum() if len(logits) else each.sum()
-    return Term((each * weight).sum(), weight.sum(), _count(each), right, _none(each))
+    right = chosen.sum(logits.argmax(dim=-1) == target) if len(logits) else each.sum()
+    count = chosen.count(each)
+    if weight is None:
+        return Term(chosen.sum(each), count, count, right, _none(each))
+    return Term(chosen.sum(each * weight), chosen.sum(weight), count, right, _none(each))
 
 
-def _event(logit: Tensor, happens: Tensor) -> Term:
+def _event(chosen: Chosen, logit: Tensor, happens: Tensor) -> Term:
     """Binary cross-entropy of [row] log-odds."""
     each = functional.binary_cross_entropy_with_logits(
         logit, happens.to(logit.dtype), reduction="none"
     )
-    predicted = torch.sigmoid(logit).sum()
-    return Term(each.sum(), _count(each), _count(each), predicted, happens.sum())
+    predicted, count = chosen.sum(torch.sigmoid(logit)), chosen.count(each)
+    return Term(chosen.sum(each), count, count, predicted, chosen.sum(happens))
 
 
-def _distance(gap: Tensor) -> Term:
+def _distance(chosen: Chosen, gap: Tensor) -> Term:
     """Mean square of gaps [row, number]."""
-    each = gap.square().mean(dim=-1)
-    return Term(each.sum(), _count(each), _count(each), _none(each), _none(each))
-
-
-def _count(each: Tensor) -> Tensor:
-    return each.new_tensor(float(len(each)))
+    each, none = gap.square().mean(dim=-1), _none(gap)
+    count = chosen.count(each)
+    return Term(chosen.sum(each), count, count, none, none)
 
 
 def _none(each: Tensor) -> Tensor:

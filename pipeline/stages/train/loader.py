@@ -16,17 +16,17 @@ from typing import TypeVar
 import numpy as np
 import torch
 from jaxtyping import Int64
-from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from infgen.model.batching.batch import Batch, Limits, collate
+from infgen.model.batching.packed import PackedBatch
 from infgen.model.batching.perturbation import Perturbation
-from infgen.model.batching.tensors import map_tensors
 from infgen.tokens.scene_tokens import SceneTokens
 from pipeline.stages.tokenize import open_tokens
 from pipeline.stages.train.sampler import ScenePermutation
 
 T = TypeVar("T")
+Made = Batch | PackedBatch
 
 AHEAD = 2
 """Batches prepared ahead."""
@@ -76,7 +76,7 @@ def draw_of_step(step: int, seed: int) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe(Dataset[list[Batch]]):
+class Recipe(Dataset[list[Made]]):
     """How the batch of a step is made.
 
     Attributes:
@@ -86,6 +86,7 @@ class Recipe(Dataset[list[Batch]]):
         parts: Parts that the batch of a step is cut into ...
         own: ... and which of them are made.
         noise: How the scenes' tokens are disturbed; None for scenes as they are.
+        packed: Whether batches are made ready to be copied to a GPU.
     """
 
     scenes: Sequence[SceneTokens]
@@ -94,12 +95,14 @@ class Recipe(Dataset[list[Batch]]):
     parts: int = 1
     own: range = range(1)
     noise: Perturbation | None = None
+    packed: bool = False
 
-    def __getitem__(self, step: int) -> list[Batch]:
+    def __getitem__(self, step: int) -> list[Made]:
         """Make the own parts of the batch of one step."""
         draw = draw_of_step(step, self.order.seed)
         scenes = [[self.scenes[row] for row in self.rows(step, part)] for part in self.own]
-        return [collate(part, self.limits, draw, self.noise) for part in scenes]
+        made = [collate(part, self.limits, draw, self.noise) for part in scenes]
+        return [PackedBatch.of(batch) for batch in made] if self.packed else [*made]
 
     def rows(self, step: int, part: int) -> list[int]:
         """Scenes of one part; all parts are of about one size."""
@@ -108,7 +111,7 @@ class Recipe(Dataset[list[Batch]]):
 
 def train_batches(
     recipe: Recipe, steps: range, workers: int
-) -> Generator[list[Batch], None, None]:
+) -> Generator[list[Made], None, None]:
     """Yield the own parts of every step's batch, prepared ahead.
 
     Args:
@@ -118,14 +121,14 @@ def train_batches(
             nothing to start, and hands batches over for nothing.
     """
     if workers:
-        made = _made_by_processes(recipe, steps, workers)
+        made = made_by_processes(recipe, steps, workers)
     else:
         made = map(recipe.__getitem__, steps)
-    pinned = map(_pin, made) if torch.cuda.is_available() else made
-    yield from _prefetched(pinned)
+    yield from _prefetched(map(_pin, made))
 
 
-def _made_by_processes(recipe: Recipe, steps: range, workers: int) -> Iterator[list[Batch]]:
+def made_by_processes(recipe: Recipe, steps: range, workers: int) -> Iterator[list[Made]]:
+    """Make the batches of some steps in processes of their own."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])  # Torch is imported once, not by each.
     loader = DataLoader(
@@ -163,9 +166,9 @@ def _take(made: Iterator[T]) -> list[T]:
     return list(islice(made, 1))
 
 
-def _pin(parts: list[Batch]) -> list[Batch]:
-    """Put batches in memory that a GPU can copy from by itself."""
-    return map_tensors(parts, Tensor.pin_memory)
+def _pin(parts: list[Made]) -> list[Made]:
+    """Put what goes to a GPU in memory that it can copy from by itself."""
+    return [part.pin() if isinstance(part, PackedBatch) else part for part in parts]
 
 
 def validation_batches(

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from signal import SIGTERM
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from infgen.model.batching.perturbation import Perturbation, make_perturbation
@@ -19,6 +20,8 @@ from pipeline.stages.train.recorder import TrainingRecorder, is_validated
 from pipeline.stages.train.setup import TrainingError, TrainingSetup, repeatable
 from pipeline.stages.train.validation import validate
 from pipeline.storage.checkpoint import TrainingState, load_checkpoint
+
+WORKERS_OF_A_GPU = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +128,8 @@ def _run_steps(
     steps = range(first, setup.train.steps)
     stop: Stopped | None = None
     try:
-        with closing(train_batches(recipe, steps, setup.train.loader_workers)) as batches:
+        workers = _loader_workers(setup.train.loader_workers, group.device)
+        with closing(train_batches(recipe, steps, workers)) as batches:
             for step, parts in zip(steps, batches, strict=True):
                 if group.any(stop is not None or signals.pending_signal() > 0):
                     stop = stop or Stopped(signals.pending_signal() or SIGTERM)
@@ -146,12 +150,28 @@ def _run_steps(
         raise stop
 
 
+def _loader_workers(asked: int | None, device: torch.device) -> int:
+    """Processes that prepare batches."""
+    if asked is not None:
+        return asked
+    return 0 if device.type == "cpu" else WORKERS_OF_A_GPU
+
+
 def _step(
     optimizer_step: OptimizerStep, recipe: Recipe, parts: list[Any], step: int
 ) -> StepResult:
-    """Do a step; if its loss is not finite, say of which scenes."""
+    """Do a step; say which scenes have a loss that is not finite, or too much memory."""
     try:
         return optimizer_step.step(parts, recipe.own, step)
+    except torch.OutOfMemoryError as error:
+        most = max(len(part.scenario_ids) for part in parts)
+        why = str(error).splitlines()[0]
+        raise TrainingError(
+            f"step {step}: out of memory with {most} scenes at once; the steps before are "
+            "saved. Free memory and run again, or begin anew with a larger "
+            "train.gradient_accumulation (the batch in smaller parts, with the same "
+            f"gradient) or a smaller train.batch_scenes: {why}"
+        ) from error
     except NotFiniteError as error:
         bad = error.parts or range(recipe.parts)
         rows = [row for part in bad for row in recipe.rows(step, part)]

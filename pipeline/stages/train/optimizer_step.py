@@ -8,13 +8,14 @@ latter are known beforehand (``supervised``), so gradients simply add up.
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from infgen.config import TrainSettings
-from infgen.model.batching.batch import Batch, to_device
+from infgen.model.batching.batch import Batch
+from infgen.model.batching.packed import IndexedBatch, PackedBatch, prepared
 from infgen.model.training.closed_loop import close_loop
 from infgen.model.training.diagnostics import motion_surprise
 from infgen.model.training.loss_weights import TERMS, supervised
@@ -70,6 +71,9 @@ class OptimizerStep:
     All gradients lie in one tensor, zeroed before each step, followed by all other sums:
     one addition over all processes does for everything. A parameter that a batch does not
     reach has a gradient of zero.
+
+    The host waits for a GPU once a step, for its figures. What a CPU does parameter by
+    parameter, a GPU does for all at once: it has a thousand of them, most of them small.
     """
 
     def __init__(
@@ -81,18 +85,22 @@ class OptimizerStep:
     ) -> None:
         self._training, self._settings, self._process_group = training, settings, group
         self.forward = Pass(training.network, settings)
-        parameters = list(training.network.parameters())
+        self._parameters = parameters = list(training.network.parameters())
         sizes = [p.numel() for p in parameters]
-        tail = (len(TERMS) * len(FIGURES), 2, parts)
+        tail = [len(TERMS) * len(FIGURES), 2, parts]
         self._sums = parameters[0].new_zeros(sum(sizes) + sum(tail))
-        gradient, terms, self._surprise, self._bad = torch.split(
-            self._sums, [sum(sizes), *tail]
-        )
+        self._gradient, self._figures = torch.split(self._sums, [sum(sizes), sum(tail)])
+        terms, self._surprise, self._bad = torch.split(self._figures, tail)
         self._terms = terms.view(len(TERMS), len(FIGURES))
-        for parameter, own in zip(parameters, torch.split(gradient, sizes), strict=True):
-            parameter.grad = own.view_as(parameter)
+        cut = zip(torch.split(self._gradient, sizes), parameters, strict=True)
+        self._own = [part.view_as(parameter) for part, parameter in cut]
+        for parameter, own in zip(parameters, self._own, strict=True):
+            parameter.grad = own
+        self._on_cpu = self._sums.device.type == "cpu"
 
-    def step(self, parts: Sequence[Batch], own: range, step: int) -> StepResult:
+    def step(
+        self, parts: Sequence[Batch | PackedBatch], own: range, step: int
+    ) -> StepResult:
         """Do one step.
 
         Args:
@@ -105,9 +113,10 @@ class OptimizerStep:
             PeerError: if another process is gone. In both cases the weights are as before.
         """
         training, settings = self._training, self._settings
-        network = training.network.train()
+        training.network.train()
         batches = [self._prepared(part) for part in parts]
-        weight = torch.stack([supervised(batch, settings) for batch in batches]).sum(dim=0)
+        weights = [supervised(each.batch, settings) for each in batches]
+        weight = torch.stack(weights).sum(dim=0)
         self._process_group.add_up(weight)
         self._sums.zero_()
         names: list[str] = []
@@ -115,47 +124,78 @@ class OptimizerStep:
             torch.manual_seed(noise_of_part(step, settings.seed, number))  # For dropout.
             names = self._add(batch, weight, number)
         self._process_group.add_up(self._sums)
-        clipped = torch.nn.utils.clip_grad_norm_(
-            network.parameters(), settings.max_gradient_norm
-        )
-        terms = self._all_terms(names)
-        norm = float(clipped)
-        self._check(norm, terms)
+        found = torch.cat([self._clip()[None], self._figures]).cpu()
+        norm, (terms, surprise, bad) = float(found[0]), self._told(found[1:], names)
+        _check(norm, terms, bad)
         for group in training.optimiser.param_groups:
             group["lr"] = learning_rate(settings, step)
         training.optimiser.step()
         _move_average(training, settings, step)
-        return StepResult(terms, norm, self._surprise.clone())
+        return StepResult(terms, norm, surprise)
 
-    def _prepared(self, part: Batch) -> Batch:
+    def _prepared(self, part: Batch | PackedBatch) -> IndexedBatch:
         """Move a part to its device; simulate it for closed-loop fine-tuning."""
-        here = to_device(part, self._sums.device)
+        here = prepared(part, self._sums.device)
         top = self._settings.closed_loop_top_k
-        return close_loop(self._training.network, here, top) if top else here
+        if not top:
+            return here
+        return replace(here, batch=close_loop(self._training.network, here.batch, top))
 
-    def _add(self, batch: Batch, weight: Tensor, number: int) -> list[str]:
+    def _add(self, indexed: IndexedBatch, weight: Tensor, number: int) -> list[str]:
         """Add the gradient and the sums of one part; return the names of its terms."""
-        outputs = self.forward(batch)
+        batch = indexed.batch
+        outputs = self.forward(batch, indexed.index)
         terms = losses(outputs, batch, self._settings)
         loss = _share(terms, weight, self._settings)
-        loss.backward()  # type: ignore[no-untyped-call]
-        for name, term in terms.items():
-            found = [getattr(term, figure).detach().float() for figure in FIGURES]
-            self._terms[TERMS.index(name)] += torch.stack(found)
+        self._add_gradient(loss)
+        nothing = loss.new_zeros(())
+        none = Term(nothing, nothing, nothing, nothing, nothing)
+        found = [getattr(terms.get(each, none), name) for each in TERMS for name in FIGURES]
+        sums = torch.stack([each.detach().float() for each in found])
+        self._terms += sums.view_as(self._terms)
         self._surprise += motion_surprise(outputs, batch)
         self._bad[number] = (~torch.isfinite(loss.detach())).float()
         return list(terms)
 
-    def _all_terms(self, names: Sequence[str]) -> Terms:
-        rows = self._terms.clone()
-        return {name: Term(*rows[TERMS.index(name)].unbind()) for name in names}
-
-    def _check(self, norm: float, terms: Mapping[str, Term]) -> None:
-        bad = self._bad.nonzero()[:, 0].tolist()
-        if math.isfinite(norm) and not bad:
+    def _add_gradient(self, loss: Tensor) -> None:
+        if self._on_cpu:
+            loss.backward()  # type: ignore[no-untyped-call]
             return
-        infinite = [name for name, term in terms.items() if not torch.isfinite(term.loss)]
-        raise NotFiniteError(infinite, bad)
+        found = torch.autograd.grad(loss, self._parameters, allow_unused=True)
+        sums: list[Tensor] = []
+        more: list[Tensor] = []
+        for own, gradient in zip(self._own, found, strict=True):
+            if gradient is not None:
+                sums.append(own)
+                more.append(gradient)
+        torch._foreach_add_(sums, more)
+
+    def _clip(self) -> Tensor:
+        """Clip the gradient; return its norm before that."""
+        most = self._settings.max_gradient_norm
+        if self._on_cpu:
+            return torch.nn.utils.clip_grad_norm_(self._parameters, most)
+        norm = torch.linalg.vector_norm(self._gradient)
+        self._gradient.mul_((most / (norm + 1e-6)).clamp(max=1.0))
+        return norm
+
+    def _told(
+        self, figures: Tensor, names: Sequence[str]
+    ) -> tuple[Terms, Tensor, list[int]]:
+        """Terms, surprise and the parts that are not finite, of figures on the host."""
+        rows, surprise, bad = torch.split(
+            figures, [self._terms.numel(), len(self._surprise), len(self._bad)]
+        )
+        rows = rows.view_as(self._terms)
+        terms = {name: Term(*rows[TERMS.index(name)].unbind()) for name in names}
+        return terms, surprise, bad.nonzero()[:, 0].tolist()
+
+
+def _check(norm: float, terms: Mapping[str, Term], bad: Sequence[int]) -> None:
+    if math.isfinite(norm) and not bad:
+        return
+    infinite = [name for name, term in terms.items() if not torch.isfinite(term.loss)]
+    raise NotFiniteError(infinite, bad)
 
 
 def _share(terms: Terms, weight: Tensor, settings: TrainSettings) -> Tensor:
@@ -193,7 +233,10 @@ def learning_rate(settings: TrainSettings, step: int) -> float:
 def _move_average(training: TrainingState, settings: TrainSettings, step: int) -> None:
     """Move the average towards the weights, faster at first: they are still far off."""
     decay = min(settings.ema_decay, (1 + step) / (10 + step))
-    with torch.no_grad():
-        for name, parameter in training.network.named_parameters():
-            if name in training.average:
-                training.average[name].lerp_(parameter, 1 - decay)
+    parameters = dict(training.network.named_parameters())
+    averages, current = [], []
+    for name, average in training.average.items():
+        averages.append(average)
+        current.append(parameters[name].detach())
+    if averages:
+        torch._foreach_lerp_(averages, current, 1 - decay)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import Batch
+from infgen.model.batching.index import BatchIndex
 from infgen.model.batching.tensors import in_float32
 from infgen.model.logits import Outputs
 from infgen.model.network import Network
@@ -36,10 +37,10 @@ class Pass:
         """Whether the network is compiled (as far as known: it happens at first use)."""
         return self._compiled is not None
 
-    def __call__(self, batch: Batch) -> Outputs:
+    def __call__(self, batch: Batch, index: BatchIndex | None = None) -> Outputs:
         """Compute all outputs, for the loss: in float32."""
         with self._casting():
-            return in_float32(self._forward(batch))
+            return in_float32(self._forward(batch, index))
 
     def averaged(self, batch: Batch, average: Mapping[str, Tensor]) -> Outputs:
         """Compute all outputs with other parameters: those of a moving average."""
@@ -50,17 +51,18 @@ class Pass:
             )
             return in_float32(outputs)
 
-    def _forward(self, batch: Batch) -> Outputs:
+    def _forward(self, batch: Batch, index: BatchIndex | None) -> Outputs:
+        how = {"hidden_roads": self._hidden_roads, "index": index}
         if self._compiled is not None:
             from torch._dynamo.exc import TorchDynamoException  # noqa: PLC0415
 
             try:
-                return self._compiled(batch, hidden_roads=self._hidden_roads)
+                return self._compiled(batch, **how)
             except TorchDynamoException as error:  # Not a GPU that is out of memory.
                 self._compiled = None
                 why = str(error).strip().splitlines()[0]
                 warnings.warn(f"going on without compiling: {why}", stacklevel=2)
-        outputs: Outputs = self._network(batch, hidden_roads=self._hidden_roads)
+        outputs: Outputs = self._network(batch, **how)
         return outputs
 
     def _casting(self) -> AbstractContextManager[object]:

@@ -2,7 +2,10 @@
 
 The first process calls the others together for one piece of work at a time, with a note in
 the store that ``torchrun`` provides: what to do, as JSON. Nothing else passes between them
-but sums of numbers.
+but sums of numbers: of tensors on GPUs by nccl, of tensors on CPUs, as votes are, by gloo.
+
+NCCL only tells its caller of a process that is lost if ``TORCH_NCCL_BLOCKING_WAIT`` is set,
+as ``cli.py`` sets it; otherwise a thread of its own ends the process, and nothing is saved.
 """
 
 import json
@@ -19,7 +22,7 @@ from torch import Tensor
 from torch.distributed.rendezvous import rendezvous
 
 from pipeline.engine import signals
-from pipeline.stages.train.ranks import own_rank
+from pipeline.stages.train.ranks import Rank, own_rank
 
 POLL_S = 0.1
 MEETING = timedelta(minutes=30)
@@ -69,7 +72,7 @@ class ProcessGroup:
 
     def any(self, said: bool) -> bool:
         """Tell whether any process says so."""
-        votes = torch.tensor(float(said), device=self.device)
+        votes = torch.tensor(float(said))  # On the CPU: no GPU is waited for.
         self.add_up(votes)
         return bool(votes > 0)
 
@@ -79,7 +82,7 @@ class ProcessGroup:
         Raises:
             PeerError: if they do not.
         """
-        found = torch.tensor([number, number**2], dtype=torch.float64, device=self.device)
+        found = torch.tensor([number, number**2], dtype=torch.float64)
         self.add_up(found)
         mean, square = (found / self.size).tolist()
         if (mean, square) != (number, number**2):
@@ -90,7 +93,15 @@ def own_device() -> torch.device:
     """Where this process computes: its own GPU, if there are any."""
     if not torch.cuda.is_available():
         return torch.device("cpu")
-    return torch.device("cuda", own_rank().local)
+    return device_of(own_rank(), torch.cuda.device_count())
+
+
+def device_of(rank: Rank, gpus: int) -> torch.device:
+    """Tell which of the GPUs that a process sees is its own.
+
+    Some launchers show every process all GPUs of its machine, some only its own.
+    """
+    return torch.device("cuda", rank.local % gpus) if gpus else torch.device("cpu")
 
 
 @dataclass
@@ -174,11 +185,13 @@ def _process_group(timeout_s: float) -> Iterator[ProcessGroup]:
         raise PeerError("this process has not joined a group")
     store = _part(_MEETING.store, f"call-{_MEETING.calls}")
     _MEETING.calls += 1
-    if device.type == "cuda":
+    on_gpu = device.type == "cuda"
+    if on_gpu:
         torch.cuda.set_device(device)
     try:
         dist.init_process_group(
-            "nccl" if device.type == "cuda" else "gloo",
+            "cpu:gloo,cuda:nccl" if on_gpu else "gloo",
+            device_id=device if on_gpu else None,
             store=store,
             rank=rank.number,
             world_size=rank.count,

@@ -71,7 +71,8 @@ class TrainingSetup:
         order = ScenePermutation(sizes, how.batch_scenes, how.bucket_batches, how.seed)
         first = group.rank * how.gradient_accumulation
         own = range(first, first + how.gradient_accumulation)
-        return Recipe(self.scenes, self.limits, order, parts, own)
+        packed = group.device.type != "cpu"
+        return Recipe(self.scenes, self.limits, order, parts, own, packed=packed)
 
 
 def begin(

@@ -12,10 +12,12 @@ from pydantic import ValidationError
 
 from infgen.config import TrainSettings
 from infgen.model.batching.perturbation import (
+    LoggedMotion,
     Perturbation,
     make_perturbation,
     perturb_map,
     perturb_motion,
+    perturb_scenes,
 )
 from infgen.tokens.motion_tokens import advance, make_match_table, nearest_motion_tokens
 from infgen.tokens.scene_tokens import NO_MOTION_TOKEN
@@ -92,7 +94,30 @@ def random_drives(vocabulary, seed, agents=20, tokens=10):
 
 
 def stray(drives, noise, seed=0):
-    return perturb_motion(*drives, noise, np.random.default_rng(seed))
+    return perturb_motion(drawn(drives, noise, seed), noise)
+
+
+def drawn(drives, noise, seed=0):
+    return LoggedMotion.drawn(*drives, noise, np.random.default_rng(seed))
+
+
+@given(st.integers(0, 2**32), st.sampled_from([0.0, 0.5]))
+@settings(max_examples=10)
+def test_scenes_stray_together_as_they_do_alone(seed, drift):
+    vocabulary = fan_moves()
+    noise = noise_of(vocabulary, 9, share=0.5, drift=drift)
+    sizes = ((3, 18), (0, 5), (7, 11))
+    scenes = [
+        drawn(random_drives(vocabulary, seed + i, *size), noise, seed)
+        for i, size in enumerate(sizes)
+    ]
+
+    together = perturb_scenes(scenes, noise)
+
+    for scene, found in zip(scenes, together, strict=True):
+        for ours, alone in zip(found, perturb_motion(scene, noise), strict=True):
+            np.testing.assert_array_equal(ours, alone)
+    assert perturb_scenes([], noise) == []
 
 
 def test_agents_stray_by_a_step_of_the_codebook_and_no_farther():
@@ -124,11 +149,10 @@ def test_the_move_to_learn_makes_good_what_the_last_one_missed():
 def test_poses_follow_moves_and_labels_are_the_nearest_moves(seed, few):
     vocabulary = straight_moves()
     noise = noise_of(vocabulary, few)
-    agent_type, pose, motion_token, moving = random_drives(vocabulary, seed)
+    drives = random_drives(vocabulary, seed)
+    agent_type, pose, _, moving = drives
 
-    strays = perturb_motion(
-        agent_type, pose, motion_token, moving, noise, np.random.default_rng(seed)
-    )
+    strays = stray(drives, noise, seed)
 
     for token in range(1, pose.shape[1]):
         rows = np.flatnonzero(moving[:, token])

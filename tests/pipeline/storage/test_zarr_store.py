@@ -270,15 +270,6 @@ def test_zarr_reads_the_file_by_itself(group):
         assert opened["mood"][:].tolist() == [0, 1, 2] * 5
 
 
-def test_a_record_is_read_with_the_file_opened_once(group, monkeypatch):
-    opened = read_records(group, Walk, SCHEMA, whole=False)
-    count, plain = [], os.open
-    monkeypatch.setattr(os, "open", lambda *given: count.append(given) or plain(*given))
-
-    assert opened[4].name == "walk 4"
-    assert len(count) == 1
-
-
 def test_a_killed_write_leaves_no_group(tmp_path):
     class Killed(BaseException):
         pass

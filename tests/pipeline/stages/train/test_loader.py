@@ -17,6 +17,7 @@ from infgen.model.batching.tensors import map_tensors
 from pipeline.stages.train.loader import (
     TokenScenes,
     draw_of_step,
+    made_by_processes,
     train_batches,
     validation_batches,
 )
@@ -81,6 +82,27 @@ def test_noise_is_the_same_whoever_makes_it_and_never_in_held_out_scenes(
         assert not torch.equal(logged.label, parts[0].agents.label)
     (validation_split,) = validation_batches(setup.validation_split, setup.limits, 9, 0, 9)
     assert torch.equal(validation_split.agents.label, validation_split.agents.motion_token)
+
+
+def test_a_packed_batch_unpacks_to_itself_and_the_places_that_hold_something(setup):
+    recipe = setup.recipe(ProcessGroup())
+    packed = replace(recipe, packed=True)
+
+    for step, made in enumerate(made_by_processes(packed, range(2), 1)):
+        (plain,), (found,) = recipe[step], made
+        unpacked = found.unpack(torch.device("cpu"))
+        assert_same([unpacked.batch], [plain])
+        assert found.scenario_ids == plain.scenario_ids
+        index, agents = unpacked.index, plain.agents
+        assert index.visible.pack(agents.visible).all()
+        assert len(index.visible.at) == agents.visible.sum()
+        assert len(index.described.at) == plain.details.present.sum()
+        assert len(index.asked.at) == plain.entries.asked.sum()
+        hidden = torch.zeros_like(plain.roads.real).flatten()
+        hidden[index.roads.hidden] = True
+        assert torch.equal(hidden.view_as(plain.roads.real), plain.roads.predicted)
+        before = index.roads.rows.at[index.roads.before]
+        assert torch.equal(before, index.roads.hidden - 1)
 
 
 @pytest.mark.parametrize("workers", [0, 1])

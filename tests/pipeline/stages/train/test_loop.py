@@ -1,6 +1,7 @@
 """The loop: what it says no to, what it keeps when it must stop, and that it learns."""
 
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
@@ -46,6 +47,26 @@ def test_a_loss_that_is_not_finite_names_its_terms_and_scenes_and_keeps_the_weig
     other = begin(setup, *books)
     assert load_checkpoint(setup.folder, other) == 3
     assert all(torch.isfinite(p).all() for p in other.network.parameters())
+
+
+def test_memory_that_does_not_suffice_is_an_error_that_names_the_settings(
+    setup, books, quiet
+):
+    training, forwards = begin(setup, *books), count(1)
+
+    def full(module, arguments):
+        if next(forwards) > 3:
+            raise torch.OutOfMemoryError("tried to allocate 7 GiB\nand more")
+
+    training.network.register_forward_pre_hook(full)
+
+    with pytest.raises(TrainingError, match=r"step 3: .* 2 scenes .*gradient_accumulation"):
+        train(setup, training, quiet)
+
+    other = begin(setup, *books)
+    assert load_checkpoint(setup.folder, other) == 3
+    for name, value in other.network.state_dict().items():
+        assert torch.equal(training.network.state_dict()[name], value)
 
 
 def test_only_the_scenes_of_the_part_that_is_not_finite_are_named(

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from pipeline.stages.train.launch import joined
-from pipeline.stages.train.process_group import PeerError, ProcessGroup
+from pipeline.stages.train.process_group import PeerError, ProcessGroup, device_of
 from pipeline.stages.train.ranks import Rank, own_rank
 from pipeline.stages.train.stage import work
 from pipeline.stages.train.train_log import read_log
@@ -187,6 +187,14 @@ def test_alone_nothing_is_added_up():
     assert values.tolist() == [1.0, 2.0]
     assert ProcessGroup().any(True)
     assert not ProcessGroup().any(False)
+
+
+@pytest.mark.parametrize(
+    ("local", "gpus", "device"),
+    [(3, 8, "cuda:3"), (3, 1, "cuda:0"), (5, 4, "cuda:1"), (2, 0, "cpu")],
+)
+def test_a_process_has_a_gpu_among_those_it_sees(local, gpus, device):
+    assert device_of(Rank(number=local, count=8, local=local), gpus) == torch.device(device)
 
 
 def test_without_torchrun_there_is_one_process():

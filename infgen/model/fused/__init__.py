@@ -1,0 +1,1 @@
+"""The same network with fewer launches, for training on a GPU."""

@@ -1,0 +1,128 @@
+"""With fewer launches the network says and learns the same."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from infgen.config import TrainSettings
+from infgen.model.batching.batch import collate
+from infgen.model.batching.index import BatchIndex
+from infgen.model.batching.tensors import in_float32
+from infgen.model.fused.attention import _FusedPairs, _Gate
+from infgen.model.fused.together import launched_together
+from infgen.model.neighbour_attention import Shared
+from infgen.model.network import Network
+from infgen.model.relation_tables import (
+    RelationEmbedding,
+    _back_in_segments,
+    _back_to_rows,
+)
+from infgen.model.training.losses import losses, total
+from tests.model.conftest import (
+    GRID,
+    TINY,
+    VARIANTS,
+    make_motion_codebook,
+    make_network,
+    make_record,
+    make_road_codebook,
+)
+
+
+def learned(network, batch, *, together, bf16=False):
+    """Loss and gradients of a batch."""
+    network.zero_grad()
+    index = BatchIndex.of(batch)
+    cast = torch.autocast("cpu", torch.bfloat16, enabled=bf16)
+    with cast, launched_together(network, together=together):
+        outputs = in_float32(network(batch, hidden_roads=True, index=index))
+    loss = total(losses(outputs, batch, TrainSettings()), TrainSettings())
+    loss.backward()
+    found = {name: p.grad for name, p in network.named_parameters() if p.grad is not None}
+    return loss.detach(), found
+
+
+@pytest.mark.parametrize("variant", ["full", "the paper's", "narrow relations", "smart"])
+def test_launched_together_a_network_learns_what_it_learns_part_by_part(variant, limits):
+    torch.manual_seed(1)
+    settings = replace(TINY, **VARIANTS[variant])
+    network = Network(settings, make_motion_codebook(), make_road_codebook(), GRID)
+    batch = collate([make_record(3, agents=12), make_record(4)], limits, 0)
+
+    plain, ours = (learned(network.train(), batch, together=b) for b in (False, True))
+
+    torch.testing.assert_close(ours[0], plain[0], rtol=1e-5, atol=0.0)
+    assert ours[1].keys() == plain[1].keys()
+    for name, gradient in plain[1].items():
+        close = {"rtol": 1e-3, "atol": 1e-4 * float(gradient.abs().max()) + 1e-6}
+        torch.testing.assert_close(ours[1][name], gradient, msg=name, **close)
+
+
+def test_under_autocast_losses_are_nearly_those_of_float32(limits):
+    network = make_network().train()
+    batch = collate([make_record(3, agents=12)], limits, 0)
+    sharp, _ = learned(network, batch, together=True)
+
+    rough, gradients = learned(network, batch, together=True, bf16=True)
+
+    assert rough != sharp
+    torch.testing.assert_close(rough, sharp, rtol=0.02, atol=0.0)
+    assert all(torch.isfinite(each).all() for each in gradients.values())
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25])
+def test_pairs_are_differentiated_as_they_are_computed(share):
+    torch.manual_seed(2)
+    double = {"dtype": torch.float64, "requires_grad": True}
+    by_both, features = torch.randn(3, 2, 5, **double), torch.randn(4, 3, **double)
+    relation = torch.randn(3, 6, 2, **double)
+    index = torch.randint(4, (3, 6))
+    hidden = torch.rand(3, 1, 6) < 0.3
+    hidden[1] = True  # Nobody is there.
+    cover = torch.zeros(3, 1, 6, dtype=torch.float64).masked_fill_(hidden, -1e9)
+
+    def pairs(by_both, features, relation):
+        torch.manual_seed(3)  # Drops the same weights each time.
+        shared = Shared.of(relation)
+        more = cover, hidden.all(dim=-1, keepdim=True), share
+        shared = shared.values, shared.ticket, shared.pulled
+        return _FusedPairs.apply(by_both, features, index, *shared, *more)
+
+    assert torch.autograd.gradcheck(pairs, (by_both, features, relation))
+    saw = pairs(by_both, features, relation)
+    assert not saw[1].any()
+    assert share or torch.allclose(saw[[0, 2], :, 5], torch.ones(2, 2, dtype=torch.float64))
+    assert not saw[..., 6:].any()
+
+
+def test_gates_are_differentiated_as_they_are_computed():
+    torch.manual_seed(2)
+    double = {"dtype": torch.float64, "requires_grad": True}
+    given = [torch.randn(*shape, **double) for shape in ((4, 3), (4, 3), (6, 6), (6,))]
+
+    assert torch.autograd.gradcheck(_Gate.apply, given)
+
+
+def test_tables_evaluated_together_are_those_evaluated_alone(network):
+    tables = [each for each in network.modules() if isinstance(each, RelationEmbedding)]
+    alone = [each.table() for each in tables]
+
+    with launched_together(network, together=True):
+        together = [each.table() for each in tables]
+
+    for one, other in zip(together, alone, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
+    assert all(each.evaluated is None for each in tables)
+
+
+def test_what_comes_back_in_segments_is_what_comes_back_to_rows():
+    torch.manual_seed(5)
+    pull, nodes = torch.randn(200, 4), torch.randint(30, (200, 6))
+    nodes[:150] = 7  # A hot row.
+    shares = torch.rand(200, 6)
+
+    found = _back_in_segments(pull, nodes, shares, 40)
+
+    expected = _back_to_rows(pull, nodes, shares, 40)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
