@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -31,14 +32,20 @@ from infgen.metrics.windows import cut_windows
 from infgen.rollout.rollout import Rollout
 from infgen.scene import Scene
 from infgen.spatial.road_edges import RoadEdges
-from pipeline.stages.score_write import CURVE_SCHEMA, SUM_SCHEMA
+from pipeline.stages.score_write import SUM_SCHEMA
 
 PARTS, SUMS = "proper.parquet", "proper_sums.parquet"
 CURVES = "proper_curves.parquet"
-PARTS_SCHEMA = {
+PARTS_SCHEMA: dict[str, Any] = {
     "scenario_id": pl.String,
     "part": pl.String,
     "values": pl.List(pl.Float32),
+}
+SCENE_CURVES_SCHEMA = {
+    "metric": pl.String,
+    "window": pl.Int32,
+    "value": pl.Float64,
+    "scenes": pl.Int64,
 }
 PROPER = "proper"
 """Before the names of its numbers in tables."""
@@ -200,5 +207,4 @@ def write_proper_curves(target: Path, tally: ProperTally) -> None:
         for window, (total, count) in enumerate(values.T)
         if count
     ]
-    table = pl.DataFrame(rows, schema={**CURVE_SCHEMA}, orient="row")
-    table.rename({"rollouts": "scenes"}).write_parquet(target)
+    pl.DataFrame(rows, schema=SCENE_CURVES_SCHEMA, orient="row").write_parquet(target)
