@@ -23,7 +23,7 @@ from infgen.metrics.proper.spread import (
 )
 from tests.metrics.proper.birth_death import COPIES, Town, draw, ensemble, towns
 
-SCENES, MEMBERS = 150, 16
+SCENES, MEMBERS = 100, 16
 GENERATOR = "generator"
 
 
@@ -41,13 +41,21 @@ def played():
 
 
 @pytest.fixture(scope="module")
-def scored(played):
-    """Mean of the fair scores of each forecaster."""
+def forecasts(played):
+    """The same as numbers."""
     truths, found = played
+    members = {name: [read_courses(some) for some in each] for name, each in found.items()}
+    return [read_course(truth) for truth in truths], members
+
+
+@pytest.fixture(scope="module")
+def scored(forecasts):
+    """Mean of the fair scores of each forecaster."""
+    truths, found = forecasts
     return {
         name: np.mean(
             [
-                score_ensemble(read_courses(some), read_course(truth)).mean(axis=0)
+                score_ensemble(some, truth).mean(axis=0)
                 for truth, some in zip(truths, members, strict=True)
             ],
             axis=0,
@@ -58,8 +66,8 @@ def scored(played):
 
 def pooled(truths, members):
     """All scenes beside each other: [member, scene x window, quantity] and the truth."""
-    forecast = np.concatenate([read_courses(some).single for some in members], axis=1)
-    return forecast, np.concatenate([read_course(truth).single for truth in truths])
+    forecast = np.concatenate([some.single for some in members], axis=1)
+    return forecast, np.concatenate([truth.single for truth in truths])
 
 
 @pytest.mark.parametrize("copy", COPIES)
@@ -69,8 +77,8 @@ def test_fair_scores_are_least_for_the_generator(scored, copy):
 
 
 @pytest.mark.parametrize("copy", COPIES)
-def test_ranks_and_spread_are_right_for_the_generator_alone(played, copy):
-    truths, found = played
+def test_ranks_and_spread_are_right_for_the_generator_alone(forecasts, copy):
+    truths, found = forecasts
     for at, quantity in enumerate(QUANTITIES):
         off = {}
         for name in (GENERATOR, copy):

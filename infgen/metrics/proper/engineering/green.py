@@ -60,7 +60,7 @@ def delays_s(vehicles: Vehicles, greens: Greens) -> Float64[np.ndarray, " value"
         if step >= vehicles.near.shape[1]:
             continue
         ahead_m, aside_m = _before_line_m(vehicles, int(step), stop_m, way_rad)
-        angle_rad = np.abs(turned_rad(way_rad, vehicles.heading_rad[:, step]))
+        angle_rad = np.abs(turned_rad(way_rad[None], vehicles.heading_rad[:, step]))
         with np.errstate(invalid="ignore"):
             queues = vehicles.near[:, step] & (vehicles.speed_mps[:, step] < STANDING_MPS)
         queues &= (ahead_m > 0) & (ahead_m < QUEUE_M) & (aside_m < LANE_M)

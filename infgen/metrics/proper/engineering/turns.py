@@ -56,6 +56,6 @@ def turns_deg(
                 continue
             seen = outside[row, begin - 1] and outside[row, end]
             if seen and away_m[row, begin:end].min() < CORE_M:
-                heading_rad = vehicles.heading_rad[row, [begin, end]]
-                found.append(float(np.degrees(turned_rad(*heading_rad))))
+                one_rad, other_rad = vehicles.heading_rad[row, [begin, end]][:, None]
+                found.append(float(np.degrees(turned_rad(one_rad, other_rad)[0])))
     return np.array(found, dtype=np.float64)
