@@ -72,9 +72,9 @@ def proper_charts(summary: Mapping[str, Any], curves: Path) -> list[Chart]:
         )
     ]
     ranks = [
-        Series(COUNTS[name], np.arange(len(found["ranks"][name])), _array(found, name))
+        Series(COUNTS[name], np.arange(len(shares), dtype=np.float64), np.array(shares))
         for name in QUANTITIES
-        if found["ranks"][name]
+        if (shares := found["ranks"][name])
     ]
     drawn.append(
         _chart(
@@ -189,7 +189,3 @@ def _chart(
     if not lines:
         return None
     return line_chart(lines, title=title, x_label=x_label, y_label=y_label)
-
-
-def _array(found: Mapping[str, Any], name: str) -> np.ndarray:
-    return np.array(found["ranks"][name], dtype=np.float64)

@@ -30,7 +30,7 @@ def turn_rad(random, spread):
 
 
 def drive(random, spread, start_m):
-    """Way along the lane [step]: speeds vary, and red holds at the line until it is green."""
+    """Way along the lane [step]: speeds vary, and red holds at the line until green."""
     mean_mps = choose(random, spread, 9.0, 2.0, 1.0)
     swing = choose(random, spread, 1.5, 0.5, 0.0)
     delay = int(choose(random, spread, 12, 5, 1))
