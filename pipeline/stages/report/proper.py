@@ -76,9 +76,16 @@ def proper_charts(summary: Mapping[str, Any], curves: Path) -> list[Chart]:
         for name in QUANTITIES
         if (shares := found["ranks"][name])
     ]
+    most = max((len(line.x) for line in ranks), default=0)
+    flat = Series(
+        "as it should be",
+        np.arange(most, dtype=np.float64),
+        np.full(most, 1 / max(1, most)),
+    )
     drawn.append(
         _chart(
             ranks,
+            flat,
             title="Ranks of the truth among the rollouts (proper)",
             x_label="rollouts below the truth",
             y_label="share",
@@ -114,6 +121,7 @@ def _counts(found: Mapping[str, Any]) -> Table:
     )
 
 
+_EVENTS = {"num_entries": "entries per window", "num_exits": "exits per window"}
 _SINGLE = {
     "context": "against logs of like situations",
     "spread_skill": "spread over error",
@@ -124,7 +132,7 @@ _SINGLE = {
 def _likelihoods(found: Mapping[str, Any]) -> Table:
     rows = [
         [label, *_cells(found, f"likelihood/{name}")]
-        for name, label in {**COMPOSITES, **BUCKETS, **FEATURES}.items()
+        for name, label in {**COMPOSITES, **BUCKETS, **FEATURES, **_EVENTS}.items()
     ]
     return Table(
         title="Likelihood of the logs under their rollouts (proper)",
@@ -167,7 +175,10 @@ def _cells(found: Mapping[str, Any], name: str) -> list[Cell]:
 
 
 def _mean(found: Mapping[str, Any], name: str) -> Cell:
-    value: float | None = found["numbers"].get(name, {}).get("mean")
+    """Mean of a number; nothing where it is not defined."""
+    if name not in found["numbers"]:
+        return None
+    value: float | None = found["numbers"][name]["mean"]
     return _NOT_MEASURED if value is None else value
 
 
@@ -184,8 +195,13 @@ def _lines(path: Path, window_s: float) -> dict[str, Series]:
 
 
 def _chart(
-    lines: Sequence[Series], *, title: str, x_label: str, y_label: str
+    lines: Sequence[Series],
+    truth: Series | None = None,
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
 ) -> Chart | None:
     if not lines:
         return None
-    return line_chart(lines, title=title, x_label=x_label, y_label=y_label)
+    return line_chart(lines, truth, title=title, x_label=x_label, y_label=y_label)
