@@ -117,7 +117,7 @@ def _counts(found: Mapping[str, Any]) -> Table:
         rows=rows,
         note=f"{_about(found)} Scores: less is better, and skill 1 is best, 0 as good as "
         "the reference. Spread over error is 1 where rollouts are as unsure as they should "
-        "be, rank error 0.",
+        "be, rank error 0. Skill over motion only stands in tables of comparisons.",
     )
 
 
