@@ -12,7 +12,7 @@ from tests.metrics.proper.roads import NOW, RADIUS_M, STEP_S, traffic
 
 STEPS, GREEN = 202, 60
 LINE_M, LANES = -6.0, 4
-SCENES, ROLLOUTS = 16, 3
+SCENES, ROLLOUTS = 16, 2
 SPREAD = {"generator": 1.0, "collapsed": 0.0, "dispersed": 3.0}
 """How far every choice is from its mean, as a multiple of how far it should be."""
 
