@@ -139,7 +139,7 @@ def _likelihoods(found: Mapping[str, Any]) -> Table:
         columns=["feature", "likelihood", "95 % interval"],
         rows=rows,
         note=f"{_about(found)} More is better. An agent that is gone is an outcome of its "
-        "own, so emptying a street is punished.",
+        "own, so leaving too early or too late counts.",
     )
 
 
