@@ -5,7 +5,8 @@ Runs on the shared validation records, or on the built-in ones where they are ab
     python benchmarks/scorer.py [--scenes N]
 
 The last line is one JSON object: ``cpu_s_per_scenario`` (the Waymo metric, 32 rollouts, one
-core), ``peak_rss_mib``, and ``cpu_s_per_long_rollout`` (30 s, both long-term protocols).
+core), ``peak_rss_mib``, ``cpu_s_per_long_rollout`` (30 s, both long-term protocols), and
+``cpu_s_proper_per_scenario`` (protocol ``proper`` on top of it, 32 rollouts).
 """
 
 import argparse
@@ -25,12 +26,19 @@ from infgen.config import ReferenceSettings, TokenSettings
 from infgen.metrics.interaction import nearest_object_m, time_to_collision_s
 from infgen.metrics.kinematics import measure_kinematics
 from infgen.metrics.long_term.binned import Binned, bin_traffic
+from infgen.metrics.proper.context import read_context
+from infgen.metrics.proper.engineering.measure import read_place
+from infgen.metrics.proper.retrieval import CLIMATOLOGY_LOGS, LogCourse, retrieve
+from infgen.metrics.proper.sample import Frame, take_sample
+from infgen.metrics.proper.scene import References, score_scene
 from infgen.metrics.road import road_edge_m
-from infgen.metrics.traffic import Traffic, from_log
+from infgen.metrics.traffic import Traffic, from_log, logged_rows, observe_log
+from infgen.metrics.windows import cut_windows
 from infgen.metrics.wosac import metric
 from infgen.metrics.wosac.logged import HISTORY_STEPS, LOG_STEPS, LogError, LoggedScene
 from infgen.metrics.wosac.rollouts import Rollouts, played
 from infgen.metrics.wosac.signals import build_stop_lines, runs_red_light
+from infgen.scene import Scene
 from infgen.spatial.road_edges import RoadEdges, build_road_edges, scene_road_edges
 
 ROLLOUTS = 32
@@ -123,6 +131,46 @@ def time_long(limit: int) -> float:
     return float(np.mean(seconds))
 
 
+def time_proper(limit: int) -> float:
+    """CPU-seconds of protocol ``proper`` for a scene with all its rollouts, once binned.
+
+    The log stands for each of its rollouts here, so that they last as long as it does.
+    """
+    seconds = []
+    for scene in islice(read_split("validation"), limit or None):
+        log, edges = observe_log(scene), scene_road_edges(scene)
+        binned = _bin(log, edges)
+        ids = scene.tracks.id[logged_rows(scene)]
+        steps = log.motion.x_m.shape[2] - 1 - log.now
+        seconds.append(
+            cpu_s(lambda a=(scene, log, binned, ids, steps): _score_proper(*a))  # type: ignore[misc]
+        )
+    return float(np.mean(seconds))
+
+
+def _score_proper(
+    scene: Scene, log: Traffic, binned: Binned, ids: np.ndarray, steps: int
+) -> None:
+    settings = ReferenceSettings()
+    window_s, radius_m = settings.proper_window_s, settings.count_radius_m
+    frame = Frame(
+        windows=cut_windows(steps, window_s, window_s),
+        window_s=window_s,
+        radius_m=radius_m,
+        place=read_place(scene, radius_m, logged_lights=True),
+    )
+    samples = [
+        take_sample(log, binned, ids, frame, logged=at == 0) for at in range(ROLLOUTS + 1)
+    ]
+    context = read_context(scene, log, radius_m)
+    logs = [
+        LogCourse(str(at), context, samples[0].whole_course)
+        for at in range(CLIMATOLOGY_LOGS)
+    ]
+    near = retrieve(scene.scenario_id, context, logs)
+    score_scene(samples[0], samples[1:], References(logs, near))
+
+
 def _bin(traffic: Traffic, edges: RoadEdges | None) -> Binned:
     radius_m = ReferenceSettings().count_radius_m
     return bin_traffic(traffic, edges, radius_m, as_logged=False)
@@ -158,11 +206,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"  {count:4d} {value:6.3f} CPU-s")
     long_s = time_long(scenes)
     print(f"long-term bins of one 30 s rollout, two protocols: {long_s:.3f} CPU-s")
+    proper_s = time_proper(scenes)
+    print(
+        f"protocol proper of one scene x {ROLLOUTS} rollouts, as long as the log: "
+        f"{proper_s:.3f} CPU-s"
+    )
     figures = {
         "cpu_s_per_scenario": round(float(seconds.mean()), 4),
         "cpu_s_worst": round(float(seconds.max()), 4),
         "peak_rss_mib": round(peak_mib, 1),
         "cpu_s_per_long_rollout": round(long_s, 4),
+        "cpu_s_proper_per_scenario": round(proper_s, 4),
         "scenes": len(logs),
     }
     print(json.dumps(figures))

@@ -108,6 +108,7 @@ def test_it_leaves_tables_in_three_forms_every_number_and_one_page(desk):
         "table-1-short-term",
         "table-2-long-term",
         "table-3-motion-only",
+        "proper",
         "against-the-logs",
         "runs",
         "curves",

@@ -30,6 +30,8 @@ class ReferenceSettings:
     count_radius_m: NonNegative = 75.0
     """Agents within this distance of the ego are counted. The agent count error is given
     for it and for no limit."""
+    proper_window_s: Window = 2.0
+    """Length of a window of protocol `proper`; its windows lie side by side."""
 
 
 @dataclass(frozen=True, slots=True, config=RULES)
@@ -39,6 +41,8 @@ class ScoreSettings:
     presence_radius_m: NonNegative = 0.0
     """For models that neither insert nor remove: an agent counts as present within this
     distance of the ego only, and enters or exits where it crosses it; 0 for no limit."""
+    proper: bool = True
+    """Score by protocol `proper` too, as far as the log goes."""
     wosac_version: str = "wosac-2025"
     """Version of the Waymo metric, computed on the first eight seconds."""
     bootstrap_resamples: Count = 1000

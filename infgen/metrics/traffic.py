@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int64
 
 from infgen.clock import CLOCK
 from infgen.metrics.motion import Motion
@@ -65,12 +65,23 @@ def from_log(scene: Scene, settings: TokenSettings) -> Traffic:
         TokensError: if the log cannot be written as tokens.
     """
     events = logged_events(scene, settings)
-    tracks = scene.tracks
-    rows = np.flatnonzero((tracks.agent_type >= 0) & (tracks.agent_type < AgentType.OTHER))
+    return replace(observe_log(scene), events=events)
+
+
+def logged_rows(scene: Scene) -> Int64[np.ndarray, " agent"]:
+    """Rows of the tracks that are vehicles, pedestrians and cyclists."""
+    agent_type = scene.tracks.agent_type
+    return np.flatnonzero((agent_type >= 0) & (agent_type < AgentType.OTHER))
+
+
+def observe_log(scene: Scene) -> Traffic:
+    """Read a log without its entries and exits, which are read from tokens."""
+    tracks, rows = scene.tracks, logged_rows(scene)
     valid = tracks.valid[rows]
     share = valid / np.maximum(1, valid.sum(axis=1, keepdims=True))
     size_lwh_m = np.einsum("as,asc->ac", share, tracks.size_lwh_m[rows])
     xyz_m = np.ascontiguousarray(np.moveaxis(tracks.xyz_m[rows], -1, 0))
+    nothing = np.zeros(0, np.int16), np.zeros(0, np.float32)
     return Traffic(
         scenario_id=scene.scenario_id,
         index=LOGGED,
@@ -85,7 +96,7 @@ def from_log(scene: Scene, settings: TokenSettings) -> Traffic:
             agent_type=tracks.agent_type[rows],
             valid=valid[None],
         ),
-        events=events,
+        events=Events(*nothing, *nothing),
     )
 
 

@@ -11,7 +11,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from infgen.config import RolloutSettings
 from infgen.errors import ConfigError
 from infgen.exports.wosac import About
 from infgen.rollout.rollout import Rollout
@@ -25,6 +24,7 @@ from pipeline.engine.atomic import (
 from pipeline.engine.events import Event
 from pipeline.engine.locks import locked
 from pipeline.engine.manifest import read_manifest
+from pipeline.storage.rollouts import read_lights
 from pipeline.storage.scene_lookup import SceneLookup, unit_folders
 
 REQUEST = "request.json"
@@ -174,21 +174,13 @@ def find_units(rollouts: Path) -> list[Unit]:
         )
         for scenario_id, rollout in index.iter_rows():
             scenes.setdefault(scenario_id, []).append(rollout)
-        found.append(Unit(folder, scenes, _lights_of(folder)))
+        found.append(Unit(folder, scenes, read_lights(folder)))
     for scenario_id in (each for unit in found for each in unit.scenes):
         if not _SAFE_ID.fullmatch(scenario_id):
             raise ExportError(f"scenario id {scenario_id!r} cannot name a file")
     if not any(unit.scenes for unit in found):
         raise ConfigError(f"{rollouts} holds no rollouts; `infgen rollout` makes some")
     return found
-
-
-def _lights_of(folder: Path) -> str:
-    """Tell what lights showed in a unit's rollouts: as it was then usual, if it is old."""
-    if not (folder / MANIFEST).is_file():
-        return RolloutSettings().signals
-    played = read_manifest(folder).get("settings", {}).get("rollout", {})
-    return str(played.get("signals", RolloutSettings().signals))
 
 
 def parts_of(unit: Unit) -> Iterator[Part]:

@@ -16,6 +16,7 @@ from pipeline.engine.layout import read_json
 from pipeline.engine.manifest import read_manifest
 from pipeline.engine.plan import Plan
 from pipeline.stages.reference_files import read_against, read_binned, read_logged
+from pipeline.stages.score_proper import PROPER, read_proper
 from pipeline.stages.score_summary import Tally
 from pipeline.stages.score_tables import WOSAC
 from pipeline.stages.score_write import read_tally
@@ -143,7 +144,7 @@ def _plan(ran: ExecutedRun) -> Plan:
 
 
 def _tally(plan: Plan) -> Tally:
-    """Gather what the units of a stage ``score`` tallied, and the official scores."""
+    """Gather what the units of a stage ``score`` tallied, by every protocol."""
     tally = Tally()
     manifest = read_manifest(plan.root.folder(SCORE, plan[SCORE].key))
     for unit in finished_units(plan.root, SCORE, manifest):
@@ -152,6 +153,9 @@ def _tally(plan: Plan) -> Tally:
             scores = one.get("scores", {})
             found = {f"{OFFICIAL}/{name}": value for name, value in scores.items()}
             tally.means[one["scenario_id"]].update(found)
+        proper = read_proper(unit.path)
+        for scenario_id in proper.parts:
+            tally.means[scenario_id].update(proper.numbers(scenario_id))
     return tally
 
 
@@ -164,6 +168,8 @@ def _numbers(summary: Mapping[str, Any]) -> Iterator[tuple[str, Measured]]:
             yield f"{protocol}/divergence/{name}", Measured(value)
     for name, entry in summary["numbers"].items():
         yield name, _measured(entry)
+    for name, entry in summary[PROPER]["numbers"].items():
+        yield f"{PROPER}/{name}", _measured(entry)
     for name, entry in summary[OFFICIAL]["scores"].items():
         yield f"{OFFICIAL}/{name}", _measured(entry)
 

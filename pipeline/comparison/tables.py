@@ -7,6 +7,7 @@ from infgen.clock import CLOCK
 from infgen.views.published import ABLATIONS, CAVEAT, PAPER, Published
 from infgen.views.sheets import Measured, Sheet, SheetCell
 from pipeline.comparison.claims import PROTOCOLS, claims
+from pipeline.comparison.proper import proper
 from pipeline.comparison.result import LONG, MOTION_ONLY, OFFICIAL_PLAY, ComparisonResult
 from pipeline.comparison.statistics import truth
 from pipeline.engine.layout import KEY_DIGITS
@@ -37,6 +38,7 @@ def tables(found: ComparisonResult) -> list[Sheet]:
         short_term(found),
         long_term(found),
         motion_only(found),
+        proper(found),
         ablations(found),
         against_logs(found),
         runs(found),

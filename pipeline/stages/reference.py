@@ -16,6 +16,7 @@ from pipeline.storage.splits import files_of_split
 if TYPE_CHECKING:
     from infgen.metrics.long_term.binned import Binned
     from infgen.metrics.long_term.reference import Counts
+    from infgen.metrics.proper.retrieval import LogCourse
     from infgen.scene import Scene
 
 SCENES_PER_GROUP = 64
@@ -41,7 +42,7 @@ def work(
     from pipeline.stages import reference_files as files  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
-    counts, logged = no_counts(), []
+    counts, logged, courses = no_counts(), [], []
     group: list[Binned] = []
     skipped: dict[str, str] = {}
     for scene in read_task_scenes(unit.task):
@@ -51,6 +52,7 @@ def work(
             continue
         counts += measured[0]
         binned = measured[1]
+        courses.append(measured[2])
         group.append(binned)
         numbers = LogCounts(binned.num_near, binned.num_all)
         logged.append(files.Logged(scene.scenario_id, numbers))
@@ -61,15 +63,19 @@ def work(
     files.write_binned(target, len(logged), group)
     files.write_counts(target, counts)
     files.write_logged(target, logged)
+    files.write_courses(target, courses)
     return {"scenes": len(logged), "skipped": skipped}
 
 
 def _measure(
     scene: "Scene", tokens: TokenSettings, settings: ReferenceSettings
-) -> "tuple[Counts, Binned] | str":
-    """Count one log, and bin it; or say why it cannot be."""
+) -> "tuple[Counts, Binned, LogCourse] | str":
+    """Count one log, bin it and follow its course; or say why it cannot be."""
     from infgen.metrics.long_term.binned import bin_traffic  # noqa: PLC0415
     from infgen.metrics.long_term.reference import count_log  # noqa: PLC0415
+    from infgen.metrics.proper.context import read_context  # noqa: PLC0415
+    from infgen.metrics.proper.course import follow_course  # noqa: PLC0415
+    from infgen.metrics.proper.retrieval import LogCourse  # noqa: PLC0415
     from infgen.metrics.traffic import from_log  # noqa: PLC0415
     from infgen.metrics.windows import cut_windows  # noqa: PLC0415
     from infgen.spatial.road_edges import scene_road_edges  # noqa: PLC0415
@@ -85,7 +91,13 @@ def _measure(
     edges, radius_m = scene_road_edges(scene), settings.count_radius_m
     logged = bin_traffic(traffic, edges, radius_m, as_logged=True)
     played = bin_traffic(traffic, edges, radius_m, as_logged=False)
-    return count_log(logged, windows), played
+    side_by_side = cut_windows(after, settings.proper_window_s, settings.proper_window_s)
+    course = LogCourse(
+        scenario_id=scene.scenario_id,
+        context=read_context(scene, traffic, radius_m),
+        course=follow_course(traffic, radius_m, side_by_side),
+    )
+    return count_log(logged, windows), played, course
 
 
 def finish(
@@ -105,7 +117,7 @@ def finish(
 
 STAGE = Stage(
     name="reference",
-    version=2,
+    version=3,
     settings={"tokenize": TokenSettings, "reference": ReferenceSettings},
     plan=plan,
     work=work,

@@ -8,12 +8,14 @@ from infgen.config import ReferenceSettings
 from infgen.metrics.long_term.binned import Binned
 from infgen.metrics.long_term.reference import Counts, log_probabilities
 from infgen.metrics.long_term.table import Against, LogCounts
+from infgen.metrics.proper.retrieval import LogCourse
 from pipeline.engine.layout import read_json
 from pipeline.storage.zarr_store import read_records, write_json, write_records
 
 BINNED_SCHEMA, COUNTS_SCHEMA = "infgen.binned/1", "infgen.counts/1"
-LOGGED_SCHEMA = "infgen.logged/1"
+LOGGED_SCHEMA, COURSES_SCHEMA = "infgen.logged/1", "infgen.courses/1"
 COUNTS, LOGGED, MEANS = "counts.zarr", "logged.zarr", "means.json"
+COURSES = "courses.zarr"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,16 @@ def read_logged(folder: Path) -> dict[str, LogCounts]:
     """Read the numbers of agents of one file's logs, by scenario id."""
     logged = read_records(folder / LOGGED, Logged, LOGGED_SCHEMA, whole=True)
     return {one.scenario_id: one.counts for one in logged}
+
+
+def write_courses(target: Path, logs: Sequence[LogCourse]) -> None:
+    """Write the situations and courses of some logs."""
+    write_records(target / COURSES, logs, LogCourse, COURSES_SCHEMA, compress=True)
+
+
+def read_courses(folder: Path) -> list[LogCourse]:
+    """Read the situations and courses of a unit's logs, or of the sample of a split's."""
+    return list(read_records(folder / COURSES, LogCourse, COURSES_SCHEMA, whole=True))
 
 
 def write_means(target: Path, near: float, everyone: float) -> None:

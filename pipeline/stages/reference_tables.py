@@ -1,6 +1,6 @@
 """From the logs of a split to its counts, and to the logs' own scores under them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ from infgen.config import ReferenceSettings
 from infgen.metrics.agent_count import mean_counts
 from infgen.metrics.long_term.reference import add_up
 from infgen.metrics.long_term.table import make_row
+from infgen.metrics.proper.retrieval import LogCourse, sample_logs
 from infgen.metrics.windows import cut_windows
 from pipeline.engine.stage import Progress
 from pipeline.stages import reference_files as files
@@ -25,6 +26,7 @@ def gather(
     """Add up the units' counts, score their logs, and write both; returns the logs."""
     files.write_counts(target, add_up(files.read_counts(unit) for unit in units))
     files.write_means(target, *_means(units, settings))
+    files.write_courses(target, sample_logs(_courses(units)))
     parts = target / "parts"
     parts.mkdir()
     tally, paths = Tally(), []
@@ -45,6 +47,12 @@ def gather(
     parts.rmdir()
     write_tally(target, tally)
     return len(tally.means)
+
+
+def _courses(units: Sequence[Path]) -> Iterator[LogCourse]:
+    """Read the courses of all logs, a unit in memory at a time."""
+    for unit in units:
+        yield from files.read_courses(unit)
 
 
 def _means(units: Sequence[Path], settings: ReferenceSettings) -> tuple[float, float]:

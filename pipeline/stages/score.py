@@ -18,8 +18,11 @@ from pipeline.storage.splits import in_split, split_of
 if TYPE_CHECKING:
     from infgen.metrics.long_term.reference import Counts
     from infgen.metrics.long_term.table import Against
+    from infgen.metrics.proper.retrieval import LogCourse
     from infgen.rollout.rollout import Rollout
     from infgen.scene import Scene
+    from infgen.spatial.road_edges import RoadEdges
+    from pipeline.stages.score_proper import SceneEnsemble
     from pipeline.stages.score_write import ScoreRow
 
 
@@ -39,7 +42,7 @@ def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
     _check_split(inputs.units("rollout"), settings["reference"].split)
     scenes = {done.name: done for done in inputs.units("ingest")}
     logs = {done.name: done for done in inputs.units("reference")}
-    identity = inputs.content("reference", "counts.zarr", "means.json")
+    identity = inputs.content("reference", "counts.zarr", "means.json", "courses.zarr")
     folder = str(inputs.folder("reference"))
     units = []
     for done in inputs.units("rollout"):
@@ -74,12 +77,14 @@ def work(
     from pipeline.engine.atomic import write_json  # noqa: PLC0415
     from pipeline.stages.reference_files import (  # noqa: PLC0415
         read_against,
+        read_courses,
         read_logged,
         write_counts,
     )
+    from pipeline.stages.score_proper import write_proper  # noqa: PLC0415
     from pipeline.stages.score_tables import WOSAC  # noqa: PLC0415
     from pipeline.stages.score_write import ROWS, write_part, write_tally  # noqa: PLC0415
-    from pipeline.storage.rollouts import read_rollouts  # noqa: PLC0415
+    from pipeline.storage.rollouts import read_lights, read_rollouts  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
     folder, logs = Path(unit.task["rollouts"]), unit.task["logs"]
@@ -87,7 +92,8 @@ def work(
     against = read_against(Path(unit.task["reference"]), logged, settings["reference"])
     wanted = _scenario_ids(folder)
     scenes = dict(_scenes(unit.task["scenes"], wanted))
-    scorer = _Scorer(against, settings["reference"], settings["score"])
+    courses = read_courses(Path(unit.task["reference"]))
+    scorer = _Scorer(against, courses, read_lights(folder) == "log", settings)
     grouped = groupby(read_rollouts(folder), key=lambda rollout: rollout.scenario_id)
     for scenario_id, group in grouped:
         if scenario_id in scenes:
@@ -96,6 +102,7 @@ def work(
     scorer.tally.close_unit()
     write_part(target / ROWS, scorer.rows())
     write_tally(target, scorer.tally)
+    write_proper(target, scorer.proper)
     write_counts(target, scorer.counts)
     write_json(target / WOSAC, scorer.official)
     missing = [scenario_id for scenario_id in wanted if scenario_id not in scenes]
@@ -110,15 +117,24 @@ class _Scorer:
     """The scores of one unit, taken scene by scene."""
 
     def __init__(
-        self, against: "Against", reference: ReferenceSettings, settings: ScoreSettings
+        self,
+        against: "Against",
+        courses: "Sequence[LogCourse]",
+        logged_lights: bool,
+        settings: Mapping[str, Any],
     ) -> None:
         from infgen.metrics.long_term.reference import no_counts  # noqa: PLC0415
+        from pipeline.stages.score_proper import ProperTally  # noqa: PLC0415
         from pipeline.stages.score_summary import Tally  # noqa: PLC0415
 
         self.tally: Tally = Tally()
         self.counts: Counts = no_counts()
         self.official: list[dict[str, Any]] = []
-        self._against, self._reference, self._settings = against, reference, settings
+        self.proper: ProperTally = ProperTally()
+        self._against, self._courses = against, courses
+        self._logged_lights = logged_lights
+        self._reference: ReferenceSettings = settings["reference"]
+        self._settings: ScoreSettings = settings["score"]
         self._rows: list[ScoreRow] = []
 
     def take(self, scene: "Scene", rollouts: "Sequence[Rollout]") -> None:
@@ -133,21 +149,42 @@ class _Scorer:
 
         edges, radius_m = scene_road_edges(scene), self._settings.presence_radius_m
         self.official.append(_score_wosac(scene, rollouts, self._settings.wosac_version))
+        ensemble = self._gather(scene, edges, rollouts)
         for rollout in rollouts:
             lived = present_within_radius(rollout, radius_m) if radius_m else rollout
             near_m = self._reference.count_radius_m
-            binned = bin_traffic(from_rollout(lived), edges, near_m, as_logged=False)
+            traffic = from_rollout(lived)
+            binned = bin_traffic(traffic, edges, near_m, as_logged=False)
+            if ensemble is not None:
+                ensemble.add(traffic, binned, lived)
             windows = self._against.windows(binned.bins.shape[-1])
             self.counts += count_simulated(binned, windows)
             row = make_row(binned, self._against)
             self.tally.add(scene.scenario_id, row)
             self._rows += rows_of(scene.scenario_id, rollout.index, row.numbers, "")
 
+        proper = None if ensemble is None else ensemble.score(self._courses)
+        if proper is not None:
+            self.proper.add(scene.scenario_id, proper)
+
+    def _gather(
+        self, scene: "Scene", edges: "RoadEdges | None", rollouts: "Sequence[Rollout]"
+    ) -> "SceneEnsemble | None":
+        """Begin to gather rollouts for protocol ``proper``, if it is asked for."""
+        from pipeline.stages.score_proper import SceneEnsemble  # noqa: PLC0415
+
+        if not self._settings.proper:
+            return None
+        lights = self._logged_lights
+        return SceneEnsemble(scene, edges, rollouts, self._reference, logged_lights=lights)
+
     def rows(self) -> "list[ScoreRow]":
-        """Rows of the rollouts, and then of the official metric."""
+        """Rows of the rollouts, of protocol ``proper``, and of the official metric."""
         from pipeline.stages.score_write import rows_of  # noqa: PLC0415
 
         found = list(self._rows)
+        for scenario_id in self.proper.parts:
+            found += rows_of(scenario_id, None, self.proper.numbers(scenario_id), "")
         for one in self.official:
             prefix = f"{self._settings.wosac_version}/"
             found += rows_of(one["scenario_id"], None, one.get("scores", {}), prefix)
@@ -206,7 +243,7 @@ def finish(
 
 STAGE = Stage(
     name="score",
-    version=3,
+    version=4,
     settings={"reference": ReferenceSettings, "score": ScoreSettings},
     plan=plan,
     work=work,
@@ -214,6 +251,8 @@ STAGE = Stage(
     modules=(
         "pipeline.stages.reference_files",
         "pipeline.stages.score",
+        "pipeline.stages.score_proper",
+        "pipeline.stages.score_proper_summary",
         "pipeline.stages.score_summary",
         "pipeline.stages.score_tables",
         "pipeline.stages.score_write",

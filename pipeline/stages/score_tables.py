@@ -9,6 +9,9 @@ from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import read_json
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress
 from pipeline.stages.reference_files import read_counts
+from pipeline.stages.score_proper import CURVES as PROPER_CURVES
+from pipeline.stages.score_proper import ProperTally, read_proper, write_proper_curves
+from pipeline.stages.score_proper_summary import summarize
 from pipeline.stages.score_summary import Gathered, Summary, Tally
 from pipeline.stages.score_write import ROWS, join_parts, read_tally, write_curves
 
@@ -26,13 +29,15 @@ def gather(
     reference = inputs.folder("reference")
     parts = [folder / ROWS for folder in (reference, *(done.path for done in units))]
     join_parts(parts, target / "scores.parquet")
-    tally = Tally()
+    tally, proper = Tally(), ProperTally()
     wosac: dict[str, dict[str, Any]] = {}
     for at, done in enumerate(units):
         progress(at, len(units), "units gathered")
         tally.merge(read_tally(done.path, done.report["rollouts"]))
+        proper.merge(read_proper(done.path))
         wosac |= {one["scenario_id"]: one for one in read_json(done.path / WOSAC)}
     write_curves(target / "curves.parquet", tally)
+    write_proper_curves(target / PROPER_CURVES, proper)
     summary = Summary(
         settings=settings["score"],
         reference=settings["reference"],
@@ -45,7 +50,9 @@ def gather(
     )
     missing = sorted({scene for done in units for scene in done.report["missing"]})
     skipped = _skipped(inputs.units("reference"))
-    write_json(target / "summary.json", summary.build(missing, skipped))
+    told = summary.build(missing, skipped)
+    told["proper"] = summarize(proper, settings["score"], settings["reference"])
+    write_json(target / "summary.json", told)
     return summary.report(missing)
 
 

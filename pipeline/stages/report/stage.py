@@ -32,6 +32,7 @@ STAGES = (
 LOWEST = 10
 TABLES, FIGURES = "tables", "figures.pdf"
 PASSPORT = "passport.html"
+PROPER_CURVES = "proper_curves.parquet"
 
 
 def plan(inputs: Inputs, settings: ReportSettings) -> list[Unit]:
@@ -63,6 +64,7 @@ def finish(
     from pipeline.stages.report.figures import find_lowest  # noqa: PLC0415
     from pipeline.stages.report.passport import passport  # noqa: PLC0415
     from pipeline.stages.report.players import write_players  # noqa: PLC0415
+    from pipeline.stages.report.proper import proper_tables  # noqa: PLC0415
     from pipeline.stages.report.tables import worst_table  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
@@ -71,7 +73,7 @@ def finish(
     lowest = find_lowest(inputs.folder("score") / "scores.parquet", LOWEST)
     pages = write_players(inputs, target, lowest, settings.player_pages)
     tables = [*score_tables(summary, manifests), worst_table(lowest, pages)]
-    about = passport(inputs, manifests)
+    about, proper = passport(inputs, manifests), proper_tables(summary)
     counts = histograms.read_both(inputs)
     progress(1, 3, "tables")
     charts = _charts(inputs, summary, counts)
@@ -81,6 +83,7 @@ def finish(
         "weights": manifests["train"]["report"].get("weights", "unknown"),
         "scores": tables[0],
         "paper_tables": tables[1:3],
+        "proper_tables": proper,
         "feature_tables": tables[3:],
         "passport_tables": about,
         "machines_page": f"{RUN_FOLDER}/{PASSPORT}",
@@ -89,15 +92,16 @@ def finish(
     }
     page = render("report.html", **values)
     progress(2, 3, "figures")
-    _write_tables(target / TABLES, [*tables, *about, histograms.table(*counts)])
+    every = [*tables, *proper, *about]
+    _write_tables(target / TABLES, [*every, histograms.table(*counts)])
     figures = write_pdf(chart for part in charts.values() for chart in part)
     write_file(target / FIGURES, figures)
     _write_passport(inputs, target / RUN_FOLDER, settings.title)
     write_json(target / "table.json", tables[0].to_json())
     texts = {
         "table.csv": tables[0].to_csv(),
-        "table.tex": "".join(table.to_latex() for table in tables),
-        "report.md": _markdown(settings.title, [*tables, *about]),
+        "table.tex": "".join(table.to_latex() for table in [*tables, *proper]),
+        "report.md": _markdown(settings.title, every),
         "report.html": page,
     }
     for name, text in texts.items():
@@ -115,11 +119,13 @@ def _charts(
 ) -> "dict[str, Sequence[Chart]]":
     """Charts by the name that the page has for them."""
     from pipeline.stages.report import figures, histograms  # noqa: PLC0415
+    from pipeline.stages.report.proper import proper_charts  # noqa: PLC0415
     from pipeline.stages.report.training import LOG, training_figures  # noqa: PLC0415
 
     curves = figures.read_curves(inputs.folder("score") / "curves.parquet", summary)
     return {
         "score_charts": figures.score_charts(summary, curves),
+        "proper_charts": proper_charts(summary, inputs.folder("score") / PROPER_CURVES),
         "histogram_charts": histograms.charts(*counts),
         "training_charts": training_figures(inputs.folder("train") / LOG, "this run"),
     }
@@ -192,7 +198,7 @@ def _section(manifest: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 STAGE = Stage(
     name="report",
-    version=5,
+    version=6,
     settings={"report": ReportSettings},
     plan=plan,
     work=work,
@@ -203,6 +209,7 @@ STAGE = Stage(
         "pipeline.stages.report.histograms",
         "pipeline.stages.report.passport",
         "pipeline.stages.report.players",
+        "pipeline.stages.report.proper",
         "pipeline.stages.report.tables",
         "pipeline.stages.report.training",
         "pipeline.stages.train.train_log",

@@ -50,6 +50,15 @@ NUMBERS = {
     "corrected/offroad_rate": "off-road rate",
 }
 """Words for the other numbers."""
+PROPER = {
+    "energy": "energy score of counts (proper)",
+    "skill_persistence/energy": "skill over as many as now (proper)",
+    "skill_climatology/energy": "skill over the split's distribution (proper)",
+    "context/energy": "energy score, logs of like situations (proper)",
+    "spread_skill/vehicles": "spread over error, vehicles (proper)",
+    "likelihood/composite": "likelihood of the logs (proper)",
+}
+"""Words for the numbers of protocol ``proper`` that stand among all scores."""
 _PAPER_ACE = {"ace/own_near": "mean_ace", "ace_slope/own_near": "ace_slope"}
 
 
@@ -68,6 +77,10 @@ def score_table(summary: Mapping[str, Any]) -> Table:
         if entry is not None and entry["mean"] is not None:
             beside = [_published_ace(each, name) for each in PAPER]
             rows.append([label, *_cells(entry), *beside])
+    proper = summary.get("proper", {}).get("numbers", {})
+    for name, label in PROPER.items():
+        if name in proper and proper[name]["mean"] is not None:
+            rows.append([label, *_cells(proper[name]), *[None for _ in PAPER]])
     official = summary["wosac"]
     for name, label in (("metametric", official["version"]), (_MIN_ADE, "minADE, m")):
         if name in official["scores"]:

@@ -17,6 +17,7 @@ from pipeline.stages.reference_files import (
     read_against,
     read_binned,
     read_counts,
+    read_courses,
     read_logged,
 )
 from tests.pipeline.stages.test_score import REFERENCE, Inputs, ingested
@@ -131,3 +132,21 @@ def test_the_same_logs_give_the_same_bytes(tmp_path, inputs):
     for path in files:
         other = inputs.reference / path.relative_to(first)
         assert path.read_bytes() == other.read_bytes(), path
+
+
+def test_courses_of_the_logs_are_kept_for_climatology_and_retrieval(inputs):
+    kept = read_courses(inputs.reference)
+
+    assert {log.scenario_id for log in kept} == {"crossing", "parked", "slow"}
+    by_name = {log.scenario_id: log.course for log in kept}
+    assert by_name["parked"].present.sum(axis=(1, 2)) == pytest.approx([3.0] * 4)
+    assert by_name["crossing"].windows == 4
+    assert all(np.isfinite(log.context).all() for log in kept)
+
+
+def test_a_log_takes_some_hundred_bytes(inputs):
+    (kept, *_) = read_courses(inputs.reference)
+
+    course = kept.course
+    arrays = [kept.context, course.now, course.present, course.entries, course.exits]
+    assert sum(array.nbytes for array in arrays) == 4 * (11 + 9 + 4 * (9 + 5 + 5))

@@ -343,6 +343,52 @@ def test_without_rollouts_there_is_an_empty_table(tmp_path, scenes):
     assert report["composite_paper"] is report["composite_corrected"] is None
 
 
+def test_protocol_proper_scores_each_scene_and_the_split(result, tmp_path):
+    summary, scores, _ = result
+    proper = summary["proper"]
+
+    assert (proper["scenes"], proper["windows"], proper["window_s"]) == (3, 4, 2.0)
+    energy = scores.filter(pl.col("metric") == "proper/energy")
+    assert energy["scenario_id"].to_list() == ["crossing", "parked", "slow"]
+    assert proper["numbers"]["energy"]["mean"] == pytest.approx(energy["value"].mean())
+    likelihood = proper["numbers"]["likelihood/composite"]
+    assert 0 < likelihood["low"] <= likelihood["mean"] <= likelihood["high"] < 1
+    assert sum(proper["ranks"]["entries"]) == pytest.approx(1)
+    curves = pl.read_parquet(tmp_path / "score" / "out" / "proper_curves.parquet")
+    model = curves.filter(pl.col("metric") == "model/energy")
+    assert model["window"].to_list() == [0, 1, 2, 3]
+    assert model["scenes"].to_list() == [3] * 4
+
+
+def test_what_no_scene_shows_is_not_measured(result):
+    numbers = result[0]["proper"]["numbers"]
+
+    assert numbers["w1/setting_off_delay"]["mean"] is None
+    assert numbers["skill_persistence/pedestrians"]["mean"] is not None
+
+
+def test_protocol_proper_is_a_setting(tmp_path, inputs):
+    settings = {**SETTINGS, "score": ScoreSettings(proper=False)}
+
+    summary, scores, _ = run(tmp_path / "score", inputs, settings)
+
+    assert summary["proper"]["scenes"] == 0
+    assert summary["proper"]["numbers"]["energy"]["mean"] is None
+    assert not scores["metric"].str.starts_with("proper/").any()
+
+
+def test_one_rollout_has_likelihoods_but_no_fair_score(tmp_path, scenes):
+    inputs = Inputs(
+        [ingested(tmp_path / "l", scenes)],
+        [played(tmp_path / "p", [as_rollout(scene) for scene in scenes])],
+    )
+
+    numbers = run(tmp_path / "score", inputs)[0]["proper"]["numbers"]
+
+    assert numbers["energy"]["mean"] is numbers["spread_skill/vehicles"]["mean"] is None
+    assert numbers["likelihood/map"]["mean"] is not None
+
+
 def test_the_radius_setting_makes_agents_enter_and_leave(tmp_path, scenes):
     # The ego drives away from the parked cars: with a circle of 20 m they are left behind.
     leaving = replace(scenes[0], scenario_id="crossing")

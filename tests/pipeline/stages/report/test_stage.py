@@ -284,6 +284,24 @@ def test_the_table_holds_the_scores_of_the_summary(written, summary):
     assert rows["Mean ACE, own log, near"]["rollouts"] == pytest.approx(ace, abs=1e-6)
 
 
+def test_proper_scores_stand_in_the_table_and_in_tables_of_their_own(written, summary):
+    _, files = written
+    table = json.loads(files["table.json"])
+    rows = {row[0]: dict(zip(table["columns"], row, strict=True)) for row in table["rows"]}
+    energy = summary["proper"]["numbers"]["energy"]
+
+    row = rows["energy score of counts (proper)"]
+    assert row["rollouts"] == pytest.approx(energy["mean"], abs=1e-6)
+    assert row["95 % interval"] == f"{energy['low']:.4f} to {energy['high']:.4f}"
+    assert "<h2>By protocol proper</h2>" in files["report.html"]
+    counts = files["tables/proper-scores-of-counts-around-the-ego.csv"]
+    assert counts.splitlines()[1].startswith("all counts by type and ring")
+    traffic = files[
+        "tables/traffic-as-engineers-judge-it-rollouts-against-their-logs-proper.md"
+    ]
+    assert "| stop duration | s | not measured | - |" in traffic  # Nobody ever stops.
+
+
 def test_published_numbers_stand_beside_the_papers_protocol_only(written):
     table = json.loads(written[1]["table.json"])
     rows = {row[0]: dict(zip(table["columns"], row, strict=True)) for row in table["rows"]}
@@ -304,7 +322,7 @@ def test_all_forms_of_the_table_agree(written):
     assert [row[0] for row in rows[1:]] == [row[0] for row in table["rows"]]
     for row in table["rows"]:
         assert row[0] in files["report.md"]
-    assert files["table.tex"].count(r"\begin{table}") == 5
+    assert files["table.tex"].count(r"\begin{table}") == 8
 
 
 def test_the_page_stands_alone(written):

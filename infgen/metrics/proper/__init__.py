@@ -1,0 +1,1 @@
+"""Protocol ``proper``: scores that are best, in expectation, for the logs' distribution."""
