@@ -4,6 +4,7 @@
 Argoverse is needed.
 """
 
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -28,7 +29,8 @@ from infgen.sources.womd_tracks import WorldTracks, origin_near
 
 POSES, ANNOTATIONS = "city_SE3_egovehicle.feather", "annotations.feather"
 MAP_FOLDER = "map"
-_PARQUET, _FEATHER = b"PAR1", b"ARROW1"
+_PARQUET = b"PAR1"
+_SCENARIO, _TABLE = "scenario_", ".parquet"
 _ANNOTATION_HZ = 10.0
 
 
@@ -38,21 +40,23 @@ def find(folder: Path, names: Sequence[str]) -> list[SceneFiles]:
     A scenario has a Parquet table and a map beside it, a sensor log Feather tables of boxes
     and poses, and its map in the folder ``map``.
     """
-    heads = {
-        name: read_head(folder / name)
-        for name in names
-        if name.endswith((".parquet", ".feather"))
-    }
-    tables = [name for name, head in heads.items() if head.startswith(_PARQUET)]
+    maps = _maps(names)
+    tables = [name for name in names if _is_parquet(folder, name, maps)]
     if len(tables) == 1:
-        maps = _maps(folder, names)
         return [_files(folder, [tables[0], *maps[:1]])]
-    if {POSES, ANNOTATIONS} & heads.keys():
+    tables = [name for name in (ANNOTATIONS, POSES) if name in names]
+    if tables:
         inner = folder / MAP_FOLDER
-        maps = _maps(inner, sorted(_names(inner)))
-        tables = [name for name in (ANNOTATIONS, POSES) if name in names]
+        maps = _maps(sorted(os.listdir(inner)) if inner.is_dir() else ())
         return [_files(folder, [*tables, *(f"{MAP_FOLDER}/{name}" for name in maps[:1])])]
     return []
+
+
+def _is_parquet(folder: Path, name: str, maps: Sequence[str]) -> bool:
+    """Tell a scenario's table by its content; a damaged one by its name."""
+    if name.startswith(_SCENARIO) and name.endswith(_TABLE):
+        return True
+    return bool(maps) and read_head(folder / name).startswith(_PARQUET)
 
 
 def label(files: SceneFiles) -> Label:
@@ -69,11 +73,11 @@ def read(files: SceneFiles, now: int | None) -> ReadScene:
         OSError: if a file cannot be read.
     """
     paths = {Path(path).name: path for path in files.paths}
-    maps = [path for name, path in paths.items() if name.endswith(".json")]
+    maps = [paths[name] for name in _maps(paths)]
     if not maps:
         raise RecordError("folder has no map archive (log_map_archive_*.json)")
-    if parquet := [path for name, path in paths.items() if name.endswith(".parquet")]:
-        return decode_motion(read_bytes(parquet[0]), read_bytes(maps[0]), now)
+    if not {ANNOTATIONS, POSES} & paths.keys():
+        return decode_motion(read_bytes(files.paths[0]), read_bytes(maps[0]), now)
     for name in (ANNOTATIONS, POSES):
         if name not in paths:
             raise RecordError(f"folder has no {name}")
@@ -159,10 +163,6 @@ def _files(folder: Path, names: Iterable[str]) -> SceneFiles:
     return SceneFiles(short_name(folder), tuple(str(folder / name) for name in names))
 
 
-def _maps(folder: Path, names: Sequence[str]) -> list[str]:
+def _maps(names: Iterable[str]) -> list[str]:
     """Map archives of a folder: JSON, and not the pose of its raster image."""
     return [name for name in names if name.endswith(".json") and "Sim2" not in name]
-
-
-def _names(folder: Path) -> list[str]:
-    return [path.name for path in folder.iterdir()] if folder.is_dir() else []

@@ -1,7 +1,7 @@
 """ScenarioNet and MetaDrive: scene files, one pickle per scene -> ``Scene``.
 
 ``find``, ``label`` and ``read`` are the way in (``scene_files.SceneSource``). The pickles
-are read by ``unpickle``, which runs nothing of them.
+are read by ``pickles``, which runs nothing of them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ from infgen.sources.scenarionet.parts import (
 from infgen.sources.scenarionet.roads import lane_ids, read_road_map
 from infgen.sources.scenarionet.signals import read_signals
 from infgen.sources.scenarionet.tracks import read_tracks, track_ids
-from infgen.sources.scenarionet.unpickle import array, unpickle
+from infgen.sources.scenarionet.pickles import array, unpickle
 from infgen.sources.tfrecord import RecordError
 from infgen.sources.womd import MAX_STEPS
 from infgen.sources.womd_tracks import origin_near
@@ -47,16 +47,21 @@ STEP_TOLERANCE_S = 0.02
 _PROTOCOLS = (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
 _SUMMARIES = ("dataset_summary", "dataset_mapping")
 """First letters of ScenarioNet's own tables of a folder, which hold no scenes."""
+_SUFFIXES = (".pkl", ".pickle")
 _MAX_DIFFICULTY = 2
 _MAX_ID_LETTERS = 200
 
 
 def find(folder: Path, names: Sequence[str]) -> list[SceneFiles]:
-    """Find the pickles of a folder but for ScenarioNet's own tables."""
+    """Find the pickles of a folder but for ScenarioNet's own tables.
+
+    They are told by their content; files that are only named so are found to be refused.
+    """
     return [
         SceneFiles(short_name(folder / name), (str(folder / name),))
         for name in names
-        if not name.startswith(_SUMMARIES) and is_pickle(read_head(folder / name))
+        if not name.startswith(_SUMMARIES)
+        and (name.endswith(_SUFFIXES) or is_pickle(read_head(folder / name)))
     ]
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from infgen.sources.scenarionet.unpickle import Array, array
+from infgen.sources.scenarionet.pickles import Array, array
 from infgen.sources.tfrecord import RecordError
 
 Part = Mapping[str, Any]

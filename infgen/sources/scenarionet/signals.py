@@ -7,7 +7,7 @@ from jaxtyping import Float64, Int64
 
 from infgen.scene import Signals, SignalState
 from infgen.sources.scenarionet.parts import Part, points_of, sequence_of
-from infgen.sources.scenarionet.unpickle import array
+from infgen.sources.scenarionet.pickles import array
 from infgen.sources.tfrecord import RecordError
 
 _PREFIX = "LANE_STATE_"

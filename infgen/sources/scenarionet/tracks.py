@@ -10,7 +10,7 @@ from infgen.scene import AgentType
 from infgen.sources.ids import integer_ids
 from infgen.sources.scenarionet.datasets import Convention
 from infgen.sources.scenarionet.parts import Part, part_of, text_of
-from infgen.sources.scenarionet.unpickle import array
+from infgen.sources.scenarionet.pickles import array
 from infgen.sources.tfrecord import RecordError
 from infgen.sources.womd_tracks import WorldTracks
 

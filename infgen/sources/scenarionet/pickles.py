@@ -286,6 +286,11 @@ def unpickle(data: bytes) -> Any:
         raise RecordError(f"not a usable pickle: {said or 'damaged'}") from error
 
 
+def pickled(value: Any) -> bytes:
+    """Write plain containers and numpy arrays as the pickle that ScenarioNet reads."""
+    return pickle.dumps(value, protocol=4)
+
+
 def array(value: Any, dtype: Any = np.float64) -> np.ndarray:
     """Return an array of a file, or a list of numbers or of rows, as an array of one type.
 
