@@ -4,7 +4,16 @@ import re
 from collections.abc import Iterable
 from itertools import count
 
-_INTEGER = re.compile(r"0|[1-9]\d{0,18}")
+_INTEGER = re.compile(r"0|-?[1-9][0-9]{0,18}")
+
+
+def integer_name(name: object) -> int | None:
+    """Return the integer that a name stands for by itself; None if it is none."""
+    if type(name) is int:
+        return name if -(2**63) <= name < 2**63 else None
+    if not isinstance(name, str) or not _INTEGER.fullmatch(name):
+        return None
+    return int(name) if -(2**63) <= int(name) < 2**63 else None
 
 
 def integer_ids(names: Iterable[str], largest: int) -> dict[str, int]:
@@ -20,7 +29,7 @@ def integer_ids(names: Iterable[str], largest: int) -> dict[str, int]:
     found = {
         name: int(name)
         for name in names
-        if _INTEGER.fullmatch(name) and int(name) <= largest
+        if _INTEGER.fullmatch(name) and -largest - 1 <= int(name) <= largest
     }
     taken = set(found.values())
     free = (number for number in count() if number not in taken)

@@ -69,7 +69,7 @@ class MapBuilder:
         """Say which lanes a stop sign controls."""
         self._signs += [(feature_id, lane) for lane in lanes]
 
-    def lines_m(self, kind: FeatureType) -> list[Float64[np.ndarray, "point 3"]]:
+    def lines_m(self, kind: FeatureType) -> list[Float64[np.ndarray, "_ 3"]]:
         """Points of the features of one kind so far."""
         pairs = zip(self._points, self._features, strict=True)
         return [points_m for points_m, (_, of, *_) in pairs if of == kind]

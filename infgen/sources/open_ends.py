@@ -18,7 +18,7 @@ MIN_SINE = 0.5
 _BLOCK = 1 << 20
 """Pairs of lane parts and outline parts in memory at a time."""
 
-Line = Float64[np.ndarray, "point n"]
+Line = Float64[np.ndarray, "_ _"]
 
 
 def at_open_ends(

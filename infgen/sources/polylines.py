@@ -3,9 +3,12 @@
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from infgen.sources.tfrecord import RecordError
+
 SPACING_M = 1.0
 """Farthest that neighbouring points of a line may be apart. Map tokens end where a line
 bends between points more than 3 m apart."""
+MAX_LENGTH_M = 200_000.0
 _BLOCK = 1 << 20
 """Pairs of points and polygon sides in memory at a time."""
 
@@ -32,10 +35,16 @@ def densify(
     """Add points to a line until neighbours are no farther apart; its own points stay.
 
     Example: 0 and 2.5 m become 0, 0.833, 1.667 and 2.5 m.
+
+    Raises:
+        RecordError: if the line is longer than any real one, or not finite.
     """
     if len(xyz_m) < 2:
         return xyz_m
-    lengths_m = np.linalg.norm(np.diff(xyz_m[:, :2], axis=0), axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        lengths_m = np.linalg.norm(np.diff(xyz_m[:, :2], axis=0), axis=1)
+    if not lengths_m.sum() <= MAX_LENGTH_M:
+        raise RecordError(f"a map line is {lengths_m.sum():g} m long")
     parts = np.maximum(1, np.ceil(lengths_m / spacing_m)).astype(np.int64)
     segment = np.repeat(np.arange(len(parts)), parts)
     within = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
@@ -80,7 +89,7 @@ def inside(
 
 def kept_chains(
     line_m: Float64[np.ndarray, "point n"], kept: Bool[np.ndarray, " part"]
-) -> list[Float64[np.ndarray, "chain n"]]:
+) -> list[Float64[np.ndarray, "_ n"]]:
     """Join the kept parts of a line that follow one another, around its end if closed."""
     if kept.all():
         return [line_m]

@@ -29,12 +29,12 @@ between polygons that touch."""
 MIN_EDGE_M = 1.0
 """Shorter remains of an outline are left out."""
 
-Outline = Float64[np.ndarray, "corner 3"]
+Outline = Float64[np.ndarray, "_ 3"]
 
 
 def road_edges(
     areas: Sequence[Outline], lanes: Sequence[Outline]
-) -> list[Float64[np.ndarray, "point 3"]]:
+) -> list[Float64[np.ndarray, "_ 3"]]:
     """Return the lines that bound some areas together.
 
     Args:

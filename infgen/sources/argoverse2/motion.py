@@ -26,7 +26,7 @@ NOW = 49
 """Last of the 50 observed steps."""
 SCORED, FOCAL = 2, 3
 """``object_category`` of tracks to predict."""
-MAX_STATES = 20_000_000
+MAX_STATES = 2_000_000
 _COLUMNS = {
     "track_id": TEXT,
     "object_type": TEXT,

@@ -25,6 +25,8 @@ from infgen.sources.tfrecord import RecordError
 
 MIN_CENTRE_POINTS = 10
 MAX_AREA_CORNERS = 200_000
+MAX_HEIGHTS = 20_000
+"""Points that heights are taken from; of more every second, third, ... does."""
 _LARGEST_ID = 2**62
 _SIDES = {"left": Side.LEFT, "right": Side.RIGHT}
 _LINKS = {"predecessors": LinkType.ENTRY, "successors": LinkType.EXIT}
@@ -65,8 +67,8 @@ class _Lane:
 
     id: int
     raw: Mapping[str, Any]
-    centre_m: Float64[np.ndarray, "point 3"]
-    bounds_m: Mapping[str, Float64[np.ndarray, "point 3"]]
+    centre_m: Float64[np.ndarray, "_ 3"]
+    bounds_m: Mapping[str, Float64[np.ndarray, "_ 3"]]
 
 
 def read_map(data: bytes) -> tuple[MapBuilder, Ground]:
@@ -97,7 +99,8 @@ def read_map(data: bytes) -> tuple[MapBuilder, Ground]:
         kind = RoadEdgeType.MEDIAN if island else RoadEdgeType.BOUNDARY
         road_map.feature(next_id + at, FeatureType.ROAD_EDGE, kind, edge_m)
     known = [bound_m for lane in lanes for bound_m in lane.bounds_m.values()]
-    return road_map, Ground(np.concatenate([np.empty((0, 3)), *known, *areas]))
+    heights_m = np.concatenate([np.empty((0, 3)), *known, *areas])
+    return road_map, Ground(heights_m[:: 1 + len(heights_m) // MAX_HEIGHTS])
 
 
 def _archive(data: bytes) -> Mapping[str, Any]:

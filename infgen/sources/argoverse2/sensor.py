@@ -26,7 +26,7 @@ NOW = 10
 EGO = "ego"
 MAX_GAP_NS = 250_000_000
 """Longest time between two boxes of a track that is bridged: one missed sweep."""
-MAX_STATES = 20_000_000
+MAX_STATES = 2_000_000
 STEP_NS = round(CLOCK.step_s * 1e9)
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
@@ -99,7 +99,7 @@ def _clock(time_ns: Int64[np.ndarray, " box"]) -> Int64[np.ndarray, " step"]:
     return first + STEP_NS * np.arange(num_steps, dtype=np.int64)
 
 
-def _by_track(names: np.ndarray) -> tuple[list[str], list[Int64[np.ndarray, " row"]]]:
+def _by_track(names: np.ndarray) -> tuple[list[str], list[Int64[np.ndarray, " _"]]]:
     """Tracks in the order of their first box, and the rows of each."""
     places: dict[str, int] = {}
     track = np.array([places.setdefault(name, len(places)) for name in names], np.int64)

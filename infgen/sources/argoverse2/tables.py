@@ -8,7 +8,7 @@ import numpy as np
 
 from infgen.sources.tfrecord import RecordError
 
-MAX_ROWS = 2_000_000
+MAX_ROWS = 300_000
 """Rows of one table; the largest real one has about 60,000."""
 FLOAT, INTEGER, TEXT = np.float64, np.int64, np.str_
 

@@ -13,6 +13,7 @@ from jaxtyping import Float64
 
 from infgen.clock import CLOCK
 from infgen.scene import Scene, SceneError
+from infgen.sources.ids import integer_name
 from infgen.sources.scene_files import (
     Label,
     ReadScene,
@@ -209,4 +210,9 @@ def _interest(about: Part, tracks: Mapping[str, Part]) -> np.ndarray:
     """Ids of the objects of interest."""
     ids: Mapping[str, Any] = track_ids(tracks)
     named = [str(name) for name in sequence_of(about.get("objects_of_interest"))]
-    return np.array([ids[name] for name in named if name in ids], np.int32)
+    found = [ids.get(name, integer_name(name)) for name in named]
+    return np.array([each for each in found if _is_track_id(each)], np.int32)
+
+
+def _is_track_id(number: int | None) -> bool:
+    return number is not None and -(2**31) <= number < 2**31

@@ -74,7 +74,7 @@ def integer_of(value: Any, default: int = 0) -> int:
     """Return a whole number, also one written as text; the default if it is none."""
     if isinstance(value, str):
         value = int(value) if value.isascii() and value.isdigit() and len(value) < 19 else None
-    return value if isinstance(value, int) else default
+    return value if type(value) is int else default
 
 
 def number_of(value: Any) -> float:

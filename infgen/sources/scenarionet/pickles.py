@@ -6,8 +6,8 @@ format, so this module, and no other, reads the subset of it that plain data nee
 - Only opcodes in ``_OPCODES`` are known: strings, bytes, numbers, None, booleans, lists,
   tuples, dictionaries and sets. Keys and members must be plain, so that nothing is hashed
   that can be nested without end.
-- The only names that a file may import are those in ``_NAMES``, all of numpy's arrays. They
-  stand for inert stand-ins of this module: no function or class of numpy sees anything of a
+- The only names that a file may import are those in ``_NAMES``: what numpy's arrays, and
+  sets of older protocols, are made of. They stand for inert stand-ins of this module: no function or class of numpy sees anything of a
   file before ``array`` has checked its type, shape and size.
 
 The standard library's unpickler in Python (``pickle._Unpickler``) is the base, not the one
@@ -150,10 +150,25 @@ def _encode(text: str, encoding: str = "latin1") -> bytes:
     return text.encode("latin1")
 
 
+def _no_bytes() -> bytes:
+    """Take the empty bytes of protocol 2."""
+    return b""
+
+
+def _set(items: Any = ()) -> set[Any]:
+    """Take a set as protocols 2 and 3 write it."""
+    if not isinstance(items, list | tuple) or not all(map(_is_plain, items)):
+        raise pickle.UnpicklingError("it fills a set with what is not plain")
+    return set(items)
+
+
 _NAMES: dict[tuple[str, str], _Inert] = {
     ("numpy", "ndarray"): _Inert(),
     ("numpy", "dtype"): _Function(DType),
     ("_codecs", "encode"): _Function(_encode),
+    ("__builtin__", "bytes"): _Function(_no_bytes),
+    ("__builtin__", "set"): _Function(_set),
+    ("builtins", "set"): _Function(_set),
     **{
         (f"numpy.{core}.{module}", name): _Function(function)
         for core in ("core", "_core")

@@ -1,6 +1,6 @@
 """Map features of a ScenarioNet description."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from infgen.scene import (
     RoadMap,
     Side,
 )
-from infgen.sources.ids import integer_ids
+from infgen.sources.ids import integer_ids, integer_name
 from infgen.sources.map_builder import MapBuilder, Span
 from infgen.sources.polylines import densify, drop_repeats
 from infgen.sources.scenarionet.datasets import Convention
@@ -67,7 +67,6 @@ _AREAS = {
     "SPEED_BUMP": FeatureType.SPEED_BUMP,
     "DRIVEWAY": FeatureType.DRIVEWAY,
 }
-Reader = Callable[[], Float64[np.ndarray, "point 3"]]
 
 
 def lane_ids(features: Mapping[str, Part]) -> dict[str, int]:
@@ -196,8 +195,8 @@ class _Reader:
             word = str(name) if isinstance(name, str | int) else ""
             if word in self._ids:
                 found.append(self._ids[word])
-            elif word.isascii() and word.isdigit() and len(word) < 19:
-                found.append(int(word))
+            elif (number := integer_name(name)) is not None:
+                found.append(number)
         return found
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from infgen.scene import Signals, SignalState
+from infgen.sources.ids import integer_name
 from infgen.sources.scenarionet.parts import Part, points_of, sequence_of
 from infgen.sources.scenarionet.pickles import array
 from infgen.sources.tfrecord import RecordError
@@ -75,8 +76,8 @@ def _lane(lane: object, name: str, lane_ids: Mapping[str, int]) -> int:
     for word in (str(lane), name):
         if word in lane_ids:
             return lane_ids[word]
-        if word.isascii() and word.isdigit() and len(word) < 19:
-            return int(word)
+        if (number := integer_name(word)) is not None:
+            return number
     raise RecordError(f"light {name[:40]} is of lane {str(lane)[:40]!r}, which is not there")
 
 

@@ -15,7 +15,7 @@ from infgen.sources.tfrecord import RecordError
 from infgen.sources.womd_tracks import WorldTracks
 
 MAX_TRACKS = 20_000
-MAX_STATES = 20_000_000
+MAX_STATES = 2_000_000
 """Tracks times steps: a crafted file must not fill the memory."""
 _SIZES = ("length", "width", "height")
 _LARGEST_ID = 2**31 - 1
@@ -109,7 +109,8 @@ def _states(
 def _wrapped(heading_rad: Float64[np.ndarray, "agent step"]) -> np.ndarray:
     """Bring headings that a converter unwrapped back to [-pi, pi); others stay as are."""
     beyond = (heading_rad < -np.pi) | (heading_rad >= np.pi)
-    return np.where(beyond, wrap_angle(heading_rad), heading_rad)
+    with np.errstate(invalid="ignore"):
+        return np.where(beyond, wrap_angle(heading_rad), heading_rad)
 
 
 def _is_number(value: object) -> bool:
