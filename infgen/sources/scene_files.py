@@ -131,6 +131,10 @@ def short_name(path: Path) -> str:
     return "/".join(path.parts[-2:]) if path.parent.name else path.name
 
 
+NEAR_FOLDERS = 2
+"""Folders above a scene whose names may tell its split."""
+
+
 def split_in(words: Sequence[str]) -> str | None:
     """Find a split in the names of folders or of a data set; the last that names one."""
     for word in reversed(words):

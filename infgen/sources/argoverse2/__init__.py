@@ -16,6 +16,7 @@ from infgen.sources.argoverse2 import motion, sensor
 from infgen.sources.argoverse2.roads import read_map
 from infgen.sources.map_builder import MapBuilder
 from infgen.sources.scene_files import (
+    NEAR_FOLDERS,
     Label,
     ReadScene,
     SceneFiles,
@@ -62,7 +63,8 @@ def _is_parquet(folder: Path, name: str, maps: Sequence[str]) -> bool:
 def label(files: SceneFiles) -> Label:
     """Tell split and id by the folders: Argoverse names them so."""
     folder = Path(files.paths[0]).parent
-    return Label(split_in(folder.parts[:-1]) or "argoverse2", folder.name)
+    above = folder.parts[-1 - NEAR_FOLDERS : -1]
+    return Label(split_in(above) or "argoverse2", folder.name)
 
 
 def read(files: SceneFiles, now: int | None) -> ReadScene:

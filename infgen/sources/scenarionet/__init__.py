@@ -15,6 +15,7 @@ from infgen.clock import CLOCK
 from infgen.scene import Scene, SceneError
 from infgen.sources.ids import integer_name
 from infgen.sources.scene_files import (
+    NEAR_FOLDERS,
     Label,
     ReadScene,
     SceneFiles,
@@ -74,12 +75,12 @@ def is_pickle(head: bytes) -> bool:
 def label(files: SceneFiles) -> Label:
     """Tell split and id; of a damaged file what its name and folders say."""
     path = Path(files.paths[0])
-    folders = path.parts[:-1]
+    folders = path.parts[-1 - NEAR_FOLDERS : -1]
     try:
         description = _description(files)
         return Label(split_of(description, folders), _scenario_id(description))
     except (RecordError, OSError):
-        return Label(split_in(path.parts) or "scenarionet", path.stem)
+        return Label(split_in(folders) or "scenarionet", path.stem)
 
 
 def read(files: SceneFiles, now: int | None) -> ReadScene:
