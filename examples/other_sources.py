@@ -47,7 +47,8 @@ def write_motion(folder: Path, scene: Scene) -> None:
     row, step = np.nonzero(tracks.valid)
     world_m = tracks.xyz_m[row, step].astype(np.float64) + scene.origin_xyz_m
     names = [
-        "AV" if at == scene.ego else str(track) for at, track in enumerate(tracks.id.tolist())
+        "AV" if at == scene.ego else str(track)
+        for at, track in enumerate(tracks.id.tolist())
     ]
     wanted = np.isin(np.arange(tracks.num_agents), scene.predict_row)
     table = pl.DataFrame(

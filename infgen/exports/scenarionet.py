@@ -1,7 +1,8 @@
 """Rollouts as scenario descriptions of ScenarioNet and MetaDrive: a JSON file per rollout.
 
 ScenarioNet keeps such descriptions as pickles, which run code when read, so rollouts are
-not written so (``scenarionet_scene`` writes logs). The file holds the same dictionary with lists for arrays; ``with_arrays``
+not written so (``scenarionet_scene`` writes logs). The file holds the same dictionary with
+lists for arrays; ``with_arrays``
 makes it what MetaDrive takes, to be handed over in memory, or pickled by whoever wants to.
 
 Facts of its format: coordinates are WOMD's; all state arrays are as long as the scenario;

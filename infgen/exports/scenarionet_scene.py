@@ -1,6 +1,6 @@
-"""Logs as scene files of ScenarioNet and MetaDrive. Inverse of ``infgen.sources.scenarionet``.
+"""Logs as scene files of ScenarioNet and MetaDrive.
 
-Nothing is rounded: positions are float64 in the world frame, so that the same ``Scene``
+Inverse of ``infgen.sources.scenarionet``. Nothing is rounded: positions are float64 in the world frame, so that the same ``Scene``
 comes back. A light's rows are named by its lane; where the order of lanes within a step is
 not theirs, or a stop point moves, that stands among the light's states.
 """
@@ -56,7 +56,8 @@ def describe_scene(scene: Scene, split: str = "") -> dict[str, Any]:
         "length": scene.tracks.num_steps,
         "metadata": _metadata(scene, split),
         "tracks": {
-            str(track): _track(scene, row) for row, track in enumerate(scene.tracks.id.tolist())
+            str(track): _track(scene, row)
+            for row, track in enumerate(scene.tracks.id.tolist())
         },
         "dynamic_map_states": _lights(scene),
         "map_features": _features(scene),

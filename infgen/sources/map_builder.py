@@ -83,7 +83,9 @@ class MapBuilder:
         ids, kinds, subtypes, speeds, interpolating = _columns(self._features, 5)
         lanes, links, others = _columns(self._links, 3)
         beside, sides, besides, own, its = _columns(self._neighbours, 5)
-        bounded, bound_sides, lines, bound_kinds, spans, rows = _columns(self._boundaries, 6)
+        bounded, bound_sides, lines, bound_kinds, spans, rows = _columns(
+            self._boundaries, 6
+        )
         signs, controlled = _columns(self._signs, 2)
         points_m = np.concatenate([np.empty((0, 3)), *self._points])
         lengths = [len(each) for each in self._points]

@@ -58,7 +58,9 @@ def _crossings(
     gap_m = side_m - start_m[:, None]  # [lane part, side, 2]
     safe = np.where(across == 0, 1.0, across)
     share = (gap_m[..., 0] * sides_m[:, 1] - gap_m[..., 1] * sides_m[:, 0]) / safe
-    along = (gap_m[..., 0] * along_m[:, None, 1] - gap_m[..., 1] * along_m[:, None, 0]) / safe
+    along = (
+        gap_m[..., 0] * along_m[:, None, 1] - gap_m[..., 1] * along_m[:, None, 0]
+    ) / safe
     lengths_m2 = np.linalg.norm(along_m, axis=1)[:, None] * np.linalg.norm(sides_m, axis=1)
     hits = (np.abs(across) > MIN_SINE * lengths_m2) & (lengths_m2 > 0)
     hits &= (share >= 0) & (share <= 1) & (along >= 0) & (along <= 1)

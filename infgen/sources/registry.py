@@ -61,7 +61,9 @@ def find_below(folder: str) -> Iterator[FoundScene]:
     seen: set[tuple[int, int]] = set()
     for place, folders, names in os.walk(folder, followlinks=True):
         stat = os.stat(place)
-        found = list(find_in(place, names)) if (stat.st_dev, stat.st_ino) not in seen else []
+        found = (
+            list(find_in(place, names)) if (stat.st_dev, stat.st_ino) not in seen else []
+        )
         seen.add((stat.st_dev, stat.st_ino))
         yield from found
         is_scene = any(len(scene.files.paths) > 1 for scene in found)

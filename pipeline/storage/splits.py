@@ -24,7 +24,8 @@ def group_name(split: str, source: str, number: int, count: int) -> str:
 def split_of(name: str) -> str:
     """Return the split that a file belongs to: its name up to ``.tfrecord``.
 
-    The split of a group of scene files is its name up to that of their source. Of WOMD's own long names the distinctive word is used:
+    The split of a group of scene files is its name up to that of their source. Of WOMD's
+    own long names the distinctive word is used:
     ``uncompressed_scenario_training_training.tfrecord-...`` is of ``training``.
     """
     if match := _GROUP.match(name):

@@ -62,7 +62,9 @@ def test_the_split_is_written_and_read(tmp_path, crossing):
 
 
 def test_two_lights_of_one_lane_in_one_step_cannot_be_written(crossing, build_signals):
-    scene = crossing(signals=build_signals([(3, 1, SignalState.GO), (3, 1, SignalState.STOP)]))
+    scene = crossing(
+        signals=build_signals([(3, 1, SignalState.GO), (3, 1, SignalState.STOP)])
+    )
 
     with pytest.raises(NotWritableError, match="lane 1 has two lights"):
         describe_scene(scene)

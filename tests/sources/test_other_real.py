@@ -19,11 +19,16 @@ from tests.sources.test_womd import differences
 from tests.tokens.test_sequence import agent_matrix, assert_same, stream_alone
 
 FOLDERS = [SHARED.parent / "av2", SHARED.parent / "scenarionet"]
-pytestmark = pytest.mark.skipif(
-    not all(folder.is_dir() for folder in FOLDERS),
-    reason="needs the shared scenes (../shared/data/av2 and scenarionet)",
-)
-FOUND = [found for folder in FOLDERS if folder.is_dir() for found in find_below(str(folder))]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        not all(folder.is_dir() for folder in FOLDERS),
+        reason="needs the shared scenes (../shared/data/av2 and scenarionet)",
+    ),
+]
+FOUND = [
+    found for folder in FOLDERS if folder.is_dir() for found in find_below(str(folder))
+]
 TWINS = {"2a1e44d405a6833f": "00007", "8a346109094cd5aa": "00008"}
 """Scenes of WOMD that are there both ways, and the TFRecord they are in."""
 MOVING_MPS = 3.0
@@ -53,9 +58,10 @@ def moving_cars(scene):
     tracks = scene.tracks
     speed_mps = np.linalg.norm(tracks.velocity_mps, axis=-1)
     cars = (tracks.agent_type == AgentType.VEHICLE)[:, None] & (speed_mps > MOVING_MPS)
-    places_m, heading_rad = tracks.xyz_m[cars & tracks.valid], tracks.heading_rad[
-        cars & tracks.valid
-    ]
+    places_m, heading_rad = (
+        tracks.xyz_m[cars & tracks.valid],
+        tracks.heading_rad[cars & tracks.valid],
+    )
     return flat(places_m), heading_rad
 
 
@@ -89,14 +95,15 @@ def test_cars_drive_along_their_lanes_and_on_the_road(scene):
     """Some turn into driveways, or drive where the map has ended."""
     places_m, heading_rad = moving_cars(scene)
     gap_m, lane_rad = nearest_lane(scene, places_m[::5])
-    on_lane = gap_m < 3
+    on_lane = gap_m < 1.5
     turned = np.abs(np.exp(1j * (lane_rad - heading_rad[::5])) - 1)[on_lane]
 
     assert on_lane.sum() > 20
     assert np.median(turned) < 0.1  # Radians, nearly.
     assert (turned < 0.6).mean() > 0.85
-    off_road_m = signed_distance_m(places_m[::5][on_lane], scene_road_edges(scene, flat=True))
-    assert (off_road_m < 0).mean() > 0.98
+    edges = scene_road_edges(scene, flat=True)
+    off_road_m = signed_distance_m(places_m[::5][on_lane], edges)
+    assert (off_road_m < 0).mean() > 0.95
 
 
 def test_boxes_move_as_their_velocities_say(scene):
@@ -105,7 +112,8 @@ def test_boxes_move_as_their_velocities_say(scene):
     seen = tracks.valid[:, 2:] & tracks.valid[:, 1:-1] & tracks.valid[:, :-2]
     gap_mps = np.linalg.norm(moved_mps - tracks.velocity_mps[:, 1:-1], axis=-1)[seen]
 
-    assert np.quantile(gap_mps, 0.9) < 1.0
+    assert np.median(gap_mps) < 0.3
+    assert np.quantile(gap_mps, 0.9) < 1.5  # Those of motion forecasting are a tracker's.
 
 
 def test_a_scene_comes_back_from_its_own_file_of_scenarionet(scene):

@@ -51,7 +51,11 @@ def road_edges(
         line_m = densify(ring, SPACING_M)
         outside = _outside(line_m, rings)
         kept = outside & ~at_open_ends(line_m, outside, lanes)
-        edges += [edge for edge in kept_chains(line_m, kept) if arc_length_m(edge)[-1] >= MIN_EDGE_M]
+        edges += [
+            edge
+            for edge in kept_chains(line_m, kept)
+            if arc_length_m(edge)[-1] >= MIN_EDGE_M
+        ]
     return edges
 
 

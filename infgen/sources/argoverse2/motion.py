@@ -112,7 +112,7 @@ def read_motion(data: bytes, ground: Ground) -> MotionLog:
 def _in_order(
     names: np.ndarray,
 ) -> tuple[list[str], Int64[np.ndarray, " track"], Int64[np.ndarray, " row"]]:
-    """Tracks in the order of their first row: names, that row, and the track of each row."""
+    """Order tracks by their first row: names, that row, and the track of each row."""
     places: dict[str, int] = {}
     row = np.array([places.setdefault(name, len(places)) for name in names], np.int64)
     _, first = np.unique(row, return_index=True)

@@ -42,7 +42,9 @@ class Ground:
 
     xyz_m: Float64[np.ndarray, "point 3"]
 
-    def height_m(self, xy_m: Float64[np.ndarray, "place 2"]) -> Float64[np.ndarray, " place"]:
+    def height_m(
+        self, xy_m: Float64[np.ndarray, "place 2"]
+    ) -> Float64[np.ndarray, " place"]:
         """Height of the nearest known point; 0 where nothing is known."""
         if not len(self.xyz_m):
             return np.zeros(len(xy_m))
@@ -87,7 +89,8 @@ def read_map(data: bytes) -> tuple[MapBuilder, Ground]:
         raise RecordError(f"drivable areas have more than {MAX_AREA_CORNERS} corners")
     road_map = MapBuilder()
     used = {lane.id for lane in lanes}
-    _write_lanes(road_map, lanes, next_id := max(used, default=0) + 1)
+    next_id = max(used, default=0) + 1
+    _write_lanes(road_map, lanes, next_id)
     next_id += 2 * len(lanes)
     crossings = _parts(archive, "pedestrian_crossings")
     for at, (name, raw) in enumerate(crossings.items()):
@@ -148,7 +151,7 @@ def _lane(name: str, raw: Mapping[str, Any]) -> _Lane:
     if longest_m > 1e5:
         raise RecordError(f"map archive: {where} is {longest_m:g} m long")
     count = max(MIN_CENTRE_POINTS, int(np.ceil(longest_m / SPACING_M)) + 1)
-    middle_m = sum(resample(bound_m, count) for bound_m in bounds_m.values()) / 2
+    middle_m = np.mean([resample(bound_m, count) for bound_m in bounds_m.values()], axis=0)
     if raw.get("centerline"):
         given_m = drop_repeats(_points(raw, "centerline", where))
         if arc_length_m(given_m)[-1] > 0:
@@ -168,7 +171,9 @@ def _write_lanes(road_map: MapBuilder, lanes: list[_Lane], first_id: int) -> Non
     for lane in lanes:
         kind = LANE_TYPES.get(str(lane.raw.get("lane_type")), LaneType.UNDEFINED)
         inner = lane.raw.get("is_intersection") is True
-        road_map.feature(lane.id, FeatureType.LANE, kind, lane.centre_m, interpolating=inner)
+        road_map.feature(
+            lane.id, FeatureType.LANE, kind, lane.centre_m, interpolating=inner
+        )
         for key, link in _LINKS.items():
             road_map.link(lane.id, link, _ids(lane.raw.get(key)))
         for word, side in _SIDES.items():

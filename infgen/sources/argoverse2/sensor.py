@@ -50,7 +50,10 @@ def read_sensor(annotations: bytes, poses: bytes) -> WorldTracks:
     boxes, car = read_feather(annotations, _BOXES), _read_poses(poses)
     time_ns = boxes["timestamp_ns"]
     steps_ns = _clock(time_ns)
-    if not (car.time_ns[0] - STEP_NS <= time_ns.min() and time_ns.max() <= car.time_ns[-1] + STEP_NS):
+    if not (
+        car.time_ns[0] - STEP_NS <= time_ns.min()
+        and time_ns.max() <= car.time_ns[-1] + STEP_NS
+    ):
         raise RecordError("boxes and poses of the car are of different times")
     names, tracks = _by_track(boxes["track_uuid"])
     if (len(names) + 1) * len(steps_ns) > MAX_STATES:
@@ -108,9 +111,7 @@ def _by_track(names: np.ndarray) -> tuple[list[str], list[Int64[np.ndarray, " _"
     return list(places), np.split(order, ends)
 
 
-def _box_poses(
-    boxes: dict[str, np.ndarray], car: Poses
-) -> Float64[np.ndarray, "box 4"]:
+def _box_poses(boxes: dict[str, np.ndarray], car: Poses) -> Float64[np.ndarray, "box 4"]:
     """Centres and headings of boxes in the city frame, from the car's pose at each."""
     quaternion = np.stack([boxes[name] for name in _QUATERNION], axis=1)
     check_rotations(quaternion, "box")
@@ -163,13 +164,13 @@ def _velocity(
     return np.where(known, moved_m / np.where(span_s > 0, span_s, 1.0), 0.0)
 
 
-def _shifted(
-    xy_m: np.ndarray, valid: np.ndarray, by: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _shifted(xy_m: np.ndarray, valid: np.ndarray, by: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions one step before (1) or after (-1), own ones where there is none."""
     there = np.zeros_like(valid)
     other = xy_m.copy()
-    to, of = (slice(1, None), slice(None, -1)) if by > 0 else (slice(None, -1), slice(1, None))
+    to, of = (
+        (slice(1, None), slice(None, -1)) if by > 0 else (slice(None, -1), slice(1, None))
+    )
     there[:, to] = valid[:, of] & valid[:, to]
     other[:, to] = np.where(there[:, to, None], xy_m[:, of], xy_m[:, to])
     return other, there

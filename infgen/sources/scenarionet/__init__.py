@@ -14,6 +14,19 @@ from jaxtyping import Float64
 from infgen.clock import CLOCK
 from infgen.scene import Scene, SceneError
 from infgen.sources.ids import integer_name
+from infgen.sources.scenarionet.datasets import convention_of, dataset_of, split_of
+from infgen.sources.scenarionet.parts import (
+    Part,
+    integer_of,
+    named_parts,
+    part_of,
+    sequence_of,
+    text_of,
+)
+from infgen.sources.scenarionet.pickles import array, unpickle
+from infgen.sources.scenarionet.roads import lane_ids, read_road_map
+from infgen.sources.scenarionet.signals import read_signals
+from infgen.sources.scenarionet.tracks import read_tracks, track_ids
 from infgen.sources.scene_files import (
     NEAR_FOLDERS,
     Label,
@@ -24,19 +37,6 @@ from infgen.sources.scene_files import (
     short_name,
     split_in,
 )
-from infgen.sources.scenarionet.datasets import convention_of, dataset_of, split_of
-from infgen.sources.scenarionet.parts import (
-    Part,
-    integer_of,
-    named_parts,
-    part_of,
-    sequence_of,
-    text_of,
-)
-from infgen.sources.scenarionet.roads import lane_ids, read_road_map
-from infgen.sources.scenarionet.signals import read_signals
-from infgen.sources.scenarionet.tracks import read_tracks, track_ids
-from infgen.sources.scenarionet.pickles import array, unpickle
 from infgen.sources.tfrecord import RecordError
 from infgen.sources.womd import MAX_STEPS
 from infgen.sources.womd_tracks import origin_near
@@ -191,16 +191,16 @@ def _origin(about: Part, near: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, 
     return found
 
 
-def _predictions(
-    about: Part, tracks: Mapping[str, Part]
-) -> tuple[np.ndarray, np.ndarray]:
+def _predictions(about: Part, tracks: Mapping[str, Part]) -> tuple[np.ndarray, np.ndarray]:
     """Rows and difficulties of the tracks to predict."""
     wanted = about.get("tracks_to_predict")
     places = {name: row for row, name in enumerate(tracks)}
     rows, levels = [], []
     for name, each in wanted.items() if isinstance(wanted, dict) else ():
         if str(name) not in places:
-            raise RecordError(f"track to predict {str(name)[:40]!r} is not one of the tracks")
+            raise RecordError(
+                f"track to predict {str(name)[:40]!r} is not one of the tracks"
+            )
         level = integer_of(each.get("difficulty")) if isinstance(each, dict) else 0
         rows.append(places[str(name)])
         levels.append(level if 0 <= level <= _MAX_DIFFICULTY else 0)

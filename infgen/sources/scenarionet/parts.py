@@ -73,7 +73,9 @@ def text_of(value: Any) -> str:
 def integer_of(value: Any, default: int = 0) -> int:
     """Return a whole number, also one written as text; the default if it is none."""
     if isinstance(value, str):
-        value = int(value) if value.isascii() and value.isdigit() and len(value) < 19 else None
+        value = (
+            int(value) if value.isascii() and value.isdigit() and len(value) < 19 else None
+        )
     return value if type(value) is int else default
 
 

@@ -7,8 +7,9 @@ format, so this module, and no other, reads the subset of it that plain data nee
   tuples, dictionaries and sets. Keys and members must be plain, so that nothing is hashed
   that can be nested without end.
 - The only names that a file may import are those in ``_NAMES``: what numpy's arrays, and
-  sets of older protocols, are made of. They stand for inert stand-ins of this module: no function or class of numpy sees anything of a
-  file before ``array`` has checked its type, shape and size.
+  sets of older protocols, are made of. They stand for inert stand-ins of this module: no
+  function or class of numpy sees anything of a file before ``array`` has checked its type,
+  shape and size.
 
 The standard library's unpickler in Python (``pickle._Unpickler``) is the base, not the one
 in C: a few bytes make that one allocate gigabytes (its memo is an array as long as the
@@ -22,7 +23,7 @@ import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -107,7 +108,6 @@ class Array:
         if not all(type(size) is int and 0 <= size <= MAX_ITEMS for size in shape):
             raise RecordError(f"an array has shape {str(shape)[:80]}")
         count, dtype = math.prod(shape), self._type.numpy()
-        order = "F" if self._fortran else "C"
         if len(shape) > 4 or count > MAX_ITEMS:
             raise RecordError(f"an array has shape {str(shape)[:80]}")
         if dtype.kind == "O":
@@ -118,7 +118,9 @@ class Array:
             raise RecordError(f"an array of shape {shape} holds {len(self._raw)} bytes")
         if not count:
             return np.empty(shape, dtype)
-        return np.frombuffer(bytes(self._raw), dtype).reshape(shape, order=order)
+        return np.frombuffer(bytes(self._raw), dtype).reshape(
+            shape, order="F" if self._fortran else "C"
+        )
 
     def _objects(self, count: int, shape: tuple[int, ...]) -> np.ndarray:
         if not isinstance(self._raw, list) or len(self._raw) != count or len(shape) != 1:
@@ -157,7 +159,7 @@ def _no_bytes() -> bytes:
 
 def _set(items: Any = ()) -> set[Any]:
     """Take a set as protocols 2 and 3 write it."""
-    if not isinstance(items, list | tuple) or not all(map(_is_plain, items)):
+    if not isinstance(items, list | tuple) or not _are_plain(items):
         raise pickle.UnpicklingError("it fills a set with what is not plain")
     return set(items)
 
@@ -201,6 +203,12 @@ _OPCODES = b"".join(
 class _Unpickler(pickle._Unpickler):
     """The standard library's unpickler in Python, with less than it can."""
 
+    if TYPE_CHECKING:  # What the base class has, and its stubs do not tell of.
+        stack: list[Any]
+        append: Callable[[Any], None]
+        pop_mark: Callable[[], list[Any]]
+        read: Callable[[int], bytes]
+
     def find_class(self, module: str, name: str) -> Any:
         """Return what stands for an imported name, and import nothing."""
         try:
@@ -238,7 +246,7 @@ class _Unpickler(pickle._Unpickler):
     def load_additems(self) -> None:
         """Put members into a set."""
         items, target = self.pop_mark(), self.stack[-1]
-        if type(target) is not set or not all(map(_is_plain, items)):
+        if type(target) is not set or not _are_plain(items):
             raise pickle.UnpicklingError("it fills what is no set of plain values")
         target.update(items)
 
@@ -259,7 +267,7 @@ class _Unpickler(pickle._Unpickler):
 
     def _put(self, keys: list[Any], values: list[Any]) -> None:
         target = self.stack[-1]
-        if type(target) is not dict or not all(map(_is_plain, keys)):
+        if type(target) is not dict or not _are_plain(keys):
             raise pickle.UnpicklingError("it fills what is no dictionary of plain keys")
         target.update(zip(keys, values, strict=True))
 
@@ -269,7 +277,7 @@ class _Unpickler(pickle._Unpickler):
             raise pickle.UnpicklingError("it appends to what is no list")
         target.extend(items)
 
-    dispatch = {  # noqa: RUF012  # As in the base class.
+    dispatch: ClassVar[dict[int, Any]] = {
         **{code: pickle._Unpickler.dispatch[code] for code in _OPCODES},
         pickle.REDUCE[0]: load_reduce,
         pickle.BUILD[0]: load_build,
@@ -282,8 +290,11 @@ class _Unpickler(pickle._Unpickler):
     }
 
 
-def _is_plain(value: Any) -> bool:
-    return value is None or type(value) in (str, int, float, bool)
+_PLAIN = frozenset((str, int, float, bool, type(None)))
+
+
+def _are_plain(values: Any) -> bool:
+    return all(type(value) in _PLAIN for value in values)
 
 
 def unpickle(data: bytes) -> Any:
@@ -321,9 +332,7 @@ def array(value: Any, dtype: Any = np.float64) -> np.ndarray:
         raise RecordError(f"expected an array, got {type(value).__name__}")
     if not value or not isinstance(value[0], list | tuple | Array):
         return _cast(_numbers(value), dtype)
-    rows = [
-        array(row, dtype) if isinstance(row, Array) else _numbers(row) for row in value
-    ]
+    rows = [array(row, dtype) if isinstance(row, Array) else _numbers(row) for row in value]
     if any(np.shape(row) != np.shape(rows[0]) or np.ndim(row) > 2 for row in rows):
         raise RecordError("an array has rows of different lengths")
     return _cast(rows, dtype)

@@ -119,9 +119,7 @@ class _Reader:
             points_m = self._points(feature, "polygon", name)
             self.map.feature(number, _AREAS[kind], 0, points_m)
 
-    def _points(
-        self, feature: Part, key: str, name: str
-    ) -> Float64[np.ndarray, "point 3"]:
+    def _points(self, feature: Part, key: str, name: str) -> Float64[np.ndarray, "point 3"]:
         found = points_of(feature.get(key), f"feature {name[:40]}")
         if not self._convention.heights:
             found = found[:, :2]
@@ -184,7 +182,10 @@ class _Reader:
         if not isinstance(each, dict):
             return
         kind = LINE_TYPES.get(text_of(each.get("boundary_type")), RoadLineType.UNKNOWN)
-        span: Span = _index(each.get("lane_start_index")), _index(each.get("lane_end_index"))
+        span: Span = (
+            _index(each.get("lane_start_index")),
+            _index(each.get("lane_end_index")),
+        )
         for line in self._named([each.get("boundary_feature_id")]):
             self.map.boundary(lane, side, line, kind, span, row)
 

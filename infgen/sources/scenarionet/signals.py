@@ -78,7 +78,9 @@ def _lane(lane: object, name: str, lane_ids: Mapping[str, int]) -> int:
             return lane_ids[word]
         if (number := integer_name(word)) is not None:
             return number
-    raise RecordError(f"light {name[:40]} is of lane {str(lane)[:40]!r}, which is not there")
+    raise RecordError(
+        f"light {name[:40]} is of lane {str(lane)[:40]!r}, which is not there"
+    )
 
 
 def _ranks(found: object, place: int, num_steps: int) -> Int64[np.ndarray, " step"]:

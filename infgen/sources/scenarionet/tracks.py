@@ -66,7 +66,9 @@ def read_tracks(
         heading_rad = _wrapped(heading_rad)
         for values in (xyz_m, heading_rad, velocity_mps, size_lwh_m):
             values[~valid] = 0
-    types = [_TYPES.get(text_of(each.get("type")), AgentType.OTHER) for each in tracks.values()]
+    types = [
+        _TYPES.get(text_of(each.get("type")), AgentType.OTHER) for each in tracks.values()
+    ]
     with np.errstate(over="ignore"):
         return WorldTracks(
             id=np.array(list(track_ids(tracks).values()), np.int32),

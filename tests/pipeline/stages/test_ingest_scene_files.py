@@ -131,13 +131,13 @@ def test_now_is_a_setting(made, tmp_path):
     assert scene.now == 20
 
 
-def test_a_bad_file_is_quarantined_by_name_and_reason_and_the_rest_goes_on(
-    made, tmp_path
-):
+def test_a_bad_file_is_quarantined_by_name_and_reason_and_the_rest_goes_on(made, tmp_path):
     shutil.copytree(made / "net", tmp_path / "net")
     bad = tmp_path / "net" / "sd_bad.pkl"
     mark = tmp_path / "was-run"
-    bad.write_bytes(b"\x80\x04cbuiltins\nopen\nX\x07\x00\x00\x00was-runX\x01\x00\x00\x00w\x86R.")
+    bad.write_bytes(
+        b"\x80\x04cbuiltins\nopen\nX\x07\x00\x00\x00was-runX\x01\x00\x00\x00w\x86R."
+    )
     text = tmp_path / "net" / "sd_text.pkl"
     text.write_bytes(b"cos\nsystem\n(S'touch was-run'\ntR.")
 
