@@ -1,7 +1,8 @@
 """Rollouts as scenario descriptions of ScenarioNet and MetaDrive: a JSON file per rollout.
 
-ScenarioNet keeps such descriptions as pickles, which run code when read, so none is
-written here. The file holds the same dictionary with lists for arrays; ``with_arrays``
+ScenarioNet keeps such descriptions as pickles, which run code when read, so rollouts are
+not written so (``scenarionet_scene`` writes logs). The file holds the same dictionary with
+lists for arrays; ``with_arrays``
 makes it what MetaDrive takes, to be handed over in memory, or pickled by whoever wants to.
 
 Facts of its format: coordinates are WOMD's; all state arrays are as long as the scenario;
@@ -32,7 +33,8 @@ VERSION = "infgen-1"
 """Of what is written here; ScenarioNet puts its own name and number."""
 DATASET = "infgen"
 _KMH_PER_MPH = 1.609344
-_LINES = (FeatureType.LANE, FeatureType.ROAD_LINE, FeatureType.ROAD_EDGE)
+LINES = (FeatureType.LANE, FeatureType.ROAD_LINE, FeatureType.ROAD_EDGE)
+"""Features with a polyline."""
 _ARRAYS = {
     **dict.fromkeys(("position", "length", "width", "height", "heading"), np.float32),
     **dict.fromkeys(("velocity", "polyline", "polygon", "stop_point", "ts"), np.float32),
@@ -44,7 +46,7 @@ _RENAMED = {"ROAD_LINE_UNKNOWN": "UNKNOWN_LINE", "ROAD_EDGE_UNKNOWN": "UNKNOWN"}
 
 def map_text(scene: Scene) -> str:
     """Write the map of a scene; the same for all of its rollouts."""
-    lanes = _Lanes(scene.road_map)
+    lanes = LaneRelations(scene.road_map)
     return json.dumps(
         {str(feature.id): _feature(feature, lanes) for feature in features_of(scene)}
     )
@@ -101,11 +103,12 @@ def _track(states: States, row: int) -> dict[str, Any]:
             "velocity": rounded(states.velocity_mps[row]),
             "valid": valid.tolist(),
         },
-        "metadata": _object(agent_type, int(states.id[row]), len(valid)),
+        "metadata": object_metadata(agent_type, int(states.id[row]), len(valid)),
     }
 
 
-def _object(agent_type: str, number: int, num_steps: int) -> dict[str, Any]:
+def object_metadata(agent_type: str, number: int, num_steps: int) -> dict[str, Any]:
+    """Metadata of a track or a light."""
     return {
         "type": agent_type,
         "object_id": str(number),
@@ -127,7 +130,7 @@ def _lights(lights: Lights) -> dict[str, Any]:
             },
             "lane": lane,
             "stop_point": stop,
-            "metadata": _object("TRAFFIC_LIGHT", lane, num_steps),
+            "metadata": object_metadata("TRAFFIC_LIGHT", lane, num_steps),
         }
         for lane, state, stop in zip(
             lights.lane_id.tolist(), lights.state, rounded(lights.stop_xyz_m), strict=True
@@ -182,7 +185,7 @@ _SPAN = (
 )
 
 
-class _Lanes:
+class LaneRelations:
     """What lanes lead to and lie beside, by their ids."""
 
     def __init__(self, road_map: RoadMap) -> None:
@@ -224,16 +227,17 @@ class _Lanes:
 
 def _line_name(kind: int) -> str:
     nowhere = np.zeros((0, 3))
-    return _named(Feature(0, 0, FeatureType.ROAD_LINE, kind, nowhere))
+    return feature_type_name(Feature(0, 0, FeatureType.ROAD_LINE, kind, nowhere))
 
 
-def _named(feature: Feature) -> str:
+def feature_type_name(feature: Feature) -> str:
+    """Name a feature's sub-type as MetaDrive does."""
     name = womd_name(feature)
     return _RENAMED.get(name, name)
 
 
-def _feature(feature: Feature, lanes: _Lanes) -> dict[str, Any]:
-    found: dict[str, Any] = {"type": _named(feature)}
+def _feature(feature: Feature, lanes: LaneRelations) -> dict[str, Any]:
+    found: dict[str, Any] = {"type": feature_type_name(feature)}
     points = rounded(feature.xyz_m)
     if feature.kind == FeatureType.STOP_SIGN:
         signs = lanes.map.sign_id == feature.id
@@ -241,14 +245,15 @@ def _feature(feature: Feature, lanes: _Lanes) -> dict[str, Any]:
             "lane": lanes.map.sign_lane_id[signs].tolist(),
             "position": points[0],
         }
-    if feature.kind not in _LINES:
+    if feature.kind not in LINES:
         return found | {"polygon": points}
     if feature.kind == FeatureType.LANE:
-        found |= _lane(feature, lanes)
+        found |= lane_fields(feature, lanes)
     return found | {"polyline": points}
 
 
-def _lane(feature: Feature, lanes: _Lanes) -> dict[str, Any]:
+def lane_fields(feature: Feature, lanes: LaneRelations) -> dict[str, Any]:
+    """Speed limit and relations of a lane."""
     speed_mph = float(lanes.map.speed_limit_mph[feature.row])
     return {
         "speed_limit_mph": speed_mph,

@@ -192,7 +192,7 @@ def _header_fault(header: bytes, *, first: bool) -> str:
     """Say what is wrong with a record's header; nothing if it is sound."""
     if not header:
         return "file is empty"
-    if _is_header(header):
+    if is_record_header(header):
         return ""
     for magic, what in _OTHER_FORMATS.items() if first else ():
         if header.startswith(magic[: _HEADER.size]):
@@ -202,10 +202,11 @@ def _header_fault(header: bytes, *, first: bool) -> str:
     return "length checksum does not match" + (": not a TFRecord?" if first else "")
 
 
-def _is_header(head: bytes) -> bool:
+def is_record_header(head: bytes) -> bool:
+    """Tell whether some bytes start a record: a length, and its checksum."""
     if len(head) < _HEADER.size:
         return False
-    return bool(_HEADER.unpack(head)[1] == masked_crc(head[:8]))
+    return bool(_HEADER.unpack_from(head)[1] == masked_crc(head[:8]))
 
 
 def _unpacked(file: ByteSource) -> "_Plain | _Gunzip":
@@ -215,7 +216,7 @@ def _unpacked(file: ByteSource) -> "_Plain | _Gunzip":
     long. A sound header is therefore believed first.
     """
     head = file.read(_HEADER.size)
-    if head.startswith(_GZIP_MAGIC) and not _is_header(head):
+    if head.startswith(_GZIP_MAGIC) and not is_record_header(head):
         return _Gunzip(file, head)
     return _Plain(file, head)
 

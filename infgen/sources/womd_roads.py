@@ -103,7 +103,7 @@ def read_road_map(
         **_boundaries(data, tables),
         **_signs(tables),
     )
-    _check(road_map)
+    check_road_map(road_map)
     return road_map
 
 
@@ -227,7 +227,13 @@ def _last_double(data: bytes, fields: list[Field], key: int) -> float:
     return 0.0
 
 
-def _check(road_map: RoadMap) -> None:
+def check_road_map(road_map: RoadMap) -> None:
+    """Refuse a map that nothing can be drawn or measured on.
+
+    Raises:
+        RecordError: if two features have one id, a point is not finite, or a lane, road
+            line or road edge has no points or all of several in one place.
+    """
     ids = road_map.feature_id
     ordered = np.sort(ids)
     if (twice := ordered[1:][ordered[1:] == ordered[:-1]]).size:

@@ -168,12 +168,20 @@ def check_records(word: str) -> None:
         ConfigError: saying so.
     """
     path = Path(word)
-    there = path.is_file() or (path.is_dir() and any(path.glob(RECORDS_IN_FOLDER)))
+    there = path.is_file() or (path.is_dir() and _holds_records(path))
     if not there and word != BUILTIN and "://" not in word and not has_magic(word):
         raise ConfigError(
             f"{word} is neither a root nor records; expected the --root of a run, "
-            f"TFRecords, or a folder of {RECORDS_IN_FOLDER}"
+            f"TFRecords, a folder of {RECORDS_IN_FOLDER}, or scenes of another source"
         )
+
+
+def _holds_records(folder: Path) -> bool:
+    from infgen.sources.registry import find_below  # noqa: PLC0415
+
+    if any(folder.glob(RECORDS_IN_FOLDER)):
+        return True
+    return next(find_below(str(folder)), None) is not None
 
 
 def write_page(view_model: "ViewModel", path: Path) -> Path:

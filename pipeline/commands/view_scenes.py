@@ -1,17 +1,16 @@
 """A scene and its rollouts: found in a root by the start of its id, or in records."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from infgen.errors import ConfigError
 from infgen.scene import Scene
-from infgen.sources.tfrecord import BadRecord, RecordError, iter_records
-from infgen.sources.womd import decode_scene, read_scenario_id
 from pipeline.engine.layout import Root
 from pipeline.engine.manifest import read_manifest
-from pipeline.storage.source_files import find_urls
+from pipeline.storage.raw_scenes import iter_raw_scenes
+from pipeline.storage.source_files import find_records
 
 if TYPE_CHECKING:
     from infgen.rollout.rollout import Rollout
@@ -58,17 +57,17 @@ def find_in_root(root: Root, prefix: str, rollouts: Sequence[int] | None) -> See
 
 
 def find_in_records(patterns: Sequence[str], prefix: str) -> Scene:
-    """Find the first log in TFRecords whose id starts so.
+    """Find the first log in records or scene files whose id starts so.
 
     Raises:
         ConfigError: if there is none, naming some that there are.
     """
     passed: list[str] = []
     bad: list[str] = []
-    for scenario_id, data in _records(find_urls(patterns), bad):
-        if scenario_id.startswith(prefix):
-            return decode_scene(data)
-        passed.append(scenario_id)
+    for raw in iter_raw_scenes(find_records(patterns), bad):
+        if raw.scenario_id.startswith(prefix):
+            return raw.decode()
+        passed.append(raw.scenario_id)
     if passed:
         choose(passed, prefix, "these records")
     why = "; ".join(bad[:MOST_BAD]) or "they are empty"
@@ -104,23 +103,6 @@ def _matching(ids: Iterable[str], prefix: str) -> list[str]:
 def _some(ids: Sequence[str]) -> str:
     more = len(ids) - MOST_NAMED
     return ", ".join(ids[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
-def _records(urls: Sequence[str], bad: list[str]) -> Iterator[tuple[str, bytes]]:
-    """Ids and bytes of all records that can be read so far as to have one.
-
-    Why others cannot is added to ``bad``.
-    """
-    for url in urls:
-        for record in iter_records(url):
-            try:
-                if isinstance(record, BadRecord):
-                    raise RecordError(record.reason)
-                scenario_id = read_scenario_id(record.data)
-            except RecordError as error:
-                bad.append(f"{url}, record {record.number}: {error}")
-                continue
-            yield scenario_id, record.data
 
 
 def _units_of_scenes(stage: Path, column: str) -> dict[str, str]:

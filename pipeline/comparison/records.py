@@ -6,7 +6,7 @@ from pathlib import Path
 from infgen.errors import ConfigError
 from pipeline.comparison.runs import Comparison
 from pipeline.engine.events import Event
-from pipeline.storage.source_files import find_urls
+from pipeline.storage.source_files import find_records as find_raw
 from pipeline.storage.towns import Order, write_towns
 
 TOWNS = "towns"
@@ -71,7 +71,7 @@ def _are_named(comparison: Comparison) -> bool:
     if comparison.preset.towns:
         return False
     try:
-        find_urls(comparison.file.base.sources)
+        find_raw(comparison.file.base.sources)
     except ConfigError as error:
         raise ConfigError(
             f"preset {comparison.preset.name} reads records of your own; name them: "

@@ -26,17 +26,20 @@ units find them in the units' reports.
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """One input file that no stage made.
+    """One input file that no stage made, or a group of small ones.
 
     Attributes:
         url: Local path or fsspec URL.
         name: File name without folders, unique among the sources.
         fingerprint: Identity of the content.
+        parts: What it consists of, where it is a group of small files: JSON-able, for the
+            tasks of units.
     """
 
     url: str
     name: str
     fingerprint: str
+    parts: tuple[Mapping[str, Any], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Ingest: raw records -> scenes in Zarr, an index of them, and a quarantine of the rest.
 
-One unit per source file. Memory stays bounded whatever the file holds: scenes are written
-in groups of bounded size as they come. A record that cannot be used is a named row of
+One unit per TFRecord, or per group of scene files (``pipeline.storage.scene_groups``).
+Memory stays bounded whatever the file holds: scenes are written in groups of bounded size as they come. A record that cannot be used is a named row of
 ``quarantine.parquet``; it never stops the file, and the file never stops the stage.
 """
 
@@ -14,9 +14,8 @@ import numpy as np
 
 from infgen.config import IngestSettings
 from infgen.scene import Scene
-from infgen.sources.tfrecord import BadRecord, Record, iter_records
-from infgen.sources.womd import scene_or_bad_record
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
+from pipeline.stages.ingest_records import Ingested, iter_ingested
 from pipeline.storage.duplicates import mark_duplicates, report_duplicates
 from pipeline.storage.parquet import make_table, read_tables
 from pipeline.storage.scenes import SCENES_SCHEMA
@@ -34,6 +33,9 @@ _INDEX = {
     "group": str,
     "row": int,
     "source": str,
+    "file": str,
+    "dataset": str,
+    "annotation_hz": float,
     "record": int,
     "offset": int,
     "record_bytes": int,
@@ -49,18 +51,22 @@ _MARKED = ("scenario_id", "split", "duplicate", "source", "record", "offset")
 
 
 def plan(inputs: Inputs, settings: IngestSettings) -> Sequence[Unit]:
-    """One unit per source file."""
+    """One unit per source file, or group of them."""
     return [
-        Unit(source.name, {"source": source.fingerprint}, {"url": source.url})
+        Unit(
+            source.name,
+            {"source": source.fingerprint},
+            {"scenes": source.parts} if source.parts else {"url": source.url},
+        )
         for source in inputs.sources
     ]
 
 
 def work(unit: Unit, target: Path, settings: IngestSettings, progress: Progress) -> Report:
-    """Ingest one file."""
+    """Ingest one file or group."""
     target.mkdir(parents=True, exist_ok=True)
     shard = _Shard(target, unit.name, settings.max_scenes_per_shard)
-    for record in iter_records(unit.task["url"]):
+    for record in iter_ingested(unit.name, unit.task, settings.now_step):
         shard.take(record)
         if (
             settings.max_scenes_per_file
@@ -110,20 +116,19 @@ class _Shard:
         self._pending_bytes = self._record_bytes = self._groups = 0
         self._records: dict[str, int] = {}
 
-    def take(self, record: Record | BadRecord) -> None:
+    def take(self, record: Ingested) -> None:
         """Keep one record as a scene, or as a row of the quarantine."""
-        found = record if isinstance(record, BadRecord) else scene_or_bad_record(record)
-        if isinstance(record, Record):
-            self._record_bytes += len(record.data)
+        found = record.found
+        self._record_bytes += record.num_bytes
         if isinstance(found, Scene) and found.scenario_id in self._records:
             first = self._records[found.scenario_id]
-            reason = f"duplicate id {found.scenario_id}: record {first} has it already"
-            found = BadRecord(record.number, record.offset, reason)
-        if isinstance(found, BadRecord):
-            row = (self._source, found.number, found.offset, found.reason)
-            self._bad.append(dict(zip(_QUARANTINE, row, strict=True)))
-        elif isinstance(record, Record):
+            found = f"duplicate id {found.scenario_id}: record {first} has it already"
+        if isinstance(found, Scene):
             self._keep(record, found)
+        else:
+            reason = found if record.file == self._source else f"{record.file}: {found}"
+            row = (self._source, record.number, record.offset, reason)
+            self._bad.append(dict(zip(_QUARANTINE, row, strict=True)))
 
     def close(self) -> None:
         """Write what is left, and the tables."""
@@ -144,7 +149,7 @@ class _Shard:
             "disk_bytes": sum(path.stat().st_size for path in files),
         }
 
-    def _keep(self, record: Record, scene: Scene) -> None:
+    def _keep(self, record: Ingested, scene: Scene) -> None:
         self._records[scene.scenario_id] = record.number
         row = {
             "scenario_id": scene.scenario_id,
@@ -152,9 +157,12 @@ class _Shard:
             "group": self._group_name,
             "row": len(self._pending),
             "source": self._source,
+            "file": record.file,
+            "dataset": record.dataset,
+            "annotation_hz": record.annotation_hz,
             "record": record.number,
             "offset": record.offset,
-            "record_bytes": len(record.data),
+            "record_bytes": record.num_bytes,
             "agents": scene.tracks.num_agents,
             "steps": scene.tracks.num_steps,
             "features": scene.road_map.num_features,
@@ -220,7 +228,7 @@ def _duplicates(index: "pl.DataFrame") -> "pl.DataFrame":
 
 STAGE = Stage(
     name="ingest",
-    version=1,
+    version=2,
     settings={"ingest": IngestSettings},
     plan=plan,
     work=work,
@@ -229,7 +237,9 @@ STAGE = Stage(
         "pipeline.storage.columns",
         "pipeline.storage.duplicates",
         "pipeline.stages.ingest",
+        "pipeline.stages.ingest_records",
         "pipeline.storage.parquet",
+        "pipeline.storage.scene_groups",
         "pipeline.storage.splits",
         "pipeline.storage.zarr_store",
     ),

@@ -15,7 +15,8 @@ def make_table(rows: Sequence[Mapping[str, Any]], columns: Fields) -> "pl.DataFr
     """Make a table of rows with these columns, also without rows."""
     import polars as pl  # noqa: PLC0415
 
-    types = {name: pl.String if kind is str else pl.Int64 for name, kind in columns.items()}
+    of = {str: pl.String, int: pl.Int64, float: pl.Float64}
+    types = {name: of[kind] for name, kind in columns.items()}
     return pl.DataFrame(list(rows), schema=types)
 
 

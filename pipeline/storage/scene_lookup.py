@@ -5,16 +5,16 @@ Only a bounded part of the scenes is in memory: rollouts come in an order of the
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
+from infgen.alignment import align_to_tokens
 from infgen.errors import ConfigError
 from infgen.scene import Scene
-from infgen.sources.tfrecord import BadRecord, RecordError, iter_records, read_record
-from infgen.sources.womd import decode_scene, read_scenario_id
 from pipeline.engine.atomic import MANIFEST
 from pipeline.engine.layout import KEY_DIGITS
 from pipeline.engine.manifest import read_manifest
-from pipeline.storage.source_files import find_urls
+from pipeline.storage.raw_scenes import RawScene, iter_raw_scenes
+from pipeline.storage.source_files import RawRecords, find_records
 
 if TYPE_CHECKING:
     from pipeline.storage.columns import PackedRecords
@@ -42,23 +42,18 @@ class SceneLookup(Protocol):
         """
 
 
-class _Place(NamedTuple):
-    url: str
-    offset: int
-
-
 class RecordLookup:
     """Scenes in raw records, read as far as needed, and read again where asked back.
 
     Where rollouts come in the order of the records, each record is read once, alone.
     """
 
-    def __init__(self, urls: Sequence[str], cache_bytes: int = CACHE_BYTES) -> None:
-        self._unread = self._read(urls)
-        self._places: dict[str, _Place] = {}
-        self._cached: dict[str, bytes] = {}
-        self._free_bytes = cache_bytes
+    def __init__(self, records: RawRecords, cache_bytes: int = CACHE_BYTES) -> None:
         self._bad: list[str] = []
+        self._unread = self._read(records)
+        self._places: dict[str, RawScene] = {}
+        self._cached: dict[str, RawScene] = {}
+        self._free_bytes = cache_bytes
 
     def find(self, scenario_id: str) -> Scene:
         """Return one log.
@@ -71,41 +66,25 @@ class RecordLookup:
         while scenario_id not in self._places:
             if next(self._unread, None) is None:
                 raise self._missing(scenario_id)
-        data = self._cached.pop(scenario_id, None)
-        if data is None:
-            return decode_scene(self._reread(self._places[scenario_id]))
-        self._free_bytes += len(data)
-        return decode_scene(data)
+        raw = self._cached.pop(scenario_id, self._places[scenario_id])
+        self._free_bytes += len(raw.data)
+        return align_to_tokens(raw.decode())
 
-    def _read(self, urls: Sequence[str]) -> Iterator[str]:
+    def _read(self, records: RawRecords) -> Iterator[str]:
         """Read record after record into the cache; yield ids."""
-        for url in urls:
-            for record in iter_records(url):
-                try:
-                    if isinstance(record, BadRecord):
-                        raise RecordError(record.reason)
-                    scenario_id = read_scenario_id(record.data)
-                except RecordError as error:
-                    self._bad.append(f"{url}, record {record.number}: {error}")
-                    continue
-                if scenario_id not in self._places:
-                    self._places[scenario_id] = _Place(url, record.offset)
-                    self._keep(scenario_id, record.data)
-                    yield scenario_id
+        for raw in iter_raw_scenes(records, self._bad):
+            if raw.scenario_id not in self._places:
+                self._places[raw.scenario_id] = raw._replace(data=b"")
+                self._keep(raw)
+                yield raw.scenario_id
 
-    def _keep(self, scenario_id: str, data: bytes) -> None:
+    def _keep(self, raw: RawScene) -> None:
         """Cache a record, and drop the oldest ones while it is too large."""
-        self._cached[scenario_id] = data
-        self._free_bytes -= len(data)
+        self._cached[raw.scenario_id] = raw
+        self._free_bytes -= len(raw.data)
         while self._free_bytes < 0 and len(self._cached) > 1:
             oldest = next(iter(self._cached))
-            self._free_bytes += len(self._cached.pop(oldest))
-
-    def _reread(self, place: _Place) -> bytes:
-        record = read_record(place.url, place.offset)
-        if isinstance(record, BadRecord):
-            raise RecordError(f"{place.url} at byte {place.offset}: {record.reason}")
-        return record.data
+            self._free_bytes += len(self._cached.pop(oldest).data)
 
     def _missing(self, scenario_id: str) -> ValueError:
         bad = "; ".join(self._bad[:MAX_NAMED])
@@ -140,7 +119,7 @@ class StoreLookup:
             none = f"none of {len(self._places)} ingested scenes has its id"
             raise MissingSceneError(f"scene {scenario_id}: {none}")
         path, row = self._places[scenario_id]
-        return self._group(path)[row]
+        return align_to_tokens(self._group(path)[row])
 
     def _group(self, path: Path) -> "PackedRecords[Scene]":
         from pipeline.storage.scenes import SCENES_SCHEMA  # noqa: PLC0415
@@ -166,7 +145,7 @@ def open_scene_lookup(names: Sequence[str]) -> SceneLookup:
         if not any(any(folder.glob("scenes-*.zarr")) for folder in folders):
             raise ConfigError(f"{names[0]} holds no ingested scenes")
         return StoreLookup(folders)
-    return RecordLookup(find_urls(names))
+    return RecordLookup(find_records(names))
 
 
 def unit_folders(folder: Path) -> list[Path] | None:

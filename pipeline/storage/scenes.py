@@ -4,16 +4,22 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from infgen.alignment import align_to_tokens
 from infgen.scene import Scene
 
 SCENES_SCHEMA = "infgen.scenes/2"
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 
 
-def read_scenes(unit_folder: Path) -> Iterator[Scene]:
+def read_scenes(unit_folder: Path, *, aligned: bool = True) -> Iterator[Scene]:
     """Stream the scenes of one ingested file, in the order of its records.
 
     One group is in memory at a time.
+
+    Args:
+        unit_folder: Of the ingested file.
+        aligned: As other stages need them, with a history that ends with a token
+            (``align_to_tokens``); otherwise as they were ingested.
 
     Raises:
         StoreError: if a group is damaged.
@@ -21,7 +27,8 @@ def read_scenes(unit_folder: Path) -> Iterator[Scene]:
     from pipeline.storage.zarr_store import read_records  # noqa: PLC0415
 
     for path in sorted(unit_folder.glob("scenes-*.zarr")):
-        yield from read_records(path, Scene, SCENES_SCHEMA, whole=True)
+        for scene in read_records(path, Scene, SCENES_SCHEMA, whole=True):
+            yield align_to_tokens(scene) if aligned else scene
 
 
 def file_name(scenario_id: str) -> str:

@@ -1,5 +1,9 @@
-"""Splits by file names: ``training.tfrecord-00000-of-01000`` is of ``training``."""
+"""Splits by file names: ``training.tfrecord-00000-of-01000`` is of ``training``.
 
+Groups of scene files are named alike: ``training.argoverse2-00000-of-00004``.
+"""
+
+import re
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
 
@@ -9,13 +13,23 @@ from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import FinishedUnit
 from pipeline.storage.duplicates import unique_rows
 
+_GROUP = re.compile(r"([^.]+)\.(?!tfrecord)[a-z0-9]+-\d{5}-of-\d{5}(?:-|$)")
+
+
+def group_name(split: str, source: str, number: int, count: int) -> str:
+    """Name a group of scene files of one split. Inverse of ``split_of``."""
+    return f"{split}.{source}-{number:05d}-of-{count:05d}"
+
 
 def split_of(name: str) -> str:
     """Return the split that a file belongs to: its name up to ``.tfrecord``.
 
-    Of WOMD's own long names the distinctive word is used:
+    The split of a group of scene files is its name up to that of their source. Of WOMD's
+    own long names the distinctive word is used:
     ``uncompressed_scenario_training_training.tfrecord-...`` is of ``training``.
     """
+    if match := _GROUP.match(name):
+        return match[1]
     stem = name.split(".tfrecord")[0]
     if "scenario_" not in stem:
         return stem

@@ -19,6 +19,7 @@ from pipeline.storage.scene_lookup import (
     open_scene_lookup,
     unit_folders,
 )
+from pipeline.storage.source_files import RawRecords
 
 
 def silent(done, total, note=""):
@@ -45,7 +46,7 @@ def ingested(source, tmp_path_factory):
 
 @pytest.mark.parametrize("cache_bytes", [1 << 30, 0], ids=["all kept", "none kept"])
 def test_records_are_found_in_any_order(source, records, cache_bytes):
-    found = RecordLookup([str(source)], cache_bytes)
+    found = RecordLookup(RawRecords([str(source)], []), cache_bytes)
 
     for scenario_id in [*reversed(records), *records]:
         assert found.find(scenario_id).scenario_id == scenario_id
@@ -54,7 +55,7 @@ def test_records_are_found_in_any_order(source, records, cache_bytes):
 def test_plain_records_are_found_again_by_their_offset(tmp_path, source, records):
     plain = tmp_path / "plain.tfrecord"
     plain.write_bytes(gzip.decompress(source.read_bytes()))
-    found = RecordLookup([str(plain)], cache_bytes=0)
+    found = RecordLookup(RawRecords([str(plain)], []), cache_bytes=0)
 
     for scenario_id in [*reversed(records), *records]:
         assert found.find(scenario_id).scenario_id == scenario_id
@@ -62,7 +63,7 @@ def test_plain_records_are_found_again_by_their_offset(tmp_path, source, records
 
 def test_records_that_nobody_asks_for_are_not_all_kept(source, records):
     largest = max(len(record.data) for record in records.values())
-    found = RecordLookup([str(source)], largest)
+    found = RecordLookup(RawRecords([str(source)], []), largest)
     found.find(list(records)[-1])
 
     assert sum(map(len, found._cached.values())) <= largest
@@ -102,7 +103,7 @@ def test_a_damaged_record_is_named_where_a_log_is_missing(tmp_path, source, reco
     with pytest.raises(
         MissingSceneError, match=r"1 unusable records: .*record 0: data check"
     ):
-        RecordLookup([str(damaged)]).find(next(iter(records)))
+        RecordLookup(RawRecords([str(damaged)], [])).find(next(iter(records)))
 
 
 def test_a_file_without_any_record_is_a_wrong_word(tmp_path):
