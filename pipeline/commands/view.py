@@ -147,7 +147,7 @@ def find_view_model(wanted: Wanted) -> "ViewModel":
         ConfigError: if there is no such scene or rollout.
     """
     from infgen.views.scene.view_model import make_view_model  # noqa: PLC0415
-    from pipeline.commands.view_scenes import find_in_records, find_in_root  # noqa: PLC0415
+    from pipeline.storage.scene_rollouts import find_in_records, find_in_root  # noqa: PLC0415
 
     if wanted.records:
         return make_view_model(find_in_records(wanted.records, wanted.scene), ())

@@ -69,11 +69,7 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
     """
     weights = inputs.folder("train")
     identity = inputs.content("train", "model.safetensors", "model.json")
-    found = read_found(inputs.folder("calibrate"))
-    biases = Biases(
-        add=found.add if settings.inserts else 0.0,
-        leave=found.leave if settings.removes else 0.0,
-    )
+    biases = read_found(inputs.folder("calibrate")).used_by(settings)
     every = inputs.units("ingest")
     shards = files_of_split(every, settings.split, to="simulate", setting="rollout.split")
     units = []

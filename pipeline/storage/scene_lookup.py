@@ -3,7 +3,7 @@
 Only a bounded part of the scenes is in memory: rollouts come in an order of their own.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
@@ -12,9 +12,10 @@ from infgen.scene import Scene
 from infgen.sources.tfrecord import BadRecord, RecordError, iter_records, read_record
 from infgen.sources.womd import decode_scene, read_scenario_id
 from pipeline.engine.atomic import MANIFEST
-from pipeline.engine.layout import KEY_DIGITS
+from pipeline.engine.layout import KEY_DIGITS, Root
 from pipeline.engine.manifest import read_manifest
 from pipeline.storage.source_files import find_urls
+from pipeline.storage.splits import in_split, split_of
 
 if TYPE_CHECKING:
     from pipeline.storage.columns import PackedRecords
@@ -56,9 +57,20 @@ class RecordLookup:
     def __init__(self, urls: Sequence[str], cache_bytes: int = CACHE_BYTES) -> None:
         self._unread = self._read(urls)
         self._places: dict[str, _Place] = {}
+        self._ids: list[str] = []
         self._cached: dict[str, bytes] = {}
         self._free_bytes = cache_bytes
         self._bad: list[str] = []
+
+    def scenario_ids(self, least: int | None = None) -> Sequence[str]:
+        """Ids in the order of the records: at least so many, if there are, or all of them.
+
+        Records are read as far as needed, and none is decoded.
+        """
+        while least is None or len(self._ids) < least:
+            if next(self._unread, None) is None:
+                break
+        return self._ids
 
     def find(self, scenario_id: str) -> Scene:
         """Return one log.
@@ -90,6 +102,7 @@ class RecordLookup:
                     continue
                 if scenario_id not in self._places:
                     self._places[scenario_id] = _Place(url, record.offset)
+                    self._ids.append(scenario_id)
                     self._keep(scenario_id, record.data)
                     yield scenario_id
 
@@ -119,15 +132,21 @@ class RecordLookup:
 class StoreLookup:
     """Scenes of an ingested store, with a few groups in memory at a time."""
 
-    def __init__(self, folders: Sequence[Path]) -> None:
+    def __init__(self, folders: Sequence[Path], split: str | None = None) -> None:
         import polars as pl  # noqa: PLC0415
 
         self._places: dict[str, tuple[Path, int]] = {}
         self._open: dict[Path, PackedRecords[Scene]] = {}
         for folder in folders:
             index = pl.read_parquet(folder / "index.parquet")
+            if split is not None:
+                index = index.filter(pl.col("split") == split)
             for scenario_id, group, row in index.select(_PLACE).iter_rows():
                 self._places.setdefault(scenario_id, (folder / group, row))
+
+    def scenario_ids(self, least: int | None = None) -> Sequence[str]:
+        """Ids of all scenes, in the order of the store."""
+        return list(self._places)
 
     def find(self, scenario_id: str) -> Scene:
         """Return one log.
@@ -167,6 +186,51 @@ def open_scene_lookup(names: Sequence[str]) -> SceneLookup:
             raise ConfigError(f"{names[0]} holds no ingested scenes")
         return StoreLookup(folders)
     return RecordLookup(find_urls(names))
+
+
+def open_split(names: Sequence[str], split: str | None) -> RecordLookup | StoreLookup:
+    """Open the scenes of one split, or of all: raw records, an ingested folder or a root.
+
+    Raises:
+        ConfigError: if there is nothing by such a name, or no scene of the split.
+    """
+    folder = Path(names[0])
+    if len(names) == 1 and Root(folder.absolute()).store.is_dir():
+        made = Root(folder.absolute()).latest_folder("ingest")
+        if made is None:
+            raise ConfigError(
+                f"{folder} holds no scenes; `infgen ingest --root {folder}` makes them"
+            )
+        folder = made
+    folders = unit_folders(folder) if len(names) == 1 else None
+    if folders is not None:
+        store = StoreLookup(folders, split)
+        if split is not None and not store.scenario_ids():
+            raise _no_split(names, split, _splits(folders))
+        return store
+    urls = find_urls(names)
+    if split is None:
+        return RecordLookup(urls)
+    found = [url for url in urls if in_split(_file_name(url), split)]
+    if not found:
+        raise _no_split(names, split, {split_of(_file_name(url)) for url in urls})
+    return RecordLookup(found)
+
+
+def _no_split(names: Sequence[str], split: str, there: Iterable[str]) -> ConfigError:
+    some = ", ".join(sorted(there)) or "none"
+    return ConfigError(f"{', '.join(names)}: no split {split!r}; there is {some}")
+
+
+def _splits(folders: Sequence[Path]) -> set[str]:
+    import polars as pl  # noqa: PLC0415
+
+    paths = [folder / "index.parquet" for folder in folders]
+    return {name for path in paths for name in pl.read_parquet(path)["split"]}
+
+
+def _file_name(url: str) -> str:
+    return url.rsplit("/", 1)[-1]
 
 
 def unit_folders(folder: Path) -> list[Path] | None:

@@ -16,6 +16,8 @@ from pipeline.storage.source_files import find_urls
 if TYPE_CHECKING:
     from infgen.rollout.rollout import Rollout
 
+SCENES = "scenes"
+"""Folder of the scenes of saved rollouts, beside them."""
 MOST_NAMED = 8
 MOST_BAD = 3
 """Most unusable records that a message names."""
