@@ -17,13 +17,31 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pipeline.api import Scenes, TrafficSimulator, load, open_scenes
+    from pipeline.api.arrays import rollouts_from_arrays, score
+    from pipeline.api.rollouts import SceneRollouts, open_rollouts
+    from pipeline.api.scenes import Scenes, open_scenes
+    from pipeline.api.scoring import Reference, SceneScores, open_reference
+    from pipeline.api.showing import PlayerPage
+    from pipeline.api.simulator import TrafficSimulator, load
 
 __version__ = "0.1.0"
-__all__ = ["Scenes", "TrafficSimulator", "load", "open_scenes"]
+__all__ = [
+    "PlayerPage",
+    "Reference",
+    "SceneRollouts",
+    "SceneScores",
+    "Scenes",
+    "TrafficSimulator",
+    "load",
+    "open_reference",
+    "open_rollouts",
+    "open_scenes",
+    "rollouts_from_arrays",
+    "score",
+]
 
 # These are made of both packages: of traffic (infgen) and of files (pipeline). ``infgen``
-# imports nothing of ``pipeline``, so that its parts work without; this is the one door, and
+# imports nothing of ``pipeline``, so that its parts work without. This is the one door, and
 # it opens when a name is first used, so that `import infgen` stays fast.
 _FACADE = "pipeline.api"
 
@@ -32,7 +50,8 @@ def __getattr__(name: str) -> Any:
     """Fetch a name of the facade (PEP 562)."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(import_module(_FACADE), name)
+    module = import_module(_FACADE).MODULES[name]
+    found = getattr(import_module(f"{_FACADE}.{module}"), name)
     globals()[name] = found
     return found
 

@@ -1,10 +1,21 @@
 """What ``import infgen`` offers: simulating, reading, scoring and showing in few words.
 
-Modules load what they need when it is used: neither importing this nor opening scenes
-loads torch.
+``infgen.NAME`` imports the module of a name when it is first used. Opening scenes so loads
+no torch.
 """
 
-from pipeline.api.scenes import Scenes, open_scenes
-from pipeline.api.simulator import TrafficSimulator, load
-
-__all__ = ["Scenes", "TrafficSimulator", "load", "open_scenes"]
+MODULES = {
+    "PlayerPage": "showing",
+    "Reference": "scoring",
+    "SceneRollouts": "rollouts",
+    "SceneScores": "scoring",
+    "Scenes": "scenes",
+    "TrafficSimulator": "simulator",
+    "load": "simulator",
+    "open_reference": "scoring",
+    "open_rollouts": "rollouts",
+    "open_scenes": "scenes",
+    "rollouts_from_arrays": "arrays",
+    "score": "arrays",
+}
+"""Module of each name."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, overload
 
 from infgen.scene import Scene
 from pipeline.storage.scene_lookup import MissingSceneError, open_split
-from pipeline.storage.scene_rollouts import SCENES, choose
+from pipeline.storage.scene_rollouts import choose
 
 if TYPE_CHECKING:
     from pipeline.storage.scene_lookup import RecordLookup, StoreLookup
@@ -116,6 +116,4 @@ def open_scenes(source: str | Path | Sequence[str], *, split: str | None = None)
         ConfigError: if there is nothing by such a name, or no scene of the split.
     """
     names = [str(source)] if isinstance(source, str | Path) else list(source)
-    if len(names) == 1 and (own := Path(names[0]) / SCENES).is_dir():
-        names = [str(own)]
-    return Scenes(open_split(names, split), ", ".join(map(str, names)))
+    return Scenes(open_split(names, split), ", ".join(names))

@@ -16,27 +16,13 @@ from infgen.config import RolloutSettings
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
 from pipeline.stages.calibration import Biases, read_found
 from pipeline.stages.simulation import begin, load_simulator, read_some, simulate_all
-from pipeline.storage.parquet import Fields, make_table, read_tables
-from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
+from pipeline.storage.parquet import read_tables
+from pipeline.storage.rollouts import INDEX, write_rollouts
 from pipeline.storage.splits import files_of_split, spread_evenly
 
 if TYPE_CHECKING:
     from infgen.rollout.recording import RolloutStart
-    from infgen.rollout.rollout import Rollout
     from infgen.rollout.simulator import Simulator
-
-INDEX: Fields = {
-    "scenario_id": str,
-    "rollout": int,
-    "unit": str,
-    "group": int,
-    "row": int,
-    "agents": int,
-    "inserted": int,
-    "left": int,
-    "steps": int,
-}
-
 
 OF_ENTRIES = (
     "add_bias",
@@ -100,9 +86,6 @@ def simulate(
     unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
 ) -> Report:
     """Simulate all rollouts of some scenes in batches, and write them as groups."""
-    from infgen.rollout.rollout import Rollout  # noqa: PLC0415
-    from pipeline.storage.zarr_store import write_records  # noqa: PLC0415
-
     biases = Biases(**unit.task["biases"])
     settings = biases.over(settings)
     folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
@@ -113,12 +96,8 @@ def simulate(
     def tell(played: float) -> None:
         progress(played, len(starts), f"{_rate(played, begun):.3g} rollouts/s")
 
-    rows: list[dict[str, Any]] = []
-    for group, rollouts in enumerate(simulate_all(simulator, starts, weights, tell)):
-        path = target / f"rollouts-{group:03d}.zarr"
-        write_records(path, rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True)
-        rows += [_row(unit.name, group, at, done) for at, done in enumerate(rollouts)]
-    make_table(rows, INDEX).write_parquet(target / "index.parquet")
+    groups = simulate_all(simulator, starts, weights, tell)
+    rows = write_rollouts(target, unit.name, groups)
     pace = {"rollouts_per_s": round(_rate(len(rows), begun), 4)}
     told = {"add_bias": settings.add_bias, "remove_bias": settings.remove_bias}
     return {**_report(rows, refused), **told, "simulates": simulator.simulates, "run": pace}
@@ -171,20 +150,6 @@ def _starts(unit: Unit, simulator: "Simulator") -> "tuple[list[RolloutStart], li
     return starts, refused
 
 
-def _row(unit: str, group: int, at: int, rollout: "Rollout") -> dict[str, Any]:
-    return {
-        "scenario_id": rollout.scenario_id,
-        "rollout": rollout.index,
-        "unit": unit,
-        "group": group,
-        "row": at,
-        "agents": len(rollout.id),
-        "inserted": int((~rollout.logged).sum()),
-        "left": int((rollout.exit_step >= 0).sum()),
-        "steps": rollout.num_steps,
-    }
-
-
 def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
     totals = {
         name: sum(row[name] for row in rows) for name in ("agents", "inserted", "left")
@@ -204,5 +169,6 @@ STAGE = Stage(
         "pipeline.stages.calibration",
         "pipeline.stages.simulation",
         "pipeline.stages.rollout",
+        "pipeline.storage.rollouts",
     ),
 )

@@ -16,10 +16,12 @@ from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage,
 from pipeline.storage.splits import in_split, split_of
 
 if TYPE_CHECKING:
+    from infgen.metrics.long_term.binned import Binned
     from infgen.metrics.long_term.reference import Counts
-    from infgen.metrics.long_term.table import Against
+    from infgen.metrics.long_term.table import Against, Row
     from infgen.rollout.rollout import Rollout
     from infgen.scene import Scene
+    from infgen.spatial.road_edges import RoadEdges
     from pipeline.stages.score_write import ScoreRow
 
 
@@ -123,23 +125,18 @@ class _Scorer:
 
     def take(self, scene: "Scene", rollouts: "Sequence[Rollout]") -> None:
         """Score the rollouts of one scene."""
-        from infgen.metrics.long_term.binned import bin_traffic  # noqa: PLC0415
-        from infgen.metrics.long_term.radius import present_within_radius  # noqa: PLC0415
         from infgen.metrics.long_term.reference import count_simulated  # noqa: PLC0415
-        from infgen.metrics.long_term.table import make_row  # noqa: PLC0415
-        from infgen.metrics.traffic import from_rollout  # noqa: PLC0415
         from infgen.spatial.road_edges import scene_road_edges  # noqa: PLC0415
         from pipeline.stages.score_write import rows_of  # noqa: PLC0415
 
         edges, radius_m = scene_road_edges(scene), self._settings.presence_radius_m
         self.official.append(_score_wosac(scene, rollouts, self._settings.wosac_version))
         for rollout in rollouts:
-            lived = present_within_radius(rollout, radius_m) if radius_m else rollout
-            near_m = self._reference.count_radius_m
-            binned = bin_traffic(from_rollout(lived), edges, near_m, as_logged=False)
+            binned, row = score_rollout(
+                rollout, edges, self._against, self._reference, radius_m
+            )
             windows = self._against.windows(binned.bins.shape[-1])
             self.counts += count_simulated(binned, windows)
-            row = make_row(binned, self._against)
             self.tally.add(scene.scenario_id, row)
             self._rows += rows_of(scene.scenario_id, rollout.index, row.numbers, "")
 
@@ -152,6 +149,34 @@ class _Scorer:
             prefix = f"{self._settings.wosac_version}/"
             found += rows_of(one["scenario_id"], None, one.get("scores", {}), prefix)
         return found
+
+
+def score_rollout(
+    rollout: "Rollout",
+    edges: "RoadEdges | None",
+    against: "Against",
+    reference: ReferenceSettings,
+    presence_radius_m: float,
+) -> "tuple[Binned, Row]":
+    """Measure one rollout, and score it under the long-term protocols.
+
+    Args:
+        rollout: The rollout.
+        edges: Road edges of its scene.
+        against: The logs of a split.
+        reference: How those were measured.
+        presence_radius_m: Agents are present within it only; 0 for no limit.
+    """
+    from infgen.metrics.long_term.binned import bin_traffic  # noqa: PLC0415
+    from infgen.metrics.long_term.radius import present_within_radius  # noqa: PLC0415
+    from infgen.metrics.long_term.table import make_row  # noqa: PLC0415
+    from infgen.metrics.traffic import from_rollout  # noqa: PLC0415
+
+    if presence_radius_m:
+        rollout = present_within_radius(rollout, presence_radius_m)
+    near_m = reference.count_radius_m
+    binned = bin_traffic(from_rollout(rollout), edges, near_m, as_logged=False)
+    return binned, make_row(binned, against)
 
 
 def _score_wosac(

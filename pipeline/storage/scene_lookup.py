@@ -178,14 +178,24 @@ _PLACE = ("scenario_id", "group", "row")
 def open_scene_lookup(names: Sequence[str]) -> SceneLookup:
     """Open raw records (paths, patterns, folders, URLs), or one folder of a store.
 
+    A folder of saved rollouts stands for the scene beside them.
+
     Raises:
         ConfigError: if there is nothing by such a name, or the store holds no scenes.
     """
+    if len(names) == 1 and (own := saved_scenes(Path(names[0]))) is not None:
+        return StoreLookup([own])
     if len(names) == 1 and (folders := unit_folders(Path(names[0]))) is not None:
         if not any(any(folder.glob("scenes-*.zarr")) for folder in folders):
             raise ConfigError(f"{names[0]} holds no ingested scenes")
         return StoreLookup(folders)
     return RecordLookup(find_urls(names))
+
+
+def saved_scenes(folder: Path) -> Path | None:
+    """Return the folder of the scene that lies beside saved rollouts, if there is one."""
+    own = folder / "scenes"
+    return own if (own / "index.parquet").is_file() else None
 
 
 def open_split(names: Sequence[str], split: str | None) -> RecordLookup | StoreLookup:
@@ -194,7 +204,7 @@ def open_split(names: Sequence[str], split: str | None) -> RecordLookup | StoreL
     Raises:
         ConfigError: if there is nothing by such a name, or no scene of the split.
     """
-    folder = Path(names[0])
+    folder = saved_scenes(Path(names[0])) or Path(names[0])
     if len(names) == 1 and Root(folder.absolute()).store.is_dir():
         made = Root(folder.absolute()).latest_folder("ingest")
         if made is None:
