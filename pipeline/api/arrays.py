@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 
 from infgen.rollout.rollout import NEVER, Rollout
 from infgen.scene import Scene
@@ -66,14 +66,14 @@ def score(
 
 
 def rollouts_from_arrays(
-    poses: Float[np.ndarray, "rollout agent step pose"],
+    poses: np.ndarray,
     scene: Scene,
     *,
     object_id: Sequence[int] | np.ndarray | None = None,
-    valid: Bool[np.ndarray, "rollout agent step"] | None = None,
+    valid: np.ndarray | None = None,
     frame: Literal["scene", "world"] = "scene",
     agent_type: Sequence[int] | np.ndarray | None = None,
-    size_lwh_m: Float[np.ndarray, "agent 3"] | None = None,
+    size_lwh_m: np.ndarray | None = None,
 ) -> SceneRollouts:
     """Make rollouts of arrays, to be looked at, scored or saved as ours.
 
@@ -81,17 +81,17 @@ def rollouts_from_arrays(
     valid for the first time.
 
     Args:
-        poses: x, y, heading, or x, y, z, heading, of every agent at every 0.1 s step after
-            now, in metres and radians. Without z agents keep that of now, inserted ones the
-            ego's.
+        poses: ``[rollout, agent, step, 3 or 4]``: x, y, heading, or x, y, z, heading, of
+            every agent at every 0.1 s step after now, in metres and radians. Without z
+            agents keep that of now, inserted ones the ego's.
         scene: The log that they continue.
-        object_id: Track id of each agent, the ego's among them; if None, those of all
+        object_id: ``[agent]``: track ids, the ego's among them; if None, those of all
             agents that are observed now, in the order of ``scene.tracks``.
-        valid: Whether an agent is there at a step; always if None.
+        valid: ``[rollout, agent, step]``: whether an agent is there; always if None.
         frame: ``scene``: as ``scene.tracks.xyz_m``. ``world``: as in the records, which is
             ``scene.origin_xyz_m`` more.
-        agent_type: ``AgentType`` of each agent; needed for those the log does not have.
-        size_lwh_m: Box of each agent; needed for those the log does not have.
+        agent_type: ``[agent]``: ``AgentType``; needed for agents the log does not have.
+        size_lwh_m: ``[agent, 3]``: boxes; needed for agents the log does not have.
 
     Raises:
         ArraysError: naming what does not fit.

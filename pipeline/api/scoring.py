@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from infgen.clock import CLOCK
 from infgen.config import ReferenceSettings, TokenSettings
 from infgen.errors import ConfigError
 from infgen.metrics.intervals import scene_mean
@@ -15,6 +16,7 @@ from infgen.metrics.long_term.protocols import PROTOCOLS
 from infgen.metrics.long_term.reference import log_probabilities, no_counts
 from infgen.metrics.long_term.table import Against, LogCounts
 from infgen.metrics.wosac import metric as wosac
+from infgen.metrics.wosac.logged import FUTURE_STEPS
 from infgen.rollout.rollout import Rollout
 from infgen.scene import Scene
 from infgen.settings import build
@@ -154,7 +156,15 @@ def score_rollouts(
             f"{metric} scores scenes generated from their first step on; these rollouts go "
             "on from a log: name another metric, or use infgen.metrics.wosac"
         )
-    scores = wosac.score(wosac.from_scene(scene), wosac.from_rollouts(rollouts), metric)
+    try:
+        given = wosac.from_rollouts(rollouts)
+        scores = wosac.score(wosac.from_scene(scene), given, metric)
+    except wosac.RolloutsError as error:
+        seconds = FUTURE_STEPS * CLOCK.step_s
+        raise wosac.RolloutsError(
+            f"{error}; {metric} wants everyone of now for {seconds:g} s, as "
+            "infgen.load(..., mode='wosac') simulates"
+        ) from error
     return SceneScores(scene.scenario_id, metric, scores.numbers())
 
 

@@ -43,7 +43,8 @@ class TrafficSimulator:
         """Simulate what may happen after the history of a scene.
 
         These are the bytes that ``infgen rollout`` writes for the same scene, weights and
-        settings.
+        settings, if its batches are of one scene each too (32 rollouts per scene, as usual,
+        or ``rollout.scenes_per_unit=1``): in others sums may round differently.
 
         Args:
             scene: A log; what it holds after ``scene.now`` is not looked at.
