@@ -21,11 +21,13 @@ if TYPE_CHECKING:
     from pipeline.api.rollouts import SceneRollouts, open_rollouts
     from pipeline.api.scenes import Scenes, open_scenes
     from pipeline.api.scoring import Reference, SceneScores, open_reference
+    from pipeline.api.session import PlannerSession
     from pipeline.api.showing import PlayerPage
     from pipeline.api.simulator import TrafficSimulator, load
 
 __version__ = "0.1.0"
 __all__ = [
+    "PlannerSession",
     "PlayerPage",
     "Reference",
     "SceneRollouts",

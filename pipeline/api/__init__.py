@@ -5,6 +5,7 @@ no torch.
 """
 
 MODULES = {
+    "PlannerSession": "session",
     "PlayerPage": "showing",
     "Reference": "scoring",
     "SceneRollouts": "rollouts",

@@ -36,7 +36,7 @@ class TrafficSimulator:
         self,
         scene: Scene,
         *,
-        seconds: float | None = None,
+        seconds: float | int | None = None,
         count: int | None = None,
         seed: int | None = None,
     ) -> "SceneRollouts":

@@ -20,4 +20,4 @@ def scene(builtin):
 
 @pytest.fixture(scope="session")
 def rollouts(scene):
-    return infgen.load("towns").rollout(scene, seconds=8.0, count=2, seed=5)
+    return infgen.load("towns").rollout(scene, seconds=8, count=2, seed=5)
