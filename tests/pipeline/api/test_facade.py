@@ -34,8 +34,8 @@ def test_every_name_is_there_and_listed():
     assert set(infgen.__all__) <= set(dir(infgen))
     for name in infgen.__all__:
         assert getattr(infgen, name).__module__ == f"pipeline.api.{MODULES[name]}"
-    with pytest.raises(AttributeError, match="'infgen' has no attribute 'lod'"):
-        infgen.lod  # noqa: B018
+    with pytest.raises(AttributeError, match="'infgen' has no attribute 'lokal'"):
+        infgen.lokal  # noqa: B018
 
 
 def test_overrides_are_the_settings_of_rollouts():

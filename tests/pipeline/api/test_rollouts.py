@@ -1,5 +1,7 @@
 """Rollouts as tables, arrays, folders, pages: nothing of them is lost."""
 
+import json
+import shutil
 import sys
 from dataclasses import fields
 from html import unescape
@@ -11,6 +13,8 @@ import pytest
 import infgen
 from cli import main
 from infgen.errors import ConfigError, MissingExtraError
+from pipeline.engine.atomic import StoreError, write_json
+from tests.exports.replays import replay
 
 
 def assert_equal(one, other):
@@ -89,6 +93,21 @@ def test_nothing_is_written_over(rollouts, saved):
         infgen.open_rollouts(saved.parent)
 
 
+def test_a_folder_of_another_schema_is_refused(saved, tmp_path):
+    copy = shutil.copytree(saved, tmp_path / "saved")
+    manifest = json.loads((copy / "manifest.json").read_text())
+    write_json(copy / "manifest.json", {**manifest, "schema": "infgen.saved-rollouts/0"})
+
+    with pytest.raises(StoreError, match=r"holds 'infgen\.saved-rollouts/0', expected"):
+        infgen.open_rollouts(copy)
+
+
+def test_rollouts_of_arrays_are_saved_without_settings(scene, tmp_path):
+    replayed = infgen.SceneRollouts(scene, (replay(scene),))
+
+    assert infgen.open_rollouts(replayed.save(tmp_path / "replay")).settings is None
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -103,6 +122,18 @@ def test_commands_read_saved_rollouts(saved, tmp_path, words):
 
     assert not left.value.code
     assert any(path.is_file() for path in tmp_path.rglob("*"))
+
+
+def test_saved_rollouts_are_scored_by_the_command(scene, tmp_path, capsys):
+    replayed = infgen.SceneRollouts(scene, (replay(scene), replay(scene, index=1)))
+    saved = str(replayed.save(tmp_path / "replay"))
+
+    with pytest.raises(SystemExit) as left:
+        main(["wosac", saved, saved, "--json"])
+
+    assert not left.value.code
+    found = json.loads(capsys.readouterr().out)["scenarios"][scene.scenario_id]
+    assert found == dict(replayed.score())
 
 
 def test_an_exported_table_is_that_of_the_facade(rollouts, saved, tmp_path):

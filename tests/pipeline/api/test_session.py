@@ -8,12 +8,12 @@ import infgen
 
 @pytest.fixture(scope="module")
 def sim():
-    return infgen.load("towns", seconds=1.5, count=2)
+    return infgen.load("towns", seconds=1.0, count=2)
 
 
 def test_a_session_that_nobody_drives_is_a_rollout(sim, scene):
     session = sim.session(scene, count=2, seed=4)
-    for _ in range(3):
+    for _ in range(2):
         session.step()
 
     driven, simulated = session.rollouts(), sim.rollout(scene, seed=4)

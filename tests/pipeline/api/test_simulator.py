@@ -21,7 +21,7 @@ from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.zarr_store import write_records
 from tests.pipeline.finished import Finished
 
-SHORT = RolloutSettings(seconds=2.0, count=3, scenes_per_unit=1, seed=7)
+SHORT = RolloutSettings(seconds=1.0, count=2, scenes_per_unit=1, seed=7)
 
 
 def assert_equal(rollouts, others):
@@ -44,7 +44,7 @@ def test_rollouts_are_those_of_the_stage(builtin, weights, tmp_path):
     folder.mkdir()
     write_records(folder / "scenes-000.zarr", scenes, Scene, SCENES_SCHEMA, compress=True)
     done = FinishedUnit(folder.name, "key", folder, {"scenes": len(scenes)})
-    sim = infgen.load(weights, seconds=2.0, count=3, scenes_per_unit=1, seed=7)
+    sim = infgen.load(weights, seconds=1.0, count=2, scenes_per_unit=1, seed=7)
     assert sim.settings == SHORT
 
     units = stage.STAGE.plan(Finished([done], weights), SHORT)
