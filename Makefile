@@ -6,7 +6,7 @@ RUNS := $(VENV)/runs
 INSTALLED := $(VENV)/installed
 CODE := cli.py infgen pipeline benchmarks examples docs/hooks tests
 
-.PHONY: demo test test-slow test-all check format bench docs clean
+.PHONY: demo test test-slow test-all check format bench notebooks docs clean
 
 demo: $(RUNS)
 	$(BIN)/infgen demo
@@ -39,6 +39,10 @@ bench: $(INSTALLED)
 	for script in $(filter-out $(OF_A_ROOT),$(wildcard benchmarks/*.py)); do \
 		$(BIN)/python $$script || exit 1; \
 	done
+
+# Runs the notebooks again, and keeps what they show.
+notebooks: $(INSTALLED)
+	$(BIN)/python tests/examples/run_notebooks.py examples/*.ipynb
 
 # The site of docs/, in site/. Nothing is fetched; a dead link is an error.
 docs: $(INSTALLED)

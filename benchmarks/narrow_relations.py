@@ -54,6 +54,20 @@ class Family:
     layers: tuple[str, ...]
 
 
+def embedding_of(network: Network, name: str) -> RelationEmbedding:
+    """Return the embedding of a family."""
+    part = network.get_submodule(name)
+    assert isinstance(part, RelationEmbedding)
+    return part
+
+
+def layer_of(network: Network, name: str) -> Attention:
+    """Return an attention layer."""
+    part = network.get_submodule(name)
+    assert isinstance(part, Attention)
+    return part
+
+
 def families(network: Network) -> list[Family]:
     """List the families of relations of a network."""
     names = [name for name, part in network.named_modules() if isinstance(part, Attention)]
@@ -91,12 +105,12 @@ def batches(network: Network, records: str, count: int) -> Iterator[Batch]:
 def seen_poses(network: Network, scenes: Sequence[Batch]) -> dict[str, Tensor]:
     """Collect the relative poses [pose, scalar] that each family looks up."""
     kept: dict[str, list[Tensor]] = {family.name: [] for family in families(network)}
-    parts = {network.get_submodule(name): name for name in kept}
+    parts = {embedding_of(network, name): name for name in kept}
     plain = RelationEmbedding.look_up
 
-    def look_up(self: RelationEmbedding, values: Tensor, table: Tensor) -> Tensor:
+    def look_up(self: RelationEmbedding, values: Tensor, table_PD: Tensor) -> Tensor:
         kept[parts[self]].append(values.flatten(0, -2))
-        return plain(self, values, table)
+        return plain(self, values, table_PD)
 
     RelationEmbedding.look_up = look_up  # type: ignore[method-assign]
     try:
@@ -108,7 +122,7 @@ def seen_poses(network: Network, scenes: Sequence[Batch]) -> dict[str, Tensor]:
     found = {}
     for name, values in kept.items():
         poses = torch.cat(values)
-        embedding = network.get_submodule(name)
+        embedding = embedding_of(network, name)
         poses = poses[poses[:, 0] <= embedding.spans[0].last]  # The rest nobody sees.
         found[name] = poses[torch.randperm(len(poses), generator=random)[:POSES]]
     return found
@@ -118,7 +132,7 @@ def weighing(network: Network, family: Family) -> Tensor:
     """How much errors [D, D] of wide features change keys and values of all layers."""
     weighed = torch.zeros(1)
     for name in family.layers:
-        layer = network.get_submodule(name)
+        layer = layer_of(network, name)
         gain, width = layer.norm_relation.weight, layer.query.out_features
         key = layer.relation_key.weight * gain * (width // layer.heads) ** -0.5
         value = layer.relation_value.weight * gain
@@ -131,6 +145,7 @@ def fit(
     narrow: RelationEmbedding,
     poses: Tensor,
     by: Tensor,
+    width: int,
     steps: int,
 ) -> tuple[Tensor, Tensor, float]:
     """Fit narrow features, and the map from them to the wide ones.
@@ -142,7 +157,7 @@ def fit(
     with torch.no_grad():
         table = wide.table()
         wanted = wide.look_up(poses[:, None], table)[:, 0]
-    leads = nn.Linear(narrow.out[2].out_features, wanted.shape[1])
+    leads = nn.Linear(width, wanted.shape[1])
     learned = [*narrow.parameters(), *leads.parameters()]
     optimizer = torch.optim.Adam(learned, lr=LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
@@ -197,12 +212,12 @@ def narrowed(
     other.load_state_dict({n: state[n] for n in same}, strict=False)
     lost = {}
     for name, poses in seen_poses(network, scenes).items():
-        family, embedding = names[name], other.get_submodule(name)
-        wide = network.get_submodule(name)
+        family, embedding = names[name], embedding_of(other, name)
+        wide = embedding_of(network, name)
         by = weighing(network, family)
-        leads, added, lost[name] = fit(wide, embedding, poses, by, steps)
+        leads, added, lost[name] = fit(wide, embedding, poses, by, width, steps)
         for layer in family.layers:
-            fold(network.get_submodule(layer), other.get_submodule(layer), leads, added)
+            fold(layer_of(network, layer), layer_of(other, layer), leads, added)
         print(f"{name}: {lost[name]:.3%} lost", file=sys.stderr)
     return other, lost
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from player import STEPS, busy_film
 
 from infgen.views.video.layout import Format
-from pipeline.commands.view_files import write_video
+from pipeline.api.view_files import write_video
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,42 +1,28 @@
 """A planner drives the ego through simulated traffic, half a second at a time.
 
-On a street that is built here, in traffic of a network that has learned nothing yet::
+In a scene of the package, in traffic of its weights::
 
-    python examples/planner.py
+    python examples/planner.py --page drive.html
 
-On a logged scene, in traffic of trained weights (folders of a root of ``infgen run``)::
+In a logged scene, in traffic of your weights::
 
-    python examples/planner.py --weights latest/train --scenes store/ingest/units/NAME
+    python examples/planner.py --weights work --scenes "$WOMD/*.tfrecord*" --scene 637f20
 """
 
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
-from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float32
-from street import fresh_network, street
 
+import infgen
 from infgen.clock import CLOCK
-from infgen.config import RolloutSettings
 from infgen.geometry import to_local
-from infgen.model.network import Network
-from infgen.model.stepping import Stepper
 from infgen.rollout.population import EGO_ROW, Population
-from infgen.rollout.recording import RolloutStart
-from infgen.rollout.session import Session
-from infgen.rollout.simulator import Simulator
 from infgen.scene import FeatureType, Scene
 from infgen.tokens.scene_tokens import Presence
-from infgen.tokens.tokenizer import tokenize_scene
-from pipeline.storage.scenes import read_scenes
-from pipeline.storage.weights import load_network
 
-FRESH = RolloutSettings(add_bias=-1.5, remove_bias=-4.0)
-"""What has learned nothing says yes and no alike: too many would come and go."""
 MAX_ACCEL_MPS2, COMFORT_BRAKE_MPS2 = 1.5, 2.0
 HEADWAY_S, STANDING_GAP_M = 1.5, 2.0
 BESIDE_M = 2.0
@@ -128,7 +114,9 @@ class LaneKeeper:
         return np.array([x_m, y_m, np.arctan2(way[1], way[0])])
 
 
-def gap_ahead(session: Session, before: Population, length_m: float) -> tuple[float, float]:
+def gap_ahead(
+    session: infgen.PlannerSession, before: Population, length_m: float
+) -> tuple[float, float]:
     """Free way of the ego to the next agent in its way, and how fast that agent drives."""
     now = session.population
     there = now.presence[0] != Presence.ABSENT
@@ -164,10 +152,9 @@ class Moment:
     num_others: int
 
 
-def drive(simulator: Simulator, start: RolloutStart, seconds: float) -> Iterator[Moment]:
+def drive(session: infgen.PlannerSession, scene: Scene, seconds: float) -> Iterator[Moment]:
     """Let the planner drive in traffic that reacts to it."""
-    session = Session(simulator, start)
-    keeper = LaneKeeper.of(start.scene, desired_mps=12.0)
+    keeper = LaneKeeper.of(scene, desired_mps=12.0)
     before = session.population
     for step in range(CLOCK.tokens_in(seconds)):
         gap_m, other_mps = gap_ahead(session, before, keeper.length_m)
@@ -184,50 +171,27 @@ def drive(simulator: Simulator, start: RolloutStart, seconds: float) -> Iterator
         )
 
 
-def make_player(network: Network, settings: RolloutSettings) -> Simulator:
-    """Get a network ready to be played."""
-    return Simulator(
-        stepper=Stepper(network),
-        vocabulary=network.motion_vocabulary(),
-        roads=network.map_vocabulary(),
-        tokens=network.grid_settings,
-        settings=settings,
-        device=torch.device("cpu"),
-    )
-
-
-def begin(scene: Scene, simulator: Simulator, seed: int = 0) -> RolloutStart:
-    """Tokenize the first second of a scene."""
-    history = tokenize_scene(
-        scene, simulator.vocabulary, simulator.roads, simulator.tokens, until=scene.now
-    )
-    return RolloutStart(scene=scene, history=history, index=0, seed=seed)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Drive, and print where to."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--weights", type=Path, help="folder of stage train; else fresh")
-    parser.add_argument("--scenes", type=Path, help="unit folder of ingest; else a street")
-    parser.add_argument("--scene", type=int, default=0, help="which scene of the folder")
+    parser.add_argument("--weights", default="towns", help="as infgen.load takes them")
+    parser.add_argument("--scenes", default="builtin", help="as infgen.open_scenes does")
+    parser.add_argument("--scene", default="", help="start of its id; else the first")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of the drive")
     parser.add_argument("--seed", type=int, default=0, help="another seed, other traffic")
+    parser.add_argument("--page", help="page to write that plays the drive")
     options = parser.parse_args(arguments)
-    network, settings = fresh_network(), FRESH
-    if options.weights:
-        network, settings = load_network(options.weights), RolloutSettings()
-    scene = street()
-    if options.scenes:
-        scene = next(islice(read_scenes(options.scenes), options.scene, None))
-    simulator = make_player(network, settings)
-    start = begin(scene, simulator, options.seed)
+    scene = infgen.open_scenes(options.scenes)[options.scene or 0]
+    session = infgen.load(options.weights).session(scene, seed=options.seed)
     print("   s      x m      y m   m/s   gap m  others")
-    for moment in drive(simulator, start, options.seconds):
+    for moment in drive(session, scene, options.seconds):
         x_m, y_m, _ = moment.ego_pose
         print(
             f"{moment.seconds:4.1f} {x_m:8.1f} {y_m:8.1f} {moment.speed_mps:5.1f} "
             f"{moment.gap_m:7.1f} {moment.num_others:7d}"
         )
+    if options.page:
+        print(session.rollouts().view(options.page))
 
 
 if __name__ == "__main__":

@@ -1,17 +1,16 @@
-"""A street with cars, and a network that has learned nothing yet: to try things out."""
+"""A street with cars, built of arrays: what a log of your own must hold.
+
+Simulated with the weights of the package, and written as a page to watch::
+
+    python examples/street.py
+"""
 
 import numpy as np
-import torch
 
+import infgen
 from infgen.clock import CLOCK
-from infgen.config import ModelSettings, TokenSettings, VocabSettings
-from infgen.model.network import Network
 from infgen.scene import AgentType, FeatureType, LaneType, RoadMap, Scene, Signals, Tracks
-from infgen.tokens.clustering.made_motion_samples import make_fan
-from infgen.tokens.clustering.physical_limits import motion_limits
-from infgen.tokens.vocabulary import BOX_LW_M, MapVocabulary, MotionVocabulary
 
-SMALL = ModelSettings(width=32, heads=4, map_blocks=1, motion_blocks=1, scene_blocks=1)
 STREET_M = 600.0
 LANES_Y_M = (0.0, 3.5)
 NOW = 10
@@ -97,20 +96,11 @@ def _lanes() -> RoadMap:
     )
 
 
-def fresh_network(seed: int = 0) -> Network:
-    """Make a small network that has learned nothing, with moves and roads made by rule."""
-    limits = motion_limits(VocabSettings())
-    fans = [make_fan(kind, limits, spacing_m=0.3) for kind in range(3)]
-    moves = min(len(paths) for paths in fans)
-    still = np.zeros((1, CLOCK.steps_per_token + 1, 3), dtype=np.float32)
-    path = np.stack([np.concatenate([still, paths[: moves - 1]]) for paths in fans])
-    bend_rad = np.linspace(-0.08, 0.08, 33)[:, None] * np.arange(10)
-    steps_m = 0.5 * np.stack([np.cos(bend_rad), np.sin(bend_rad)], axis=-1)
-    curve_m = np.pad(steps_m.cumsum(axis=1), ((0, 0), (1, 0), (0, 0))).astype(np.float32)
-    torch.manual_seed(seed)
-    return Network(
-        SMALL,
-        MotionVocabulary(BOX_LW_M, path, np.zeros(path.shape[:2], dtype=bool)),
-        MapVocabulary(curve_m, np.zeros(len(curve_m), dtype=bool)),
-        TokenSettings(),
-    )
+def main() -> None:
+    """Simulate the street, and say where the page is."""
+    rollouts = infgen.load("towns").rollout(street(), seconds=10, count=2)
+    print(rollouts.view(log=False))
+
+
+if __name__ == "__main__":
+    main()

@@ -98,10 +98,13 @@ class ExportOptions:
         from pipeline.commands.export import export  # noqa: PLC0415
         from pipeline.commands.export_job import Order  # noqa: PLC0415
         from pipeline.commands.export_wosac import read_description  # noqa: PLC0415
+        from pipeline.storage.saved_rollouts import is_saved  # noqa: PLC0415
         from pipeline.storage.scene_lookup import open_scene_lookup  # noqa: PLC0415
 
         root = find_root(self.root)
-        logs = split_names(self.records) if self.records else [str(root.latest / "ingest")]
+        beside = self.rollouts is not None and is_saved(self.rollouts)
+        logs = [str(self.rollouts if beside else root.latest / "ingest")]
+        logs = split_names(self.records) if self.records else logs
         about = read_description(self.about, root) if self.about else None
         order = Order(
             to=self.to,
@@ -121,7 +124,8 @@ class ViewOptions:
     source: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[ROOT | RECORDS...]", help="A root, or TFRecords to see a log of."
+            metavar="[ROOT | RECORDS...]",
+            help="A root, saved rollouts, or TFRecords to see a log of.",
         ),
     ] = None
     root: RootFolder = WORK
@@ -147,15 +151,19 @@ class ViewOptions:
     def write(self, tell: Callable[[Event], None]) -> "Shown":
         """Write it, with progress events."""
         from pipeline.commands.view import Wanted, check_records, is_root, view  # noqa: PLC0415
+        from pipeline.storage.saved_rollouts import is_saved  # noqa: PLC0415
 
         words = [part for word in self.source or () for part in split_names(word)]
-        root = Path(words[0]) if len(words) == 1 and is_root(Path(words[0])) else None
-        for word in () if root else words:
+        only = Path(words[0]) if len(words) == 1 else None
+        root = only if only and is_root(only) else None
+        saved = only if only and is_saved(only) else None
+        for word in () if root or saved else words:
             check_records(word)
         width_px, height_px = _size(self.size)
         wanted = Wanted(
             root=find_root(root or self.root),
-            records=() if root else tuple(words),
+            saved=saved,
+            records=() if root or saved else tuple(words),
             scene=self.scene,
             rollouts=_indices(self.rollouts),
             log=self.log,

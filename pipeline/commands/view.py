@@ -12,14 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 from infgen.clock import CLOCK
 from infgen.errors import ConfigError
-from pipeline.commands.view_files import (
+from pipeline.api.view_files import (
+    GIF_FPS,
+    MP4_FPS,
     STRIPS,
     VIDEOS,
     check_ending,
+    write_page,
     write_strip,
     write_video,
 )
-from pipeline.engine.atomic import write_file
 from pipeline.engine.events import Event
 from pipeline.engine.layout import Root
 from pipeline.storage.scenes import file_name
@@ -29,8 +31,6 @@ if TYPE_CHECKING:
     from infgen.views.scene.view_model import ViewModel
     from infgen.views.video.layout import Format
 
-FPS, GIF_FPS = 25, 10
-
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
@@ -38,6 +38,7 @@ class Wanted:
 
     Attributes:
         root: Of the experiment.
+        saved: Folder of saved rollouts to show instead, if any.
         records: TFRecords to show a log of, without any root; empty for the root's.
         scene: Start of the scene's id; empty for the first there is.
         rollouts: Indices; None for the first few.
@@ -54,6 +55,7 @@ class Wanted:
     """
 
     root: Root
+    saved: Path | None = None
     records: tuple[str, ...] = ()
     scene: str = ""
     rollouts: tuple[int, ...] | None = None
@@ -92,7 +94,7 @@ class Wanted:
         from infgen.views.video.layout import Format  # noqa: PLC0415
 
         gif = self.video is not None and self.video.suffix.lower() == ".gif"
-        fps = self.fps or (GIF_FPS if gif else FPS)
+        fps = self.fps or (GIF_FPS if gif else MP4_FPS)
         return Format(self.width_px, self.height_px, fps, self.theme)
 
 
@@ -147,11 +149,18 @@ def find_view_model(wanted: Wanted) -> "ViewModel":
         ConfigError: if there is no such scene or rollout.
     """
     from infgen.views.scene.view_model import make_view_model  # noqa: PLC0415
-    from pipeline.commands.view_scenes import find_in_records, find_in_root  # noqa: PLC0415
+    from pipeline.storage.scene_rollouts import (  # noqa: PLC0415
+        find_in_records,
+        find_in_root,
+        find_in_saved,
+    )
 
     if wanted.records:
         return make_view_model(find_in_records(wanted.records, wanted.scene), ())
-    scene, rollouts = find_in_root(wanted.root, wanted.scene, wanted.rollouts)
+    if wanted.saved is not None:
+        scene, rollouts = find_in_saved(wanted.saved, wanted.scene, wanted.rollouts)
+    else:
+        scene, rollouts = find_in_root(wanted.root, wanted.scene, wanted.rollouts)
     # Without rollouts there is only the log to see.
     return make_view_model(scene, rollouts, log=wanted.log or not rollouts)
 
@@ -182,12 +191,3 @@ def _holds_records(folder: Path) -> bool:
     if any(folder.glob(RECORDS_IN_FOLDER)):
         return True
     return next(find_below(str(folder)), None) is not None
-
-
-def write_page(view_model: "ViewModel", path: Path) -> Path:
-    """Write the player page of a view model."""
-    from infgen.views.player import player_page  # noqa: PLC0415
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, player_page(view_model).encode())
-    return path

@@ -38,6 +38,13 @@ class Biases:
     add: float = 0.0
     leave: float = 0.0
 
+    def used_by(self, settings: RolloutSettings) -> "Biases":
+        """Leave out that of a decision that is not taken."""
+        return Biases(
+            add=self.add if settings.inserts else 0.0,
+            leave=self.leave if settings.removes else 0.0,
+        )
+
     def over(self, settings: RolloutSettings) -> RolloutSettings:
         """Add them to what the settings add themselves."""
         return replace(

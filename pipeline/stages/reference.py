@@ -46,7 +46,7 @@ def work(
     group: list[Binned] = []
     skipped: dict[str, str] = {}
     for scene in read_task_scenes(unit.task):
-        measured = _measure(scene, settings["tokenize"], settings["reference"])
+        measured = measure_log(scene, settings["tokenize"], settings["reference"])
         if isinstance(measured, str):
             skipped[scene.scenario_id] = measured
             continue
@@ -67,7 +67,7 @@ def work(
     return {"scenes": len(logged), "skipped": skipped}
 
 
-def _measure(
+def measure_log(
     scene: "Scene", tokens: TokenSettings, settings: ReferenceSettings
 ) -> "tuple[Counts, Binned, LogCourse] | str":
     """Count one log, bin it and follow its course; or say why it cannot be."""

@@ -1,6 +1,6 @@
 """From the logs of a split to its counts, and to the logs' own scores under them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from infgen.config import ReferenceSettings
 from infgen.metrics.agent_count import mean_counts
 from infgen.metrics.long_term.reference import add_up
-from infgen.metrics.long_term.table import make_row
+from infgen.metrics.long_term.table import LogCounts, make_row
 from infgen.metrics.proper.retrieval import LogCourse, sample_logs
 from infgen.metrics.windows import cut_windows
 from pipeline.engine.stage import Progress
@@ -57,11 +57,18 @@ def _courses(units: Sequence[Path]) -> Iterator[LogCourse]:
 
 def _means(units: Sequence[Path], settings: ReferenceSettings) -> tuple[float, float]:
     """Mean over the logs of the agents in the first window: near the ego, and all."""
+    logs = {name: log for unit in units for name, log in files.read_logged(unit).items()}
+    return mean_log_counts(logs, settings)
+
+
+def mean_log_counts(
+    logs: Mapping[str, LogCounts], settings: ReferenceSettings
+) -> tuple[float, float]:
+    """Mean over logs of the agents in the first window: near the ego, and all."""
     means = {}
-    for unit in units:
-        for scenario_id, log in files.read_logged(unit).items():
-            windows = cut_windows(len(log.near), settings.window_s, settings.stride_s)
-            means[scenario_id] = [mean_counts(n, windows)[0] for n in (log.near, log.all)]
+    for scenario_id, log in logs.items():
+        windows = cut_windows(len(log.near), settings.window_s, settings.stride_s)
+        means[scenario_id] = [mean_counts(n, windows)[0] for n in (log.near, log.all)]
     if not means:
         return float("nan"), float("nan")
     near, everyone = np.mean(list(means.values()), axis=0)

@@ -24,27 +24,13 @@ from pipeline.stages.simulation import (
     read_some,
     simulate_all,
 )
-from pipeline.storage.parquet import Fields, make_table, read_tables
-from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
+from pipeline.storage.parquet import read_tables
+from pipeline.storage.rollouts import INDEX, write_rollouts
 from pipeline.storage.splits import files_of_split, spread_evenly
 
 if TYPE_CHECKING:
     from infgen.rollout.recording import RolloutStart
-    from infgen.rollout.rollout import Rollout
     from infgen.rollout.simulator import Simulator
-
-INDEX: Fields = {
-    "scenario_id": str,
-    "rollout": int,
-    "unit": str,
-    "group": int,
-    "row": int,
-    "agents": int,
-    "inserted": int,
-    "left": int,
-    "steps": int,
-}
-
 
 OF_ENTRIES = (
     "add_bias",
@@ -77,11 +63,7 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
     """
     weights = inputs.folder("train")
     identity = inputs.content("train", "model.safetensors", "model.json")
-    found = read_found(inputs.folder("calibrate"))
-    biases = Biases(
-        add=found.add if settings.inserts else 0.0,
-        leave=found.leave if settings.removes else 0.0,
-    )
+    biases = read_found(inputs.folder("calibrate")).used_by(settings)
     every, device = inputs.units("ingest"), decide_device(settings)
     shards = files_of_split(every, settings.split, to="simulate", setting="rollout.split")
     units = []
@@ -113,9 +95,6 @@ def simulate(
     unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
 ) -> Report:
     """Simulate all rollouts of some scenes in batches, and write them as groups."""
-    from infgen.rollout.rollout import Rollout  # noqa: PLC0415
-    from pipeline.storage.zarr_store import write_records  # noqa: PLC0415
-
     biases = Biases(**unit.task["biases"])
     settings = on_device(biases.over(settings), unit.task["device"])
     folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
@@ -127,12 +106,8 @@ def simulate(
     def tell(played: float) -> None:
         progress(played, len(starts), f"{_rate(played, begun):.3g} rollouts/s{where}")
 
-    rows: list[dict[str, Any]] = []
-    for group, rollouts in enumerate(simulate_all(simulator, starts, weights, tell, size)):
-        path = target / f"rollouts-{group:03d}.zarr"
-        write_records(path, rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True)
-        rows += [_row(unit.name, group, at, done) for at, done in enumerate(rollouts)]
-    make_table(rows, INDEX).write_parquet(target / "index.parquet")
+    groups = simulate_all(simulator, starts, weights, tell, size)
+    rows = write_rollouts(target, unit.name, groups)
     pace = {"rollouts_per_s": round(_rate(len(rows), begun), 4)}
     run = {**pace, **about_run(simulator, size)}
     told = {
@@ -191,20 +166,6 @@ def _starts(unit: Unit, simulator: "Simulator") -> "tuple[list[RolloutStart], li
     return starts, refused
 
 
-def _row(unit: str, group: int, at: int, rollout: "Rollout") -> dict[str, Any]:
-    return {
-        "scenario_id": rollout.scenario_id,
-        "rollout": rollout.index,
-        "unit": unit,
-        "group": group,
-        "row": at,
-        "agents": len(rollout.id),
-        "inserted": int((~rollout.logged).sum()),
-        "left": int((rollout.exit_step >= 0).sum()),
-        "steps": rollout.num_steps,
-    }
-
-
 def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
     totals = {
         name: sum(row[name] for row in rows) for name in ("agents", "inserted", "left")
@@ -226,5 +187,6 @@ STAGE = Stage(
         "pipeline.stages.devices",
         "pipeline.stages.simulation",
         "pipeline.stages.rollout",
+        "pipeline.storage.rollouts",
     ),
 )

@@ -16,9 +16,11 @@ from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage,
 from pipeline.storage.splits import in_split, split_of
 
 if TYPE_CHECKING:
+    from infgen.metrics.long_term.binned import Binned
     from infgen.metrics.long_term.reference import Counts
-    from infgen.metrics.long_term.table import Against
+    from infgen.metrics.long_term.table import Against, Row
     from infgen.metrics.proper.retrieval import LogCourse
+    from infgen.metrics.traffic import Traffic
     from infgen.rollout.rollout import Rollout
     from infgen.scene import Scene
     from infgen.spatial.road_edges import RoadEdges
@@ -139,11 +141,8 @@ class _Scorer:
 
     def take(self, scene: "Scene", rollouts: "Sequence[Rollout]") -> None:
         """Score the rollouts of one scene."""
-        from infgen.metrics.long_term.binned import bin_traffic  # noqa: PLC0415
-        from infgen.metrics.long_term.radius import present_within_radius  # noqa: PLC0415
         from infgen.metrics.long_term.reference import count_simulated  # noqa: PLC0415
         from infgen.metrics.long_term.table import make_row  # noqa: PLC0415
-        from infgen.metrics.traffic import from_rollout  # noqa: PLC0415
         from infgen.spatial.road_edges import scene_road_edges  # noqa: PLC0415
         from pipeline.stages.score_write import rows_of  # noqa: PLC0415
 
@@ -151,15 +150,14 @@ class _Scorer:
         self.official.append(_score_wosac(scene, rollouts, self._settings.wosac_version))
         ensemble = self._gather(scene, edges, rollouts)
         for rollout in rollouts:
-            lived = present_within_radius(rollout, radius_m) if radius_m else rollout
-            near_m = self._reference.count_radius_m
-            traffic = from_rollout(lived)
-            binned = bin_traffic(traffic, edges, near_m, as_logged=False)
+            lived, traffic, binned = measure_rollout(
+                rollout, edges, self._reference, radius_m
+            )
+            row = make_row(binned, self._against)
             if ensemble is not None:
                 ensemble.add(traffic, binned, lived)
             windows = self._against.windows(binned.bins.shape[-1])
             self.counts += count_simulated(binned, windows)
-            row = make_row(binned, self._against)
             self.tally.add(scene.scenario_id, row)
             self._rows += rows_of(scene.scenario_id, rollout.index, row.numbers, "")
 
@@ -189,6 +187,53 @@ class _Scorer:
             prefix = f"{self._settings.wosac_version}/"
             found += rows_of(one["scenario_id"], None, one.get("scores", {}), prefix)
         return found
+
+
+def score_rollout(
+    rollout: "Rollout",
+    edges: "RoadEdges | None",
+    against: "Against",
+    reference: ReferenceSettings,
+    presence_radius_m: float,
+) -> "tuple[Binned, Row]":
+    """Measure one rollout, and score it under the long-term protocols.
+
+    Args:
+        rollout: The rollout.
+        edges: Road edges of its scene.
+        against: The logs of a split.
+        reference: How those were measured.
+        presence_radius_m: Agents are present within it only; 0 for no limit.
+    """
+    from infgen.metrics.long_term.table import make_row  # noqa: PLC0415
+
+    _, _, binned = measure_rollout(rollout, edges, reference, presence_radius_m)
+    return binned, make_row(binned, against)
+
+
+def measure_rollout(
+    rollout: "Rollout",
+    edges: "RoadEdges | None",
+    reference: ReferenceSettings,
+    presence_radius_m: float,
+) -> "tuple[Rollout, Traffic, Binned]":
+    """Return a rollout as far as its agents are present, its traffic, and its features.
+
+    Args:
+        rollout: The rollout.
+        edges: Road edges of its scene.
+        reference: How logs are measured.
+        presence_radius_m: Agents are present within it only; 0 for no limit.
+    """
+    from infgen.metrics.long_term.binned import bin_traffic  # noqa: PLC0415
+    from infgen.metrics.long_term.radius import present_within_radius  # noqa: PLC0415
+    from infgen.metrics.traffic import from_rollout  # noqa: PLC0415
+
+    if presence_radius_m:
+        rollout = present_within_radius(rollout, presence_radius_m)
+    traffic = from_rollout(rollout)
+    binned = bin_traffic(traffic, edges, reference.count_radius_m, as_logged=False)
+    return rollout, traffic, binned
 
 
 def _score_wosac(

@@ -3,7 +3,7 @@
 Only a bounded part of the scenes is in memory: rollouts come in an order of their own.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -11,10 +11,11 @@ from infgen.alignment import align_to_tokens
 from infgen.errors import ConfigError
 from infgen.scene import Scene
 from pipeline.engine.atomic import MANIFEST
-from pipeline.engine.layout import KEY_DIGITS
+from pipeline.engine.layout import KEY_DIGITS, Root
 from pipeline.engine.manifest import read_manifest
 from pipeline.storage.raw_scenes import RawScene, iter_raw_scenes
 from pipeline.storage.source_files import RawRecords, find_records
+from pipeline.storage.splits import in_split, split_of
 
 if TYPE_CHECKING:
     from pipeline.storage.columns import PackedRecords
@@ -52,8 +53,19 @@ class RecordLookup:
         self._bad: list[str] = []
         self._unread = self._read(records)
         self._places: dict[str, RawScene] = {}
+        self._ids: list[str] = []
         self._cached: dict[str, RawScene] = {}
         self._free_bytes = cache_bytes
+
+    def scenario_ids(self, least: int | None = None) -> Sequence[str]:
+        """Ids in the order of the records: at least so many, if there are, or all of them.
+
+        Records are read as far as needed, and none is decoded.
+        """
+        while least is None or len(self._ids) < least:
+            if next(self._unread, None) is None:
+                break
+        return self._ids
 
     def find(self, scenario_id: str) -> Scene:
         """Return one log.
@@ -75,6 +87,7 @@ class RecordLookup:
         for raw in iter_raw_scenes(records, self._bad):
             if raw.scenario_id not in self._places:
                 self._places[raw.scenario_id] = raw._replace(data=b"")
+                self._ids.append(raw.scenario_id)
                 self._keep(raw)
                 yield raw.scenario_id
 
@@ -98,15 +111,21 @@ class RecordLookup:
 class StoreLookup:
     """Scenes of an ingested store, with a few groups in memory at a time."""
 
-    def __init__(self, folders: Sequence[Path]) -> None:
+    def __init__(self, folders: Sequence[Path], split: str | None = None) -> None:
         import polars as pl  # noqa: PLC0415
 
         self._places: dict[str, tuple[Path, int]] = {}
         self._open: dict[Path, PackedRecords[Scene]] = {}
         for folder in folders:
             index = pl.read_parquet(folder / "index.parquet")
+            if split is not None:
+                index = index.filter(pl.col("split") == split)
             for scenario_id, group, row in index.select(_PLACE).iter_rows():
                 self._places.setdefault(scenario_id, (folder / group, row))
+
+    def scenario_ids(self, least: int | None = None) -> Sequence[str]:
+        """Ids of all scenes, in the order of the store."""
+        return list(self._places)
 
     def find(self, scenario_id: str) -> Scene:
         """Return one log.
@@ -138,14 +157,74 @@ _PLACE = ("scenario_id", "group", "row")
 def open_scene_lookup(names: Sequence[str]) -> SceneLookup:
     """Open raw records (paths, patterns, folders, URLs), or one folder of a store.
 
+    A folder of saved rollouts stands for the scene beside them.
+
     Raises:
         ConfigError: if there is nothing by such a name, or the store holds no scenes.
     """
+    if len(names) == 1 and (own := saved_scenes(Path(names[0]))) is not None:
+        return StoreLookup([own])
     if len(names) == 1 and (folders := unit_folders(Path(names[0]))) is not None:
         if not any(any(folder.glob("scenes-*.zarr")) for folder in folders):
             raise ConfigError(f"{names[0]} holds no ingested scenes")
         return StoreLookup(folders)
     return RecordLookup(find_records(names))
+
+
+def saved_scenes(folder: Path) -> Path | None:
+    """Return the folder of the scene that lies beside saved rollouts, if there is one."""
+    own = folder / "scenes"
+    return own if (own / "index.parquet").is_file() else None
+
+
+def open_split(names: Sequence[str], split: str | None) -> RecordLookup | StoreLookup:
+    """Open the scenes of one split, or of all: raw records, an ingested folder or a root.
+
+    Raises:
+        ConfigError: if there is nothing by such a name, or no scene of the split.
+    """
+    folder = saved_scenes(Path(names[0])) or Path(names[0])
+    if len(names) == 1 and Root(folder.absolute()).store.is_dir():
+        made = Root(folder.absolute()).latest_folder("ingest")
+        if made is None:
+            raise ConfigError(
+                f"{folder} holds no scenes; `infgen ingest --root {folder}` makes them"
+            )
+        folder = made
+    folders = unit_folders(folder) if len(names) == 1 else None
+    if folders is not None:
+        store = StoreLookup(folders, split)
+        if split is not None and not store.scenario_ids():
+            raise _no_split(names, split, _splits(folders))
+        return store
+    records = find_records(names)
+    return RecordLookup(records if split is None else _of_split(names, records, split))
+
+
+def _of_split(names: Sequence[str], records: RawRecords, split: str) -> RawRecords:
+    """Keep those of one split: TFRecords by their names, others by their labels."""
+    urls = [url for url in records.urls if in_split(_file_name(url), split)]
+    scenes = [scene for scene in records.scenes if scene.label.split == split]
+    if not urls and not scenes:
+        there = {split_of(_file_name(url)) for url in records.urls}
+        raise _no_split(names, split, there | {each.label.split for each in records.scenes})
+    return RawRecords(urls, scenes)
+
+
+def _no_split(names: Sequence[str], split: str, there: Iterable[str]) -> ConfigError:
+    some = ", ".join(sorted(there)) or "none"
+    return ConfigError(f"{', '.join(names)}: no split {split!r}; there is {some}")
+
+
+def _splits(folders: Sequence[Path]) -> set[str]:
+    import polars as pl  # noqa: PLC0415
+
+    paths = [folder / "index.parquet" for folder in folders]
+    return {name for path in paths for name in pl.read_parquet(path)["split"]}
+
+
+def _file_name(url: str) -> str:
+    return url.rsplit("/", 1)[-1]
 
 
 def unit_folders(folder: Path) -> list[Path] | None:

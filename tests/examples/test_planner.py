@@ -6,14 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from infgen.config import RolloutSettings
-from infgen.scene import Scene
-from pipeline.storage.scenes import SCENES_SCHEMA
-from pipeline.storage.weights import save_network, state_dict_of
-from pipeline.storage.zarr_store import write_records
+import infgen
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-ALONE = RolloutSettings(insert=False, remove=False, max_agents=8)
 
 
 @pytest.fixture
@@ -28,11 +23,11 @@ def street(planner):
 
 
 def test_the_planner_drives_along_its_lane(planner, street):
-    simulator = planner.make_player(street.fresh_network(), ALONE)
+    sim = infgen.load("towns", insert=False, remove=False, max_agents=8)
 
     # All others are far ahead and beside: a free road.
-    start = planner.begin(street.street((8.0,)), simulator)
-    moments = list(planner.drive(simulator, start, 4.0))
+    scene = street.street((8.0,))
+    moments = list(planner.drive(sim.session(scene), scene, 4.0))
 
     poses = np.array([moment.ego_pose for moment in moments])
     assert (np.diff(poses[:, 0]) > 3.5).all()
@@ -66,18 +61,22 @@ def test_the_planner_stops_behind_who_stands(planner, street):
     assert 0.5 < gap_m < 5.0
 
 
-def test_the_planner_plays_a_logged_scene_with_given_weights(
-    planner, street, tmp_path, capsys, crossing
-):
-    network = street.fresh_network(seed=3)
-    save_network(tmp_path, network, state_dict_of(network), step=1)
-    write_records(
-        tmp_path / "scenes-000.zarr", [crossing()], Scene, SCENES_SCHEMA, compress=True
-    )
-    words = f"--weights {tmp_path} --scenes {tmp_path} --seconds 1"
+def test_the_planner_drives_a_scene_of_the_package_and_shows_it(planner, tmp_path, capsys):
+    page = tmp_path / "drive.html"
 
-    planner.main(words.split())
+    planner.main(["--seconds", "1", "--page", str(page)])
 
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 1 + 2
-    assert lines[-1].split()[0] == "1.0"
+    assert len(lines) == 1 + 2 + 1
+    assert lines[2].split()[0] == "1.0"
+    assert lines[-1] == str(page)
+    assert "rollout 0" in page.read_text()
+
+
+def test_the_street_is_simulated_and_shown(street, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    street.main()
+
+    assert capsys.readouterr().out == "street.html\n"
+    assert "rollout 1" in (tmp_path / "street.html").read_text()

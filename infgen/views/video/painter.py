@@ -13,13 +13,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from infgen.errors import MissingExtraError
 from infgen.views.scene.marks import Mark
 
 OPAQUE = 255
-
-
-class MissingExtraError(ValueError):
-    """A package that comes with an extra is not installed."""
 
 
 def wanted(name: str) -> ModuleType:

@@ -11,10 +11,10 @@ from infgen.errors import ConfigError
 from infgen.rollout.rollout import Rollout
 from infgen.views.player.payload import unpack
 from pipeline.commands.view import Wanted, find_view_model, view
-from pipeline.commands.view_scenes import choose
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import Root, link
 from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
+from pipeline.storage.scene_rollouts import choose
 from pipeline.storage.scenes import file_name
 from pipeline.storage.zarr_store import write_records
 from tests.exports.replays import replay, with_newcomer

@@ -17,6 +17,7 @@ from pipeline.storage.scene_lookup import (
     RecordLookup,
     StoreLookup,
     open_scene_lookup,
+    open_split,
     unit_folders,
 )
 from pipeline.storage.source_files import RawRecords
@@ -135,3 +136,26 @@ def test_the_id_is_that_of_the_decoded_scene(records):
         assert decode_scene(record.data).scenario_id == scenario_id
     with pytest.raises(RecordError, match="empty"):
         read_scenario_id(b"")
+
+
+def test_ids_are_those_of_the_records_in_order_and_read_as_far_as_needed(source, records):
+    found = RecordLookup([str(source)])
+
+    assert list(found.scenario_ids(2)) == list(records)[:2]
+    assert list(found.scenario_ids()) == list(records)
+
+
+def test_a_split_of_a_store_is_chosen_by_its_index(ingested, source, records):
+    split = source.name.split(".tfrecord")[0]
+
+    assert list(open_split([str(ingested)], split).scenario_ids()) == list(records)
+    assert list(open_split([str(ingested)], None).scenario_ids()) == list(records)
+    with pytest.raises(ConfigError, match=f"no split 'other'; there is {split}"):
+        open_split([str(ingested)], "other")
+
+
+def test_a_root_without_scenes_is_told_how_to_make_them(tmp_path):
+    (tmp_path / "store").mkdir()
+
+    with pytest.raises(ConfigError, match="holds no scenes; `infgen ingest --root"):
+        open_split([str(tmp_path)], None)

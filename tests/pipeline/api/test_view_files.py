@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
-from infgen.errors import ConfigError
+from infgen.errors import ConfigError, MissingExtraError
 from infgen.views.scene.view_model import make_view_model
 from infgen.views.video import painter
 from infgen.views.video.layout import Format
-from infgen.views.video.painter import MissingExtraError, rgb
-from pipeline.commands import view_files
-from pipeline.commands.view_files import write_strip, write_video
+from infgen.views.video.painter import rgb
+from pipeline.api import view_files
+from pipeline.api.view_files import write_strip, write_video
 from pipeline.engine.signals import Stopped
 from tests.exports.replays import replay
 

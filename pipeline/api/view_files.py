@@ -1,4 +1,4 @@
-"""Videos and strips of a film, written whole or not at all.
+"""Pages, videos and strips of a scene, written whole or not at all.
 
 Frames are painted and encoded by several processes, a piece of them at a time; what comes
 out does not depend on how many there are.
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 Tell = Callable[[Event], None]
 
+MP4_FPS, GIF_FPS = 25, 10
+"""Pictures per second where none are named."""
 PIECE_FRAMES = 50
 PALETTE_SAMPLES = 4
 VIDEOS, STRIPS = (".mp4", ".gif"), (".svg", ".png")
@@ -50,6 +52,15 @@ def check_ending(path: Path, endings: Sequence[str]) -> None:
     """
     if path.suffix.lower() not in endings:
         raise ConfigError(f"{path}: expected a name that ends in {' or '.join(endings)}")
+
+
+def write_page(view_model: "ViewModel", path: Path) -> Path:
+    """Write the player page of a view model."""
+    from infgen.views.player import player_page  # noqa: PLC0415
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, player_page(view_model).encode())
+    return path
 
 
 def write_strip(

@@ -10,6 +10,8 @@ from infgen.scene import Scene
 from pipeline.engine.layout import Root
 from pipeline.engine.manifest import read_manifest
 from pipeline.storage.raw_scenes import iter_raw_scenes
+from pipeline.storage.rollouts import read_rollouts
+from pipeline.storage.saved_rollouts import read_saved
 from pipeline.storage.source_files import find_records
 
 if TYPE_CHECKING:
@@ -29,13 +31,19 @@ class Seen(NamedTuple):
     rollouts: "tuple[Rollout, ...]"
 
 
-def find_in_root(root: Root, prefix: str, rollouts: Sequence[int] | None) -> Seen:
+def find_in_root(
+    root: Root,
+    prefix: str,
+    rollouts: Sequence[int] | None,
+    most: int | None = MOST_ROLLOUTS,
+) -> Seen:
     """Find a scene of a root, and rollouts of it.
 
     Args:
         root: Of the experiment.
         prefix: Start of the scene's id; empty for the first there is.
         rollouts: Indices; None for the first few, if there are any.
+        most: How many are a few; None for all.
 
     Raises:
         ConfigError: if there is no such scene or rollout, naming some that there are.
@@ -52,8 +60,28 @@ def find_in_root(root: Root, prefix: str, rollouts: Sequence[int] | None) -> See
     if not units or (rollouts is None and prefix and not _matching(units, prefix)):
         return Seen(_find_log(root, prefix), ())
     scenario_id = choose(units, prefix, f"the rollouts below {root.path}")
-    found = _read_rollouts(root, played, units[scenario_id], scenario_id, rollouts)
+    folder = _unit_folder(root, "rollout", played, units[scenario_id])
+    found = _choose_rollouts(read_rollouts(folder), scenario_id, rollouts, most)
     return Seen(_find_log(root, scenario_id), found)
+
+
+def find_in_saved(folder: Path, prefix: str, rollouts: Sequence[int] | None) -> Seen:
+    """Find rollouts of a folder of saved ones, and their scene.
+
+    Args:
+        folder: That ``SceneRollouts.save`` wrote.
+        prefix: Start of the scene's id, or nothing.
+        rollouts: Indices; None for the first few.
+
+    Raises:
+        ConfigError: if there is no such scene or rollout, naming some that there are.
+    """
+    saved = read_saved(folder)
+    scenario_id = choose([saved.scene.scenario_id], prefix, str(folder))
+    return Seen(
+        saved.scene,
+        _choose_rollouts(saved.rollouts, scenario_id, rollouts, MOST_ROLLOUTS),
+    )
 
 
 def find_in_records(patterns: Sequence[str], prefix: str) -> Scene:
@@ -136,19 +164,20 @@ def _find_log(root: Root, prefix: str) -> Scene:
     return open_scene_lookup([str(folder)]).find(scenario_id)
 
 
-def _read_rollouts(
-    root: Root, made: Path, unit: str, scenario_id: str, asked: Sequence[int] | None
+def _choose_rollouts(
+    rollouts: "Iterable[Rollout]",
+    scenario_id: str,
+    asked: Sequence[int] | None,
+    most: int | None,
 ) -> "tuple[Rollout, ...]":
-    from pipeline.storage.rollouts import read_rollouts  # noqa: PLC0415
-
-    folder = _unit_folder(root, "rollout", made, unit)
+    """Pick rollouts of a scene by index, or the first few."""
     found: dict[int, Rollout] = {}
-    for rollout in read_rollouts(folder):
+    for rollout in rollouts:
         if rollout.scenario_id == scenario_id:
             found[rollout.index] = rollout
         elif found:
             break  # Those of a scene lie together.
-    wanted = sorted(found)[:MOST_ROLLOUTS] if asked is None else list(dict.fromkeys(asked))
+    wanted = sorted(found)[:most] if asked is None else list(dict.fromkeys(asked))
     missing = [index for index in wanted if index not in found]
     if missing:
         there = ", ".join(str(index) for index in sorted(found))

@@ -1,0 +1,40 @@
+"""Settings of rollouts as keywords, so that editors complete them and mypy checks them."""
+
+from typing import Literal, TypedDict
+
+
+class RolloutOverrides(TypedDict, total=False):
+    """Any of ``RolloutSettings``, which says what each means (`infgen settings` too)."""
+
+    split: str
+    mode: Literal["long", "motion-only", "wosac"]
+    seconds: float | None
+    count: int
+    max_scenes: int
+    scenes_per_unit: int
+    batch_rollouts: int
+    all_agents: bool | None
+    insert: bool | None
+    remove: bool | None
+    removal_radius_m: float
+    signals: Literal["now", "log"]
+    validity_patterns: bool
+    motion_top_k: int
+    position_top_k: int
+    motion_top_p: float
+    position_top_p: float
+    max_motion_samples: int
+    reject_off_road: bool
+    max_stall_s: float
+    motion_temperature: float
+    position_temperature: float
+    heading_temperature: float
+    add_bias: float
+    remove_bias: float
+    density_control: float
+    insertion_mask: bool
+    insertion_lane_distance_m: float
+    max_insertion_attempts: int
+    max_insertions: int
+    max_agents: int
+    seed: int
