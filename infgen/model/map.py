@@ -78,17 +78,31 @@ class MapEncoder(nn.Module):
 
     def forward(self, roads: MapTokens, sight: MapContext) -> MapFeatures:
         """Encode every map token."""
-        neighbours = sight.neighbours
+        return self.lay_out(roads, sight.rows, sight.grid, self.encode(roads, sight))
+
+    def encode(self, roads: MapTokens, sight: MapContext) -> Tensor:
+        """Return what every map token is among its neighbours [row, D]."""
         x = self._embed(roads, sight.rows)
         for block in self.blocks:
-            x = block(x, neighbours.seen(normed(x)))
-        rows, features, signal_states = sight.rows, normed(x), None
+            x = block(x, sight.neighbours.seen(normed(x)))
+        return x
+
+    def lay_out(self, roads: MapTokens, rows: Rows, grid: MapGrid, x: Tensor) -> MapFeatures:
+        """Put encoded map tokens side by side, to be looked up; no network is evaluated.
+
+        Args:
+            roads: The maps.
+            rows: Their map tokens.
+            grid: The same by where they are.
+            x: What ``encode`` said of them, map after map.
+        """
+        features, signal_states = normed(x), None
         if self.signals_each_step:
             looks, signal_states = self._signal_states(roads, rows, x)
             features = torch.cat([features, looks])
         lines = StopLines.of(roads) if self.stop_lines else None
         return MapFeatures(
-            rows, features, roads.pose, roads.real, sight.grid, signal_states, lines
+            rows, features, roads.pose, roads.real, grid, signal_states, lines
         )
 
     def predict_hidden(

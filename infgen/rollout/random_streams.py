@@ -40,9 +40,12 @@ class Streams:
 
     Attributes:
         key: Key of each stream, its low word first.
+        begun: Token step of the batch that is the first of each rollout's own: 0, but for
+            rollouts that took the place of others.
     """
 
     key: UInt64[np.ndarray, "stream 2"]
+    begun: Int64[np.ndarray, " stream"]
 
     @classmethod
     def of(cls, names: Iterable[tuple[int, str, int]]) -> "Streams":
@@ -51,14 +54,23 @@ class Streams:
             hashlib.sha256(f"{seed}/{scenario_id}/{index}".encode()).digest()[:16]
             for seed, scenario_id, index in names
         )
-        return cls(np.frombuffer(digests, dtype="<u8").reshape(-1, 2))
+        key = np.frombuffer(digests, dtype="<u8").reshape(-1, 2)
+        return cls(key, np.zeros(len(key), dtype=np.int64))
 
     def __len__(self) -> int:
         return len(self.key)
 
     def take(self, places: Int64[np.ndarray, " kept"]) -> "Streams":
         """Keep some of them."""
-        return Streams(self.key[places])
+        return Streams(self.key[places], self.begun[places])
+
+    def put(
+        self, places: Int64[np.ndarray, " replaced"], others: "Streams", token: int
+    ) -> "Streams":
+        """Replace some by others, which begin at a token step of the batch."""
+        key, begun = self.key.copy(), self.begun.copy()
+        key[places], begun[places] = others.key, token
+        return Streams(key, begun)
 
     def uniform(
         self, token: int, purpose: Purpose, count: int, turn: int = 0
@@ -66,7 +78,8 @@ class Streams:
         """Draw numbers in [0, 1): the same for the same arguments, always.
 
         Args:
-            token: Token step that the draw is made in.
+            token: Token step of the batch that the draw is made in. It counts from where
+                each rollout began.
             purpose: What it decides.
             count: How many per stream; a longer draw starts with the shorter one.
             turn: Which draw of that purpose in this token step (the n-th inserted agent).
@@ -74,13 +87,16 @@ class Streams:
         blocks = -(-count // WORDS)
         # The lowest word counts within a draw, from 1 on; the others name the draw.
         block = np.arange(1, blocks + 1, dtype=np.uint64)[None]
-        words = _philox((block, turn, token, int(purpose)), self.key)
+        own = (token - self.begun)[:, None]
+        words = _philox((block, turn, own, int(purpose)), self.key)
         numbers = words.reshape(len(self), -1)[:, :count] >> _UNUSED_BITS
         return numbers * 2.0**-53
 
 
 def _philox(
-    counter: tuple[UInt64[np.ndarray, "1 block"], int, int, int],
+    counter: tuple[
+        UInt64[np.ndarray, "1 block"], int, Int64[np.ndarray, "stream 1"], int
+    ],
     key: UInt64[np.ndarray, "stream 2"],
 ) -> UInt64[np.ndarray, "stream block 4"]:
     """Evaluate the generator for every key and every block of the counter."""

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float32, Int64
 
 from infgen.clock import CLOCK
 from infgen.rollout.population import Population
-from infgen.rollout.recording import RolloutStart, number_maps
 from infgen.rollout.rules.collision import COMPARED_STEPS, find_collisions, repeat
 from infgen.rollout.rules.off_road import RoadEdgeTiles, find_off_road
 from infgen.tokens.scene_tokens import Presence
@@ -122,14 +121,3 @@ class MotionCheck:
         """Token steps that each vehicle needs to stop, within ``ROAD_AHEAD``."""
         stops_s = self._length_m(before, motion_token) / CLOCK.token_s / (2 * BRAKES_MPS2)
         return np.ceil(stops_s / CLOCK.token_s).clip(*ROAD_AHEAD).astype(np.int64)
-
-
-def make_motion_check(
-    starts: Sequence[RolloutStart], vocabulary: MotionVocabulary, *, reject_off_road: bool
-) -> MotionCheck:
-    """Make the motion check of some rollouts; those of one scene share its map."""
-    maps, scene = number_maps(starts)
-    road_edge_tiles = (
-        [RoadEdgeTiles(start.scene) for start in maps] if reject_off_road else []
-    )
-    return MotionCheck(vocabulary, road_edge_tiles, scene)
