@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 
 from infgen.clock import CLOCK
 from infgen.geometry import wrap_angle
@@ -180,6 +180,11 @@ class Session:
         self._starts = everyone
         self._go_to_maps(at, most)
         return begun.with_rows(rows).put(at, logged_step(starts, rows))
+
+    @property
+    def own_token(self) -> Int64[np.ndarray, " rollout"]:
+        """Index of the last token step in the count of each rollout itself."""
+        return self.token - self._streams.begun
 
     @property
     def num_rows(self) -> int:
