@@ -16,14 +16,14 @@ from infgen.environment.ego import EgoState, action_bounds, drive
 from infgen.environment.observation import (
     Observation,
     Surroundings,
-    observation_space,
     observe,
+    table_spaces,
 )
 from infgen.environment.reward import DrivingStep
 from infgen.environment.route import END_M, Route, make_route
 from infgen.environment.scenes import DrivingScene, SceneChoice, SceneChooser
 from infgen.environment.settings import EnvironmentSettings
-from infgen.environment.world import Agents, World
+from infgen.environment.world import World
 from infgen.rollout.population import EGO_ROW
 from infgen.rollout.simulator import Simulator
 from infgen.scene import Scene
@@ -43,7 +43,7 @@ class Spaces:
     @classmethod
     def of(cls, settings: EnvironmentSettings) -> "Spaces":
         """Return the spaces that settings ask for."""
-        seen: spaces.Space = observation_space(settings)
+        seen: spaces.Space = spaces.Dict(table_spaces(settings))
         if settings.observation == "flat":
             seen = spaces.flatten_space(seen)
         low, high = action_bounds(settings.action, settings.action_s)
@@ -144,14 +144,13 @@ class DrivingBatch:
         Raises:
             ValueError: if an action is no number.
         """
+        length_m = self.world.agents.size_lwh_m[:, EGO_ROW, 0]
         low, high = action_bounds(self.settings.action, self.settings.action_s)
         if not np.isfinite(actions).all():
             raise ValueError(f"action is {actions}; expected finite numbers")
         values = np.clip(actions.astype(np.float64), low, high)
         steps = self.settings.steps_per_action
-        driven = drive(
-            self.settings.action, values, self.ego, self._length_m(), steps=steps
-        )
+        driven = drive(self.settings.action, values, self.ego, length_m, steps)
         before, collided, off_road = self.episodes, restarts & False, restarts & False
         if restarts.any():
             self._restart(restarts, steps_ahead=steps)
@@ -331,10 +330,6 @@ class DrivingBatch:
             route_ended=counted & (along_m >= length_m - END_M),
             timed_out=counted & (seconds >= self.settings.max_seconds - 1e-9),
         )
-
-    def _length_m(self) -> np.ndarray:
-        agents: Agents = self.world.agents
-        return agents.size_lwh_m[:, EGO_ROW, 0]
 
 
 def _logged_egos(scenes: Sequence[DrivingScene], ago: int) -> EgoState:

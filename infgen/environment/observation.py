@@ -60,8 +60,8 @@ LONG_M = 30.0
 Observation = dict[str, np.ndarray]
 
 
-def observation_space(settings: EnvironmentSettings) -> spaces.Dict:
-    """Return the space of the observation of one environment."""
+def table_spaces(settings: EnvironmentSettings) -> dict[str, spaces.Space]:
+    """Return the space of each table that one environment observes."""
     far_m = settings.radius_m
     tables = {
         "agents": (settings.num_agents, AGENTS),
@@ -75,7 +75,7 @@ def observation_space(settings: EnvironmentSettings) -> spaces.Dict:
     # A route is seen a little farther than anything else: its points are a fixed number.
     route_m = max(far_m, ROUTE_SPACING_M * (settings.num_route_points + 1))
     found["route"] = _box((settings.num_route_points,), ROUTE, route_m)
-    return spaces.Dict(found)
+    return dict(sorted(found.items()))
 
 
 def _box(rows: tuple[int, ...], columns: Sequence[str], far_m: float) -> spaces.Box:
@@ -132,7 +132,6 @@ class Surroundings:
 
 def observe(around: Surroundings, settings: EnvironmentSettings) -> Observation:
     """Return the observations of a batch of environments, by the names of their space."""
-    single = observation_space(settings)
     agents, agents_mask = _agents(around, settings)
     found = {"ego": _ego(around), "agents": agents, "agents_mask": agents_mask}
     parts: dict[str, list[np.ndarray]] = {
@@ -146,7 +145,7 @@ def observe(around: Surroundings, settings: EnvironmentSettings) -> Observation:
             parts[name].append(value)
         parts["route"].append(_route(around, at, settings))
     found |= {name: np.stack(values) for name, values in parts.items()}
-    return {name: _cut_off(found[name], space) for name, space in single.items()}
+    return {name: _cut_off(found[name], space) for name, space in table_spaces(settings).items()}
 
 
 def _cut_off(values: np.ndarray, space: spaces.Space) -> np.ndarray:
@@ -235,7 +234,7 @@ def _route(around: Surroundings, at: int, settings: EnvironmentSettings) -> np.n
     """Return points ahead on the route of one environment; past its end its last point."""
     number = np.arange(1, settings.num_route_points + 1)
     points_m = around.routes[at].at(around.along_m[at] + ROUTE_SPACING_M * number)
-    return _to_ego(points_m, around.ego.pose[at])
+    return _to_ego(points_m, around.ego.pose[at, None])
 
 
 def _nearest_places(

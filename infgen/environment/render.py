@@ -40,10 +40,10 @@ class Renderer:
         driven = batch.episodes.scenes[environment]
         drawn_map, lights = self._draw(driven, batch)
         showing = _showing(batch, environment)
-        view = view_of(showing, 0.0, SIDE_PX, SIDE_PX)
+        view = view_of(showing, 0.0, float(SIDE_PX), float(SIDE_PX))
         canvas = Canvas.plain(SIDE_PX, SIDE_PX, LIGHT.ground)
         canvas.paint(map_marks(drawn_map, view, LIGHT))
-        canvas.paint(light_marks(lights, driven.scene.now, view, LIGHT))
+        canvas.paint(light_marks(lights, float(driven.scene.now), view, LIGHT))
         canvas.paint(AgentMarks(showing).marks(0, 0.0, view, LIGHT))
         return canvas.pixels
 

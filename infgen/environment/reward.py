@@ -1,7 +1,7 @@
 """Rewards: what a step of a batch of environments is worth."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -52,6 +52,7 @@ class DrivingStep:
         return (self.route_ended | self.timed_out) & ~self.terminated
 
 
+@runtime_checkable
 class Reward(Protocol):
     """Any function from a step of all environments to a reward for each."""
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from infgen.geometry import wrap_angle
+from infgen.geometry import to_local
 from infgen.scene import FeatureType, LaneType, LinkType, RoadMap, Scene
 
 SPACING_M = 1.0
@@ -100,15 +100,15 @@ def _find_lane(road_map: RoadMap, pose: Float64[np.ndarray, "3"]) -> int | None:
         line_m = road_map.points(row)[:, :2].astype(np.float64)
         if road_map.feature_subtype[row] == LaneType.BIKE_LANE or len(line_m) < 2:
             continue
-        away_m = np.linalg.norm(line_m[:-1] - pose[:2], axis=1)
-        near = int(away_m.argmin())
-        way = line_m[near + 1] - line_m[near]
-        turn = abs(wrap_angle(np.arctan2(way[1], way[0]) - pose[2]))
-        gap_m = abs(way[0] * (pose[1] - line_m[near, 1]) - way[1] * (pose[0] - line_m[near, 0]))
-        gap_m = max(gap_m / max(np.hypot(*way), 1e-9), away_m[near] - np.hypot(*way))
-        cost_m = gap_m + OFF_LANE_PER_RAD_M * turn
-        if gap_m < NEAR_LANE_M and turn < ALONG_RAD and cost_m < best_m:
-            best, best_m = row, cost_m
+        way = np.diff(line_m, axis=0)
+        frame = np.column_stack([line_m[:-1], np.arctan2(way[:, 1], way[:, 0])])
+        ahead_m, aside_m, turn_rad = to_local(np.broadcast_to(pose, frame.shape), frame).T
+        beyond_m = np.maximum(ahead_m - np.linalg.norm(way, axis=1), -ahead_m).clip(min=0)
+        gap_m, turn_rad = np.hypot(beyond_m, aside_m), np.abs(turn_rad)
+        cost_m = gap_m + OFF_LANE_PER_RAD_M * turn_rad
+        cost_m[(gap_m > NEAR_LANE_M) | (turn_rad > ALONG_RAD)] = np.inf
+        if cost_m.min() < best_m:
+            best, best_m = row, float(cost_m.min())
     return best
 
 
