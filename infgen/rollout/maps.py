@@ -19,7 +19,7 @@ from infgen.model.batching.batch import MapTokens, collate_maps, to_device
 from infgen.model.neighbours import MapFeatures
 from infgen.model.signal_features import StopLines
 from infgen.rollout.insertion_mask import InsertionMask, make_insertion_mask
-from infgen.rollout.recording import RolloutStart, number_maps
+from infgen.rollout.recording import RolloutStart
 from infgen.rollout.rules.density import DensityControl, Segments, segments_of
 from infgen.rollout.rules.off_road import RoadEdgeTiles
 from infgen.rollout.rules.rejection import MotionCheck
@@ -41,9 +41,11 @@ class RolloutMaps:
     def __init__(self, simulator: Simulator, starts: Sequence[RolloutStart]) -> None:
         """Encode the maps of some rollouts, all at once."""
         self._simulator = simulator
-        self._held: dict[str, RolloutStart] = {}
-        self._encoded: dict[str, Tensor] = {}
-        self._tiles: dict[str, RoadEdgeTiles] = {}
+        # By the ``id`` of a scene, which is held: a user may have changed one and kept its
+        # scenario id.
+        self._held: dict[int, RolloutStart] = {}
+        self._encoded: dict[int, Tensor] = {}
+        self._tiles: dict[int, RoadEdgeTiles] = {}
         self._segments: list[Segments] | None = None
         self._mask: InsertionMask | None = None
         self._stalls: StallRule | None = None
@@ -56,19 +58,17 @@ class RolloutMaps:
             starts: What all rollouts of the batch continue.
             most: Number of maps beyond which those that no rollout is on are forgotten.
         """
-        maps = {start.scene.scenario_id: start for start in starts}
-        new = [name for name, start in maps.items() if not self._holds(name, start)]
+        maps = {id(start.scene): start for start in starts}
+        new = [scene for scene in maps if scene not in self._held]
         if not new:
             return
-        earlier = [name for name in self._held if name not in maps]
+        earlier = [scene for scene in self._held if scene not in maps]
         kept = earlier[max(0, len(earlier) + len(maps) - max(most, len(maps))) :]
-        self._held = {name: self._held[name] for name in kept} | maps
-        self._encode([self._held[name] for name in new])
-        held = list(self._held)
-        self._encoded = {name: self._encoded[name] for name in held}
-        self._tiles = {
-            name: tiles for name, tiles in self._tiles.items() if name in self._encoded
-        }
+        self._held = {scene: self._held[scene] for scene in kept} | maps
+        self._encode([maps[scene] for scene in new])
+        self._encoded = {scene: self._encoded[scene] for scene in self._held}
+        known = self._tiles.items()
+        self._tiles = {scene: tiles for scene, tiles in known if scene in self._held}
         roads = _collate(list(self._held.values()))
         self.features = self._simulator.stepper.lay_out_maps(
             to_device(roads, self._simulator.device),
@@ -79,8 +79,8 @@ class RolloutMaps:
 
     def number(self, starts: Sequence[RolloutStart]) -> Scenes:
         """Return the map of each rollout."""
-        at = {name: number for number, name in enumerate(self._held)}
-        return np.array([at[start.scene.scenario_id] for start in starts], dtype=np.int64)
+        at = {scene: number for number, scene in enumerate(self._held)}
+        return np.array([at[id(start.scene)] for start in starts], dtype=np.int64)
 
     def insertion_mask(self, scene: Scenes) -> InsertionMask | None:
         """Return the insertion mask, or None if it is off."""
@@ -90,10 +90,10 @@ class RolloutMaps:
         """Return the check of motion tokens."""
         tiles: list[RoadEdgeTiles] = []
         if self._simulator.settings.reject_off_road:
-            for name, start in self._held.items():
-                if name not in self._tiles:
-                    self._tiles[name] = RoadEdgeTiles(start.scene)
-            tiles = [self._tiles[name] for name in self._held]
+            for scene_id, start in self._held.items():
+                if scene_id not in self._tiles:
+                    self._tiles[scene_id] = RoadEdgeTiles(start.scene)
+            tiles = [self._tiles[scene_id] for scene_id in self._held]
         return MotionCheck(self._simulator.vocabulary, tiles, scene)
 
     def stall_rule(self, scene: Scenes) -> StallRule | None:
@@ -126,23 +126,17 @@ class RolloutMaps:
         nobody = np.zeros(0, dtype=np.int64)
         return StallRule(scenes, nobody, StopLines.of(roads), tokens)
 
-    def _holds(self, name: str, start: RolloutStart) -> bool:
-        # Another scene may have the same id: one that a user has changed.
-        return name in self._held and self._held[name].scene is start.scene
-
     def _encode(self, starts: Sequence[RolloutStart]) -> None:
         """Encode the maps of scenes together; each is kept by itself."""
         roads, simulator = _collate(starts), self._simulator
         encoded = simulator.stepper.encode_maps(to_device(roads, simulator.device))
         parts = encoded.split(roads.real.sum(dim=1).tolist())
         for start, part in zip(starts, parts, strict=True):
-            self._tiles.pop(start.scene.scenario_id, None)
-            self._encoded[start.scene.scenario_id] = part
+            self._encoded[id(start.scene)] = part
 
 
-def _collate(starts: Sequence[RolloutStart]) -> MapTokens:
-    """Collate the maps of rollouts; each map once."""
-    maps, _ = number_maps(starts)
+def _collate(maps: Sequence[RolloutStart]) -> MapTokens:
+    """Collate the maps of rollouts on different ones."""
     histories = [start.history for start in maps]
     return collate_maps(
         histories,
