@@ -263,7 +263,8 @@ class DrivingBatch:
         """Tell which egos collide and which leave the road, and remember who did not."""
         episodes, agents = self.episodes, self.world.agents
         hits = nearest_agent_m(agents) < 0
-        leaves = off_road_m(agents, [scene.edges for scene in episodes.scenes]) > 0
+        edges = [scene.edges for scene in episodes.scenes]
+        leaves = off_road_m(agents, edges) > self.settings.off_road_m
         self.episodes = replace(
             episodes,
             was_clear=episodes.was_clear | ~hits,
@@ -280,8 +281,9 @@ class DrivingBatch:
         ]
         along_m, off_m = np.array(found).T
         agents = self.world.agents
+        edges = [scene.edges for scene in episodes.scenes]
         clear = nearest_agent_m(agents) >= 0
-        on_road = off_road_m(agents, [scene.edges for scene in episodes.scenes]) <= 0
+        on_road = off_road_m(agents, edges) <= self.settings.off_road_m
         self.episodes = replace(
             episodes,
             steps=np.where(which, 0, episodes.steps),

@@ -6,7 +6,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from infgen.clock import CLOCK
-from infgen.settings import RULES, AtLeastOne, Positive
+from infgen.settings import RULES, AtLeastOne, NonNegative, Positive
 
 Hertz = Literal[10, 2]
 Places = Annotated[AtLeastOne, Field(le=256)]
@@ -26,6 +26,8 @@ class EnvironmentSettings:
     taken at each of their five steps, at 2 Hz once."""
     max_seconds: Positive = 300.0
     """An episode is truncated after so long."""
+    off_road_m: NonNegative = 0.0
+    """An episode ends when a corner of the ego's box is farther than this off the road."""
     route_length_m: Positive = 2000.0
     """Longest route; it ends earlier where the lanes of the map end. At its end an episode
     is truncated."""
