@@ -32,7 +32,7 @@ DESIRED_MPS = 8.0
 
 
 def follow_routes(observation: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Actions [..., 2] that lead along routes at a constant speed, whoever is in the way."""
+    """Actions [..., 2] that lead along routes at a constant speed, whoever is there."""
     speed_mps = observation["ego"][..., 0]
     x_m, y_m = np.moveaxis(observation["route"][..., 0, :], -1, 0)
     steering_rad = 3.0 * 2 * y_m / np.maximum(x_m**2 + y_m**2, 1.0)

@@ -51,9 +51,7 @@ def slow_for_turns(route_m: np.ndarray) -> float:
     return float(min(DESIRED_MPS, allowed_mps.min()))
 
 
-def follow(
-    speed_mps: float, desired_mps: float, gap_m: float, closing_mps: float
-) -> float:
+def follow(speed_mps: float, desired_mps: float, gap_m: float, closing_mps: float) -> float:
     """Return the acceleration of the Intelligent Driver Model (Treiber et al. 2000)."""
     braking = 2 * np.sqrt(MAX_ACCEL_MPS2 * COMFORT_BRAKE_MPS2)
     wanted_m = STANDING_GAP_M + speed_mps * max(0.0, HEADWAY_S + closing_mps / braking)
@@ -87,7 +85,7 @@ def gap_ahead(
     for one in agents:
         along_m, aside_m = along(way_m, one[:2])
         gap_m = along_m - (length_m + one[AGENTS.index("length_m")]) / 2
-        if aside_m < BESIDE_M and 0 < along_m and gap_m < best_m:
+        if aside_m < BESIDE_M and along_m > 0 and gap_m < best_m:
             best_m = float(gap_m)
             best_mps = speed_mps - float(one[AGENTS.index("velocity_x_mps")])
     for one in red:

@@ -3,7 +3,7 @@
 ::
 
     pip install 'infgen[gym]' stable-baselines3
-    python examples/train_ppo.py --steps 100000 --environments 16 --out policy.zip
+    python examples/train_ppo.py --steps 100000 --environments 16 --out policy.safetensors
 """
 
 import argparse
@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from safetensors.torch import save_file
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
@@ -28,7 +29,7 @@ class BatchForPPO(VecEnv):
             ID,
             num_envs=num_envs,
             observation="flat",
-            # As stable-baselines3 has it: the next episode begins in the step that ends one.
+            # As stable-baselines3 has it: an episode begins in the step that ends one.
             autoreset_mode=AutoresetMode.SAME_STEP,
             **settings,
         )
@@ -108,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--environments", type=int, default=16, help="driven at once")
     parser.add_argument("--rollout-steps", type=int, default=256, help="between updates")
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
-    parser.add_argument("--out", type=Path, help="file for the policy")
+    parser.add_argument("--out", type=Path, help="safetensors file for the policy")
     options = parser.parse_args(arguments)
     model = train(options.steps, options.environments, options.seed, options.rollout_steps)
     episodes = list(model.ep_info_buffer or ())
@@ -116,7 +117,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         mean = np.mean([episode["r"] for episode in episodes])
         print(f"mean return of the last {len(episodes)} episodes: {mean:.2f}")
     if options.out:
-        model.save(options.out)
+        # Not `model.save`: what it writes holds pickles.
+        save_file(model.policy.state_dict(), options.out)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """A gymnasium environment: one drives the ego, the network all others (extra ``gym``).
 
 Importing this package registers ``infgen/Drive-v0``; so does the id
-``infgen.environment:infgen/Drive-v0``. What simulates is loaded when an environment is made.
+``infgen.environment:infgen/Drive-v0``. The network is loaded when an environment is made.
 """
 
 try:

@@ -5,6 +5,7 @@ The single environment is a batch of one. Nothing here is of gymnasium but the s
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -37,13 +38,13 @@ MAX_SEED = 2**31
 class Spaces:
     """Observation and action space of one environment."""
 
-    observation: spaces.Space
+    observation: spaces.Space[Any]
     action: spaces.Box
 
     @classmethod
     def of(cls, settings: EnvironmentSettings) -> "Spaces":
         """Return the spaces that settings ask for."""
-        seen: spaces.Space = spaces.Dict(table_spaces(settings))
+        seen: spaces.Space[Any] = spaces.Dict(table_spaces(settings))
         if settings.observation == "flat":
             seen = spaces.flatten_space(seen)
         low, high = action_bounds(settings.action, settings.action_s)
@@ -342,4 +343,6 @@ def _logged_egos(scenes: Sequence[DrivingScene], ago: int) -> EgoState:
         step = scene.now - ago
         poses.append(scene.tracks.pose(step)[scene.ego])
         speeds.append(np.hypot(*scene.tracks.velocity_mps[scene.ego, step]))
-    return EgoState.at(np.array(poses, dtype=np.float64), np.array(speeds, dtype=np.float64))
+    return EgoState.at(
+        np.array(poses, dtype=np.float64), np.array(speeds, dtype=np.float64)
+    )

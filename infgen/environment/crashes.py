@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float32
 
 from infgen.environment.world import Agents
 from infgen.metrics.interaction import nearest_object_m
@@ -38,7 +38,9 @@ def nearest_agent_m(agents: Agents) -> Float32[np.ndarray, " environment"]:
         valid,
     )
     egos = np.flatnonzero(row == EGO_ROW)
-    return nearest_object_m(motion, egos, slice(None))[0, np.arange(count), np.arange(count)]
+    return nearest_object_m(motion, egos, slice(None))[
+        0, np.arange(count), np.arange(count)
+    ]
 
 
 def off_road_m(
@@ -51,20 +53,20 @@ def off_road_m(
     """
     found_m = np.full(len(edges), NO_ROAD_M)
     by_map: dict[int, list[int]] = {}
-    for at, one in enumerate(edges):
-        if one is not None:
-            by_map.setdefault(id(one), []).append(at)
+    for environment, one in enumerate(edges):
+        by_map.setdefault(id(one), []).append(environment)
     for places in by_map.values():
-        at: Int64[np.ndarray, " some"] = np.array(places)
-        one = edges[places[0]]
-        assert one is not None
+        at, one = np.array(places), edges[places[0]]
+        if one is None:
+            continue
         motion = _as_motion(
             agents.pose[at, EGO_ROW],
             agents.size_lwh_m[at, EGO_ROW],
             agents.agent_type[at, EGO_ROW],
-            np.ones((len(at), 1), dtype=bool),
+            np.ones((len(places), 1), dtype=bool),
         )
-        found_m[at] = road_edge_m(motion, np.arange(len(at)), slice(None), one)[0, :, 0]
+        egos = np.arange(len(places))
+        found_m[at] = road_edge_m(motion, egos, slice(None), one)[0, :, 0]
     return found_m
 
 
@@ -75,13 +77,16 @@ def _as_motion(
     valid: Bool[np.ndarray, "agent step"],
 ) -> Motion:
     """Return boxes that stand still for some steps, their lower sides at height 0."""
-    shape = (1, *valid.shape)
-    heights_m = size_lwh_m[:, 2] / 2
+
+    def at_all_steps(values: np.ndarray) -> Float32[np.ndarray, "1 agent step"]:
+        steps = np.broadcast_to(values[:, None], valid.shape)
+        return steps[None].astype(np.float32)
+
     return Motion(
-        *(
-            np.broadcast_to(values[None, :, None], shape).astype(np.float32)
-            for values in (pose[:, 0], pose[:, 1], heights_m, pose[:, 2])
-        ),
+        x_m=at_all_steps(pose[:, 0]),
+        y_m=at_all_steps(pose[:, 1]),
+        z_m=at_all_steps(size_lwh_m[:, 2] / 2),
+        heading_rad=at_all_steps(pose[:, 2]),
         size_lwh_m=size_lwh_m,
         agent_type=agent_type,
         valid=valid[None],

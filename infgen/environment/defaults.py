@@ -1,4 +1,4 @@
-"""What an environment simulates with, and where, if it is not told: what the package has."""
+"""Network and scenes of an environment that is given none: those of the package."""
 
 from collections.abc import Sequence
 from functools import lru_cache

@@ -1,4 +1,4 @@
-"""What an ego observes: itself, agents, map tokens, signals and its route, in its own frame.
+"""What an ego observes, in its own frame: itself, agents, map, signals and its route.
 
 The ego frame has its origin at the middle of the ego's box, x ahead and y to the left.
 Nothing depends on where the scene lies in the world or how it is turned. Shapes are fixed:
@@ -8,6 +8,7 @@ Values are cut off at the bounds of their space.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -35,7 +36,7 @@ EGO = (
     "route_heading_cos",
     "route_heading_sin",
 )
-"""Columns of ``ego``: state and box; how far to the left the route is, and its direction."""
+"""Columns of ``ego``: state and box, where the route is beside it, and its direction."""
 AGENT_TYPES = (AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST)
 PLACE = ("x_m", "y_m", "heading_cos", "heading_sin")
 AGENTS = (
@@ -46,7 +47,7 @@ AGENTS = (
     "width_m",
     *(f"is_{agent_type.name.lower()}" for agent_type in AGENT_TYPES),
 )
-"""Columns of ``agents``. The velocity is that over ground, along the axes of the ego frame."""
+"""Columns of ``agents``. Velocities are over ground, along the axes of the ego frame."""
 MAP = (*PLACE, *(f"is_{line.name.lower()}" for line in PolylineType))
 """Columns of ``map``: where each map token begins, its direction and its polyline type."""
 SIGNALS = (*PLACE, *(f"is_{shown.name.lower()}" for shown in SignalClass))
@@ -60,7 +61,7 @@ LONG_M = 30.0
 Observation = dict[str, np.ndarray]
 
 
-def table_spaces(settings: EnvironmentSettings) -> dict[str, spaces.Space]:
+def table_spaces(settings: EnvironmentSettings) -> dict[str, spaces.Space[Any]]:
     """Return the space of each table that one environment observes."""
     far_m = settings.radius_m
     tables = {
@@ -68,7 +69,7 @@ def table_spaces(settings: EnvironmentSettings) -> dict[str, spaces.Space]:
         "map": (settings.num_map_tokens, MAP),
         "signals": (settings.num_signals, SIGNALS),
     }
-    found: dict[str, spaces.Space] = {"ego": _box((), EGO, far_m)}
+    found: dict[str, spaces.Space[Any]] = {"ego": _box((), EGO, far_m)}
     for name, (rows, columns) in tables.items():
         found[name] = _box((rows,), columns, far_m)
         found[f"{name}_mask"] = spaces.MultiBinary(rows)
@@ -145,10 +146,12 @@ def observe(around: Surroundings, settings: EnvironmentSettings) -> Observation:
             parts[name].append(value)
         parts["route"].append(_route(around, at, settings))
     found |= {name: np.stack(values) for name, values in parts.items()}
-    return {name: _cut_off(found[name], space) for name, space in table_spaces(settings).items()}
+    return {
+        name: _cut_off(found[name], space) for name, space in table_spaces(settings).items()
+    }
 
 
-def _cut_off(values: np.ndarray, space: spaces.Space) -> np.ndarray:
+def _cut_off(values: np.ndarray, space: spaces.Space[Any]) -> np.ndarray:
     if isinstance(space, spaces.Box):
         return np.clip(values, space.low, space.high).astype(np.float32)
     return values.astype(np.int8)

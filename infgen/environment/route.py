@@ -130,7 +130,9 @@ def _follow_lanes(
             if number in row_of and len(road_map.points(row_of[number])) > 1
         ]
         # The first lane may lie behind the ego with all of its length.
-        reached_m = so_far_m - float(np.linalg.norm(np.diff(lines[0], axis=0), axis=1).sum())
+        reached_m = so_far_m - float(
+            np.linalg.norm(np.diff(lines[0], axis=0), axis=1).sum()
+        )
         if not others or reached_m >= length_m:
             return np.concatenate(lines)
         lane = others[int(random.integers(len(others)))]

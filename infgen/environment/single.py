@@ -95,7 +95,7 @@ class DriveEnv(gymnasium.Env[np.ndarray | Observation, np.ndarray]):
             self._info(),
         )
 
-    def render(self) -> UInt8[np.ndarray, "height width 3"] | None:  # type: ignore[override]
+    def render(self) -> UInt8[np.ndarray, "height width 3"] | None:
         """Return a picture of the ego and what is around it, north up.
 
         Raises:

@@ -30,8 +30,8 @@ class DriveVectorEnv(VectorEnv[Seen, np.ndarray, np.ndarray]):
 
     An environment whose episode has ended begins another one by itself, in a scene that is
     drawn: in the next step (``AutoresetMode.NEXT_STEP``), whose action it ignores, or in
-    the same one (``SAME_STEP``), with ``final_obs`` and ``final_info`` in the info. Within a
-    token step it begins up to 0.4 s before the end of its history.
+    the same one (``SAME_STEP``), with ``final_obs`` and ``final_info`` in the info. It may
+    be in the middle of a token step: up to 0.4 s before the end of its history.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -100,8 +100,8 @@ class DriveVectorEnv(VectorEnv[Seen, np.ndarray, np.ndarray]):
         """Begin an episode in every environment.
 
         Args:
-            seed: Environment ``i`` is seeded with ``seed + i``, or with the i-th of several;
-                None goes on with what there is.
+            seed: Environment ``i`` is seeded with ``seed + i``, or with the i-th of
+                several; None goes on with what there is.
             options: ``{"scene": ...}``: a ``Scene``, its id, or its number, or a list of
                 one of these (or None) for each environment; any if left out.
 
@@ -153,16 +153,16 @@ class DriveVectorEnv(VectorEnv[Seen, np.ndarray, np.ndarray]):
             seeds = [None] * self.num_envs if seed is None else seed
         if len(seeds) != self.num_envs:
             raise ValueError(
-                f"{len(seeds)} seeds for {self.num_envs} environments; give one, or one each"
+                f"{len(seeds)} seeds for {self.num_envs} environments; give one or all"
             )
-        known = self._random or [None] * self.num_envs
+        goes_on = bool(self._random)
         self._random = [
-            old if own is None and old is not None else seeding.np_random(own)[0]
-            for own, old in zip(seeds, known, strict=True)
+            self._random[at] if own is None and goes_on else seeding.np_random(own)[0]
+            for at, own in enumerate(seeds)
         ]
 
     def _choices(self, scene: SceneChoice | Sequence[SceneChoice]) -> list[SceneChoice]:
-        if not isinstance(scene, list | tuple):
+        if scene is None or isinstance(scene, Scene | str | int):
             return [scene] * self.num_envs
         if len(scene) != self.num_envs:
             raise ValueError(
@@ -178,7 +178,7 @@ class DriveVectorEnv(VectorEnv[Seen, np.ndarray, np.ndarray]):
         return {**info, **{f"_{name}": everyone.copy() for name in info}}
 
     def _final(self, ended: Flags) -> dict[str, Any]:
-        """Last observations and infos of episodes that have ended, as gymnasium has them."""
+        """Last observations and infos of ended episodes, as gymnasium has them."""
         if not ended.any():
             return {}
         seen, last = self._batch.observe(), np.full(self.num_envs, None, dtype=object)

@@ -81,10 +81,8 @@ class World:
         step = logged_step(starts, self._session.num_rows)
         self.agents = _agents_at(step, CLOCK.steps_per_token - 1)
 
-    def replace(
-        self, environments: Sequence[int], starts: Sequence[RolloutStart]
-    ) -> None:
-        """Let some environments begin anew: they are where the log has them at this step."""
+    def replace(self, environments: Sequence[int], starts: Sequence[RolloutStart]) -> None:
+        """Let some environments begin anew, where the log has them at this step."""
         replaced = self._session.replace(
             self._begin_step(), environments, starts, self._most_maps
         )
@@ -153,7 +151,8 @@ def _agents_at(step: BegunStep, at: int) -> Agents:
     else:
         # What was logged before the last token step of a history is not at hand here.
         logged = step.is_history[:, None]
-        before = np.where(logged[..., None], 2 * pose - step.path[:, :, 1], step.before.pose)
+        mirrored = 2 * pose - step.path[:, :, 1]
+        before = np.where(logged[..., None], mirrored, step.before.pose)
         known = step.shown[:, :, 1] | ~logged
     velocity_mps = (pose[..., :2] - before[..., :2]) / np.float32(CLOCK.step_s)
     known = known & there

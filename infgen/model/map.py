@@ -87,7 +87,9 @@ class MapEncoder(nn.Module):
             x = block(x, sight.neighbours.seen(normed(x)))
         return x
 
-    def lay_out(self, roads: MapTokens, rows: Rows, grid: MapGrid, x: Tensor) -> MapFeatures:
+    def lay_out(
+        self, roads: MapTokens, rows: Rows, grid: MapGrid, x: Tensor
+    ) -> MapFeatures:
         """Put encoded map tokens side by side, to be looked up; no network is evaluated.
 
         Args:

@@ -130,7 +130,7 @@ class RolloutMaps:
         """Encode the maps of scenes together; each is kept by itself."""
         roads, simulator = _collate(starts), self._simulator
         encoded = simulator.stepper.encode_maps(to_device(roads, simulator.device))
-        parts = encoded.split(roads.real.sum(dim=1).tolist())
+        parts = torch.split(encoded, roads.real.sum(dim=1).tolist())
         for start, part in zip(starts, parts, strict=True):
             self._encoded[id(start.scene)] = part
 

@@ -94,9 +94,7 @@ class Streams:
 
 
 def _philox(
-    counter: tuple[
-        UInt64[np.ndarray, "1 block"], int, Int64[np.ndarray, "stream 1"], int
-    ],
+    counter: tuple[UInt64[np.ndarray, "1 block"], int, Int64[np.ndarray, "stream 1"], int],
     key: UInt64[np.ndarray, "stream 2"],
 ) -> UInt64[np.ndarray, "stream block 4"]:
     """Evaluate the generator for every key and every block of the counter."""

@@ -208,9 +208,7 @@ class Session:
             self._density = maps.density(self._density, scene)
         stall_rule = maps.stall_rule(scene)
         if stall_rule is not None and self._sampler.stall_rule is not None:
-            stall_rule.go_on_from(
-                self._sampler.stall_rule, replaced, self._streams.begun
-            )
+            stall_rule.go_on_from(self._sampler.stall_rule, replaced, self._streams.begun)
         self._sampler = replace(
             self._sampler,
             streams=self._streams,

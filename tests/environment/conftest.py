@@ -1,4 +1,4 @@
-"""Environments with a small untrained network; nobody is inserted or removed if not asked."""
+"""Environments with a small untrained network, in which nobody is inserted or removed."""
 
 import numpy as np
 import pytest

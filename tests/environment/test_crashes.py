@@ -21,9 +21,7 @@ def drive_until_it_ends(env, action, most=100, **reset):
     raise AssertionError(f"the episode goes on after {most} steps")
 
 
-def test_an_episode_ends_when_the_ego_hits_who_stands_ahead(
-    parked, build_scene, drive_env
-):
+def test_an_episode_ends_when_the_ego_hits_who_stands_ahead(parked, build_scene, drive_env):
     # The ego at 10 m/s, 4.8 m long as the car ahead: 20 m from middle to middle are a gap
     # of 15.2 m. After 15 steps it is 0.2 m wide, after 16 the boxes overlap by 0.8 m.
     steps = np.arange(11)

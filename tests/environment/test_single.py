@@ -20,9 +20,7 @@ LIVELY = {"insert": True, "remove": True, "max_agents": 24, "max_insertions": 2}
 
 @pytest.mark.parametrize("observation", ["dict", "flat"])
 @pytest.mark.parametrize("action", ["bicycle", "waypoint"])
-def test_the_checker_of_gymnasium_finds_nothing(
-    crossing, simulator, observation, action
-):
+def test_the_checker_of_gymnasium_finds_nothing(crossing, simulator, observation, action):
     env = gymnasium.make(
         package.ID,
         simulator=simulator(**LIVELY),

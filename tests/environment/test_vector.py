@@ -28,22 +28,20 @@ def assert_same(one, other, at=slice(None)):
             np.testing.assert_allclose(one[name], expected, atol=2e-3, err_msg=name)
 
 
-def test_an_environment_of_a_batch_is_that_of_its_own_seed(
-    crossing, drive_env, drive_envs
-):
+def test_an_environment_of_a_batch_is_that_of_its_own_seed(crossing, drive_env, drive_envs):
     scenes = [crossing(speed_mps=speed) for speed in (10.0, 9.0)]
-    many = drive_envs(3, *scenes, rollout=LIVELY)
+    many = drive_envs(2, *scenes, rollout=LIVELY)
     single = drive_env(*scenes, rollout=LIVELY)
 
     told = [many.reset(seed=4)]
-    told += [many.step(actions(step, 3)) for step in range(18)]
+    told += [many.step(actions(step, 2)) for step in range(13)]
 
-    for at in range(3):
+    for at in range(2):
         observed, info = single.reset(seed=4 + at)
         assert_same({n: v[at] for n, v in told[0][0].items()}, observed)
-        for step in range(18):
+        for step in range(13):
             observed, reward, terminated, truncated, info = single.step(
-                actions(step, 3)[at]
+                actions(step, 2)[at]
             )
             seen, rewards, ends, cuts, infos = told[step + 1]
             assert_same({n: v[at] for n, v in seen.items()}, observed)
@@ -118,7 +116,7 @@ def test_in_the_same_step_the_last_observation_is_in_the_info(drive, drive_envs,
     observed, reward, _, truncated, info = told[3]
     assert truncated.all()
     assert "final_obs" not in told[2][4]
-    # The last speed of the one that braked for 0.4 s, and the first one of its next episode.
+    # The last speed of the one that braked for 0.4 s, and the first of its next episode.
     assert info["final_obs"][1]["ego"][0] == pytest.approx(10.0 - 8.0 * 0.4, abs=1e-4)
     np.testing.assert_allclose(observed["ego"][:, 0], 10.0, atol=1e-4)
     assert info["final_info"]["seconds"].tolist() == pytest.approx([0.4, 0.4])
@@ -134,7 +132,7 @@ def test_an_episode_does_not_notice_when_others_end(crossing, drive_env, drive_e
     env.reset(seed=8)
     alone.reset(seed=9)
     ends = 0
-    for step in range(32):
+    for step in range(24):
         action = actions(step, 2)
         action[0] = [0.0, -0.6]
         observed, _, terminated, _, _ = env.step(action)
@@ -146,10 +144,10 @@ def test_an_episode_does_not_notice_when_others_end(crossing, drive_env, drive_e
 
 def test_the_whole_course_is_decided_by_the_seed(crossing, drive_envs):
     def course(seed):
-        env = drive_envs(3, crossing(), crossing(speed_mps=6.0), rollout=LIVELY)
+        env = drive_envs(2, crossing(), crossing(speed_mps=6.0), rollout=LIVELY)
         told = [env.reset(seed=seed)[0]["agents"]]
-        for step in range(25):
-            hard = actions(step, 3)
+        for step in range(14):
+            hard = actions(step, 2)
             hard[0] = [0.0, -0.6]
             told.append(env.step(hard)[0]["agents"])
         return np.array(told)

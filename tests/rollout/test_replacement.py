@@ -40,6 +40,7 @@ def replaced_at(session, place, begin, logged):
 @pytest.fixture
 def renamed(crossing, start):
     """``renamed(name, **scene)``: a start of a crossing that has another id."""
+
     def build(name, **more):
         return start(replace(crossing(**more), scenario_id=name))
 
