@@ -90,19 +90,42 @@ class MapEncoder(nn.Module):
 
     def forward(self, roads: MapTokens, sight: MapContext) -> MapFeatures:
         """Encode every map token."""
-        neighbours = sight.neighbours
+        x = self.encode(roads, sight)
+        return self.lay_out(roads, sight.rows, sight.grid, x, sight.index)
+
+    def encode(self, roads: MapTokens, sight: MapContext) -> Tensor:
+        """Return what every map token is among its neighbours [row, D]."""
         x = self._embed(roads, sight.rows)
         for block in self.blocks:
-            x = block(x, neighbours.seen(normed(x)))
-        rows, features, signal_states = sight.rows, normed(x), None
+            x = block(x, sight.neighbours.seen(normed(x)))
+        return x
+
+    def lay_out(
+        self,
+        roads: MapTokens,
+        rows: Rows,
+        grid: MapGrid,
+        x: Tensor,
+        index: MapIndex | None = None,
+    ) -> MapFeatures:
+        """Put encoded map tokens side by side, to be looked up; no network is evaluated.
+
+        Args:
+            roads: The maps.
+            rows: Their map tokens.
+            grid: The same by where they are.
+            x: What ``encode`` said of them, map after map.
+            index: Places among them, if they are known already.
+        """
+        features, signal_states = normed(x), None
         if self.signals_each_step:
-            looks, signal_states = self._signal_states(roads, sight, x)
+            looks, signal_states = self._signal_states(roads, rows, x, index)
             features = torch.cat([features, looks])
         lines = None
         if self.stop_lines:
-            lines = StopLines.of(roads) if sight.index is None else sight.index.lines
+            lines = StopLines.of(roads) if index is None else index.lines
         return MapFeatures(
-            rows, features, roads.pose, roads.real, sight.grid, signal_states, lines
+            rows, features, roads.pose, roads.real, grid, signal_states, lines
         )
 
     def predict_hidden(
@@ -138,15 +161,12 @@ class MapEncoder(nn.Module):
         return embedded + self.signal(rows.pack(roads.signal))
 
     def _signal_states(
-        self, roads: MapTokens, sight: MapContext, x: Tensor
+        self, roads: MapTokens, rows: Rows, x: Tensor, index: MapIndex | None
     ) -> tuple[Tensor, SignalStates]:
         """Say what map tokens with a light look like under each class of it."""
-        if sight.index is None:
-            lit = sight.rows.pack(roads.light).nonzero()[:, 0]
-        else:
-            lit = sight.index.lit
+        lit = rows.pack(roads.light).nonzero()[:, 0] if index is None else index.lit
         looks = normed(x[lit, None] + self.signal.weight)  # [lit, class, D]
-        first = torch.zeros_like(sight.rows.at)
+        first = torch.zeros_like(rows.at)
         behind = torch.arange(len(lit), device=x.device) * looks.shape[1]
         first[lit] = len(x) + behind
         return looks.flatten(0, 1), SignalStates(first, roads.light, roads.shown)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Int64
 from torch import Tensor
+from torch.nn.functional import pad
 
 from infgen.model.layers import AttentionSources
 from infgen.model.neighbour_attention import Shared
@@ -22,6 +23,8 @@ class StepMemory:
         roads: Encoded maps, one per scene.
         scene: Map of each rollout [rollout].
         columns: Columns given so far.
+        begun: Column that is the first of each rollout's own [rollout]: 0, but for
+            rollouts that took the place of others.
         pose: Poses of past columns [rollout, row, place, 3].
         visible: Rows visible in them, with the same agent as now [rollout, row, place].
         features: Normed features of them before each block [block, rollout, row, place, D].
@@ -30,6 +33,7 @@ class StepMemory:
     roads: MapFeatures
     scene: Tensor
     columns: int
+    begun: Tensor
     pose: Tensor
     visible: Tensor
     features: Tensor
@@ -43,6 +47,30 @@ class StepMemory:
         """Pose and visibility of every row in the last column."""
         place = (self.columns - 1) % self.window
         return self.pose[:, :, place], self.visible[:, :, place]
+
+    def put(self, rollouts: Int64[Tensor, " replaced"], others: "StepMemory") -> None:
+        """Replace some rollouts by others, whose last columns become the last ones here.
+
+        Args:
+            rollouts: Which.
+            others: As many rollouts, with as many rows and as long a window.
+        """
+        turn = (self.columns - others.columns) % self.window
+        self.scene[rollouts] = others.scene
+        self.begun[rollouts] = self.columns - others.columns
+        self.pose[rollouts] = others.pose.roll(turn, dims=2)
+        self.visible[rollouts] = others.visible.roll(turn, dims=2)
+        self.features[:, rollouts] = others.features.roll(turn, dims=3)
+
+    def with_rows(self, rows: int) -> "StepMemory":
+        """Append free rows, up to so many."""
+        more = rows - self.visible.shape[1]
+        return replace(
+            self,
+            pose=pad(self.pose, (0, 0, 0, 0, 0, more)),
+            visible=pad(self.visible, (0, 0, 0, more)),
+            features=pad(self.features, (0, 0, 0, 0, 0, more)),
+        )
 
 
 @dataclass(frozen=True, slots=True)

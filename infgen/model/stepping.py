@@ -32,8 +32,10 @@ from infgen.model.batching.batch import MapTokens
 from infgen.model.cell_features import CellSources
 from infgen.model.insertion import CellStack, DetailStack
 from infgen.model.layers import AttentionSources, normed
+from infgen.model.map_grid import MapGrid
 from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import (
+    MapFeatures,
     NeighbourSpec,
     cell_pose,
     find_map_neighbours,
@@ -117,14 +119,34 @@ class Stepper:
             scene: Scene of each rollout.
             rows: Places for agents.
         """
+        encoder = self.network.roads
+        return self.begin_on(encoder(roads, encoder.look(roads)), scene, rows)
+
+    @torch.no_grad()
+    def encode_maps(self, roads: MapTokens) -> Tensor:
+        """Return what every map token is [row, D], map after map: what ``begin`` costs."""
+        return self.network.roads.encode(roads, self.network.roads.look(roads))
+
+    @torch.no_grad()
+    def lay_out_maps(self, roads: MapTokens, encoded: Tensor) -> MapFeatures:
+        """Put maps side by side that were encoded before, together or one by one."""
+        rows, grid = Rows.where(roads.real), MapGrid.of(roads.pose, roads.real)
+        return self.network.roads.lay_out(roads, rows, grid, encoded)
+
+    @torch.no_grad()
+    def begin_on(
+        self, maps: MapFeatures, scene: Int64[Tensor, " rollout"], rows: int
+    ) -> StepMemory:
+        """Start with an empty past on encoded maps; arguments are those of ``begin``."""
         settings = self.network.settings
         shape = (len(scene), rows, settings.temporal_window_tokens)
         pose = torch.zeros((*shape, 3), device=scene.device)
         features = pose.new_zeros((settings.motion_blocks, *shape, settings.width))
         return StepMemory(
-            roads=self.network.roads(roads, self.network.roads.look(roads)),
+            roads=maps,
             scene=scene,
             columns=0,
+            begun=torch.zeros_like(scene),
             pose=pose,
             visible=torch.zeros(shape, dtype=torch.bool, device=scene.device),
             features=features,
@@ -361,8 +383,8 @@ class Stepper:
             rows.number,
             visible[:, None] & visible[:, :, None] & others,
         )
-        pose, token = rows.pack(token_step.pose), torch.full_like(rows.at, memory.columns)
-        scene = memory.scene[rows.at // visible.shape[1]]
+        pose, rollout = rows.pack(token_step.pose), rows.at // visible.shape[1]
+        scene, token = memory.scene[rollout], memory.columns - memory.begun[rollout]
         light = self.network.motion.lights_ahead(memory.roads, pose, scene, token)
         roads = find_map_neighbours(
             self._map_reach, rows, token_step.pose, memory.roads, memory.scene, token

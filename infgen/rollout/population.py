@@ -88,6 +88,18 @@ class Population:
             }
         )
 
+    def with_rows(self, rows: int) -> "Population":
+        """Append free rows, up to so many."""
+        more = _empty(len(self.agent_number), rows - self.agent_number.shape[1])
+        return Population(
+            **{
+                f.name: np.concatenate([getattr(self, f.name), getattr(more, f.name)], 1)
+                if getattr(self, f.name).ndim > 1
+                else getattr(self, f.name)
+                for f in fields(self)
+            }
+        )
+
     def take(self, rollouts: Int64[np.ndarray, " kept"]) -> "Population":
         """Take some rollouts."""
         return _take(self, rollouts)

@@ -46,9 +46,12 @@ class Streams:
 
     Attributes:
         key: Key of each stream, its low word first.
+        begun: Token step of the batch that is the first of each rollout's own: 0, but for
+            rollouts that took the place of others.
     """
 
     key: UInt64[np.ndarray, "stream 2"]
+    begun: Int64[np.ndarray, " stream"]
 
     @classmethod
     def of(cls, names: Iterable[tuple[int, str, int]]) -> "Streams":
@@ -57,14 +60,23 @@ class Streams:
             hashlib.sha256(f"{seed}/{scenario_id}/{index}".encode()).digest()[:16]
             for seed, scenario_id, index in names
         )
-        return cls(np.frombuffer(digests, dtype="<u8").reshape(-1, 2))
+        key = np.frombuffer(digests, dtype="<u8").reshape(-1, 2)
+        return cls(key, np.zeros(len(key), dtype=np.int64))
 
     def __len__(self) -> int:
         return len(self.key)
 
     def take(self, places: Int64[np.ndarray, " kept"]) -> "Streams":
         """Keep some of them."""
-        return Streams(self.key[places])
+        return Streams(self.key[places], self.begun[places])
+
+    def put(
+        self, places: Int64[np.ndarray, " replaced"], others: "Streams", token: int
+    ) -> "Streams":
+        """Replace some by others, which begin at a token step of the batch."""
+        key, begun = self.key.copy(), self.begun.copy()
+        key[places], begun[places] = others.key, token
+        return Streams(key, begun)
 
     def uniform(
         self, token: int, purpose: Purpose, count: int, turn: int = 0
@@ -72,7 +84,8 @@ class Streams:
         """Draw numbers in [0, 1): the same for the same arguments, always.
 
         Args:
-            token: Token step that the draw is made in.
+            token: Token step of the batch that the draw is made in. It counts from where
+                each rollout began.
             purpose: What it decides.
             count: How many per stream; a longer draw starts with the shorter one.
             turn: Which draw of that purpose in this token step (the n-th inserted agent).
@@ -80,7 +93,7 @@ class Streams:
         blocks = -(-count // WORDS)
         # The lowest word counts within a draw, from 1 on; the others name the draw.
         block = np.arange(1, blocks + 1, dtype=np.uint64)
-        words = _philox((block, turn, token, int(purpose)), self.key)
+        words = _philox((block, turn, int(purpose)), token - self.begun, self.key)
         return _numbers(words.reshape(len(self), -1)[:, :count])
 
     def uniform_block(
@@ -91,7 +104,7 @@ class Streams:
         They are ``uniform(...)[:, WORDS * block : WORDS * (block + 1)]`` of each purpose.
         """
         kinds = np.array(purposes, dtype=np.uint64)
-        words = _philox((1 + block, turn, token, kinds), self.key)
+        words = _philox((1 + block, turn, kinds), token - self.begun, self.key)
         return np.moveaxis(_numbers(words), 1, 0)
 
 
@@ -102,18 +115,21 @@ def _numbers(words: UInt64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape
 
 def _philox(
     counter: tuple[int | UInt64[np.ndarray, " draw"], ...],
+    token: Int64[np.ndarray, " stream"],
     key: UInt64[np.ndarray, "stream 2"],
 ) -> UInt64[np.ndarray, "stream draw 4"]:
     """Evaluate the generator for every key and every value of the counter.
 
     Args:
-        counter: Its four words, lowest first: numbers, or one for every draw.
+        counter: Its words but the third, lowest first: numbers, or one for every draw.
+        token: Its third word, of every stream.
         key: Keys, their low words first.
     """
     draws = np.broadcast_shapes(*(np.shape(word) for word in counter), (1,))
     multiplied = np.empty((2, len(key), *draws), dtype=np.uint64)  # First and third word.
     others = np.empty_like(multiplied)
-    multiplied[0], others[0], multiplied[1], others[1] = counter
+    multiplied[0], others[0], others[1] = counter
+    multiplied[1] = token.astype(np.uint64)[:, None]
     keys = key.T[..., None]
     for _ in range(ROUNDS):
         top, bottom = _multiply(multiplied)

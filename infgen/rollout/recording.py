@@ -77,10 +77,13 @@ class RolloutStart:
 def number_maps(
     starts: Sequence[RolloutStart],
 ) -> tuple[list[RolloutStart], Int64[np.ndarray, " rollout"]]:
-    """Return one start per map, and the map of each rollout."""
-    maps = {start.scene.scenario_id: start for start in starts}
-    number = {name: at for at, name in enumerate(maps)}
-    scene = [number[start.scene.scenario_id] for start in starts]
+    """Return one start per map, and the map of each rollout.
+
+    Scenes are told apart by themselves: a user may have changed one and kept its id.
+    """
+    maps = {id(start.scene): start for start in starts}
+    number = {scene: at for at, scene in enumerate(maps)}
+    scene = [number[id(start.scene)] for start in starts]
     return list(maps.values()), np.array(scene, dtype=np.int64)
 
 

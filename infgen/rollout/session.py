@@ -10,24 +10,21 @@ The order within a token step is that of SPEC 12.2: every agent moves, removed a
 marked, and agents are inserted one by one until the network samples BEGIN MOTION.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 
 from infgen.clock import CLOCK
 from infgen.geometry import wrap_angle
-from infgen.model.batching.batch import MapTokens, collate_maps, to_device
-from infgen.model.signal_features import StopLines
-from infgen.model.step_memory import StepMemory
 from infgen.model.token_step import MotionStep
+from infgen.rollout.begun_step import BegunStep, logged_step
 from infgen.rollout.device.insertion import DeviceInsertion
 from infgen.rollout.insertion import insert_agents
-from infgen.rollout.insertion_mask import make_insertion_mask
 from infgen.rollout.insertion_state import InsertionRequest
+from infgen.rollout.maps import RolloutMaps
 from infgen.rollout.motion_sampler import Choices, MotionSampler
 from infgen.rollout.population import (
     EGO_ROW,
@@ -37,10 +34,8 @@ from infgen.rollout.population import (
     remove_beyond,
 )
 from infgen.rollout.random_streams import Streams
-from infgen.rollout.recording import NOBODY, Frame, RolloutStart, number_maps
+from infgen.rollout.recording import NOBODY, Frame, RolloutStart
 from infgen.rollout.rules.density import DensityControl
-from infgen.rollout.rules.rejection import make_motion_check
-from infgen.rollout.rules.stalls import StallRule
 from infgen.rollout.simulator import Simulator
 from infgen.tokens.motion_tokens import follow, make_match_table
 from infgen.tokens.scene_tokens import Presence
@@ -59,26 +54,36 @@ class Session:
 
     @torch.inference_mode()
     def __init__(
-        self, simulator: Simulator, starts: RolloutStart | Sequence[RolloutStart]
+        self,
+        simulator: Simulator,
+        starts: RolloutStart | Sequence[RolloutStart],
+        maps: RolloutMaps | None = None,
     ) -> None:
         """Feed the history to the network.
 
         Args:
             simulator: Network and settings.
             starts: Scenes to continue; several rollouts of one scene share its map.
+            maps: Their maps, if they are encoded already.
         """
         starts = [starts] if isinstance(starts, RolloutStart) else list(starts)
-        self._simulator = simulator
+        self._simulator, self._starts = simulator, starts
         self._streams = Streams.of(
             (start.seed, start.scene.scenario_id, start.index) for start in starts
         )
         history = place_logged_agents(starts, simulator.settings.max_agents)
-        roads = _collate_maps(starts)
-        self._memory, self._asking = _start(
-            simulator, roads, starts, self._streams, history[0]
+        self._maps = RolloutMaps(simulator, starts) if maps is None else maps
+        scene, rows = self._maps.number(starts), history[0].agent_number.shape[1]
+        self._memory = simulator.stepper.begin_on(
+            self._maps.features, simulator.tensor(scene), rows
         )
-        on_host = simulator.device.type == "cpu" or not simulator.inserts
-        self._device = None if on_host else DeviceInsertion(self._asking)
+        self._asking = InsertionRequest(
+            simulator,
+            self._streams,
+            self._maps.insertion_mask(scene),
+            np.maximum(simulator.settings.max_agents, history[0].num_agents),
+        )
+        self._device = _make_device_insertion(self._asking)
         self._density = _make_density_control(simulator, starts, history[-1])
         for population in history[:-1]:
             self._ask_motion(population)
@@ -88,12 +93,8 @@ class Session:
         self._sampler = MotionSampler(
             simulator,
             self._streams,
-            make_motion_check(
-                starts,
-                simulator.vocabulary,
-                reject_off_road=simulator.settings.reject_off_road,
-            ),
-            _make_stall_rule(simulator, roads, starts),
+            self._maps.motion_check(scene),
+            self._maps.stall_rule(scene),
             simulator.tensor(simulator.vocabulary.stationary),
         )
         self._driven_to: np.ndarray | None = None
@@ -116,23 +117,136 @@ class Session:
                 poses most closely; each corrects the error of the one before. None lets
                 the network drive the ego.
         """
-        simulator, token = self._simulator, self.token + 1
         path = None if ego_pose is None else self._ego_path(ego_pose)
-        before = self._drive_ego(path)
+        return self._end(self._begin(self._drive_ego(path), path), path)
+
+    @torch.inference_mode()
+    def begin_step(self) -> BegunStep:
+        """Let all agents choose what they do in the next token step.
+
+        Whoever drives the egos need not know yet where to: others do not see it before the
+        step has ended. The egos are driven by the network here.
+        """
+        return self._begin(self.population, None)
+
+    @torch.inference_mode()
+    def end_step(
+        self, begun: BegunStep, ego_pose: Float32[np.ndarray, "rollout 5 3"]
+    ) -> Frame:
+        """End a token step that has begun, the egos driven along given poses.
+
+        Args:
+            begun: The token step.
+            ego_pose: Poses of the egos at its five steps.
+        """
+        path = self._ego_path(ego_pose)
+        return self._end(self._follow(begun, path), path)
+
+    @torch.inference_mode()
+    def replace(
+        self,
+        begun: BegunStep,
+        rollouts: Sequence[int],
+        starts: Sequence[RolloutStart],
+        most_maps: int = 0,
+    ) -> BegunStep:
+        """Let other rollouts take the place of some, in a token step that has begun.
+
+        The token step is the last one of their histories: until it ends, their agents go
+        as they were logged. After it they are as in a session of their own.
+
+        Args:
+            begun: The token step.
+            rollouts: Places in the batch.
+            starts: What is continued there.
+            most_maps: Maps to keep encoded, beyond those that some rollout is on.
+
+        Raises:
+            ValueError: if a history is of one token step only.
+        """
+        at = np.array(rollouts, dtype=np.int64)
+        everyone = list(self._starts)
+        for place, start in zip(rollouts, starts, strict=True):
+            everyone[place] = start
+        self._maps.hold(everyone, most_maps)
+        others = Session(self._simulator, starts, self._maps)
+        rows = max(self.num_rows, others.num_rows)
+        self._append_rows(rows)
+        others._append_rows(rows)
+        self._memory.put(self._simulator.tensor(at), others._memory)
+        first = self.token + 1 - others.token
+        self._streams = self._streams.put(at, others._streams, first)
+        most = self._asking.most.copy()
+        most[at] = others._asking.most
+        if self._density is not None and others._density is not None:
+            self._density = self._density.put(at, others._density)
+        self._starts = everyone
+        self._go_to_maps(at, most)
+        return begun.with_rows(rows).put(at, logged_step(starts, rows))
+
+    @property
+    def own_token(self) -> Int64[np.ndarray, " rollout"]:
+        """Index of the last token step in the count of each rollout itself."""
+        return self.token - self._streams.begun
+
+    @property
+    def num_rows(self) -> int:
+        """Rows of each rollout."""
+        return int(self.population.agent_number.shape[1])
+
+    def _append_rows(self, rows: int) -> None:
+        if rows > self.num_rows:
+            self.population = self.population.with_rows(rows)
+            self._memory = self._memory.with_rows(rows)
+
+    def _go_to_maps(self, replaced: np.ndarray, most: np.ndarray) -> None:
+        """Let all that knows a map know the map of each rollout."""
+        maps, scene = self._maps, self._maps.number(self._starts)
+        self._memory.roads = maps.features
+        self._memory.scene = self._simulator.tensor(scene)
+        self._asking = InsertionRequest(
+            self._simulator, self._streams, maps.insertion_mask(scene), most
+        )
+        self._device = _make_device_insertion(self._asking)
+        if self._density is not None:
+            self._density = maps.density(self._density, scene)
+        stall_rule = maps.stall_rule(scene)
+        if stall_rule is not None and self._sampler.stall_rule is not None:
+            stall_rule.go_on_from(self._sampler.stall_rule, replaced, self._streams.begun)
+        self._sampler = replace(
+            self._sampler,
+            streams=self._streams,
+            check=maps.motion_check(scene),
+            stall_rule=stall_rule,
+        )
+
+    def _begin(self, before: Population, path: np.ndarray | None) -> BegunStep:
+        """Let all agents move, egos along their paths if these are known."""
         said = self._ask_motion(before)
-        choices = self._sampler.sample(before, said, token)
+        choices = self._sampler.sample(before, said, self.token + 1)
         moved, paths = self._move(before, choices, said, path)
-        after = moved
-        if simulator.inserts:
+        shown = self._observed_steps(before, moved, choices)
+        nobody = np.zeros(len(self._streams), dtype=bool)
+        return BegunStep(before, moved, paths, shown, nobody)
+
+    def _end(self, begun: BegunStep, path: np.ndarray | None) -> Frame:
+        """Insert agents, and go on to the end of the token step."""
+        after = moved = begun.moved
+        token = self.token + 1
+        if self._simulator.inserts:
+            asking = self._query_network(moved)
+            if begun.is_history.any():
+                most = np.where(begun.is_history, 0, asking.most)
+                asking = replace(asking, most=most)
             insert = insert_agents if self._device is None else self._device.insert
-            after = insert(self._query_network(moved), self._memory, moved, token)
+            after = insert(asking, self._memory, moved, token)
         self.population, self.token = after, token
         self._driven_to = None if path is None else path[:, -1]
         return Frame(
             token=token,
             agent_number=moved.agent_number,
-            path=paths,
-            shown=self._observed_steps(before, moved, choices),
+            path=begun.path,
+            shown=begun.shown,
             removed=moved.presence == Presence.REMOVED,
             inserted_number=np.where(
                 after.agent_number != moved.agent_number,
@@ -142,6 +256,17 @@ class Session:
             agent_type=after.agent_type,
             size_lwh_m=after.size_lwh_m,
         )
+
+    def _follow(self, begun: BegunStep, path: np.ndarray) -> BegunStep:
+        """Replace the motion tokens of the egos by those that follow their paths."""
+        before, moved, paths = begun.before, begun.moved, begun.path.copy()
+        motion_token, pose = moved.motion_token.copy(), moved.pose.copy()
+        motion_token[:, EGO_ROW], pose[:, EGO_ROW] = follow(
+            path[:, -1], before.pose[:, EGO_ROW], before.agent_type[:, EGO_ROW], self._table
+        )
+        paths[:, EGO_ROW] = path
+        moved = replace(moved, motion_token=motion_token, pose=pose)
+        return replace(begun, moved=moved, path=paths)
 
     def _ask_motion(self, population: Population) -> MotionStep:
         """Show the network all agents; return what follows."""
@@ -237,26 +362,11 @@ class Session:
         return shown
 
 
-def _collate_maps(starts: Sequence[RolloutStart]) -> MapTokens:
-    """Collate the maps of the rollouts; each map once."""
-    maps, _ = number_maps(starts)
-    histories = [start.history for start in maps]
-    return collate_maps(
-        histories,
-        max(history.num_map_tokens for history in histories),
-        [start.lights for start in maps],
-    )
-
-
-def _make_stall_rule(
-    simulator: Simulator, roads: MapTokens, starts: Sequence[RolloutStart]
-) -> StallRule | None:
-    """Return the stall rule, or None if it is off."""
-    tokens = math.ceil(simulator.settings.max_stall_s / CLOCK.token_s)
-    if not tokens:
-        return None
-    maps, scene = number_maps(starts)
-    return StallRule([one.scene for one in maps], scene, StopLines.of(roads), tokens)
+def _make_device_insertion(request: InsertionRequest) -> DeviceInsertion | None:
+    """Return what inserts agents on a device, or None where the host does or nobody."""
+    simulator = request.simulator
+    on_host = simulator.device.type == "cpu" or not simulator.inserts
+    return None if on_host else DeviceInsertion(request)
 
 
 def _make_density_control(
@@ -266,30 +376,3 @@ def _make_density_control(
     if not (simulator.inserts and simulator.settings.density_control):
         return None
     return DensityControl.of(starts, now, simulator.grid.radius_m)
-
-
-def _start(
-    simulator: Simulator,
-    roads: MapTokens,
-    starts: Sequence[RolloutStart],
-    streams: Streams,
-    first: Population,
-) -> tuple[StepMemory, InsertionRequest]:
-    """Encode every map once, however many rollouts of it there are."""
-    maps, scene = number_maps(starts)
-    histories = [start.history for start in maps]
-    # The stall rule, which runs on the host, keeps the maps that are given.
-    here = to_device(roads, simulator.device)
-    memory = simulator.stepper.begin(
-        here, simulator.tensor(scene), first.agent_number.shape[1]
-    )
-    settings, insertion_mask = simulator.settings, None
-    if settings.insertion_mask:
-        insertion_mask = make_insertion_mask(
-            histories,
-            (simulator.vocabulary, simulator.roads),
-            scene,
-            settings.insertion_lane_distance_m,
-        )
-    most = np.maximum(settings.max_agents, first.num_agents)
-    return memory, InsertionRequest(simulator, streams, insertion_mask, most)

@@ -60,6 +60,7 @@ class _Running:
     turn: Int64[Tensor, " rollout"]
     attempt: Int64[Tensor, " rollout"]
     tried: Bool[Tensor, "rollout cell"]
+    most: Int64[Tensor, " rollout"]
     num_agents: Int64[Tensor, " rollout"]
     num_others: Int64[Tensor, " rollout"]
     soon: Float32[Tensor, "rollout row 3"] | None
@@ -93,8 +94,7 @@ class DeviceInsertion:
         self._turns, self._attempts = simulator.settings.max_insertions, request.attempts
         self._grid = DeviceGrid(simulator.grid, device)
         self._mask = None if mask is None else DeviceMask(mask, device)
-        self._streams = DeviceStreams(request.streams.key, device)
-        self._most = torch.from_numpy(request.most).to(device)
+        self._streams = DeviceStreams(request.streams, device)
         shape = (self._turns, len(TURN_PURPOSES), -(-self._attempts // WORDS))
         turn, kind, block = np.indices(shape).reshape(3, -1)
         purpose = np.array(TURN_PURPOSES, dtype=np.int64)[kind]
@@ -112,7 +112,7 @@ class DeviceInsertion:
             return population
         simulator = self._simulator
         wanted = None if request.wanted is None else simulator.tensor(request.wanted)
-        running = self._begin(memory, population, token)
+        running = self._begin(memory, population, token, request.most)
         active = np.arange(len(running.going))
         for _ in range(self._turns * self._attempts):
             asked = running.entries.rollout
@@ -126,7 +126,9 @@ class DeviceInsertion:
                 running.entries = running.entries.take(simulator.tensor(kept))
         return _inserted(population, log[:, : self._turns])
 
-    def _begin(self, memory: StepMemory, population: Population, token: int) -> _Running:
+    def _begin(
+        self, memory: StepMemory, population: Population, token: int, most: np.ndarray
+    ) -> _Running:
         """Show all agents to the network, and draw the numbers of the token step."""
         simulator, grid = self._simulator, self._grid.grid
         token_step = simulator.token_step(population)
@@ -148,6 +150,7 @@ class DeviceInsertion:
             tried=torch.zeros(
                 (len(zero), grid.num_cells), dtype=torch.bool, device=zero.device
             ),
+            most=simulator.tensor(most),
             num_agents=there.sum(dim=1),
             num_others=near[:, EGO + 1 :].sum(dim=1),
             soon=None if self._mask is None else self._mask.soon(token_step),
@@ -171,7 +174,7 @@ class DeviceInsertion:
         uniform = numbers[:, TURN_PURPOSES.index(Purpose.ADD)]
         add = sample_event(query.add_logit, uniform, self._add_bias(running, wanted))
         going = running.going[asked] & (add | (attempt > 0))
-        going &= running.num_agents[asked] < self._most[asked]
+        going &= running.num_agents[asked] < running.most[asked]
         proposal = self._propose(running, query, numbers)
         placed = going
         if self._mask is not None and running.soon is not None:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from infgen.rollout.random_streams import KEY_STEPS, MULTIPLIERS, ROUNDS, WORDS
+from infgen.rollout.random_streams import KEY_STEPS, MULTIPLIERS, ROUNDS, Streams
 
 _LOW, _HALF = 0xFFFFFFFF, 32
 _UNUSED_BITS, _USED = 11, (1 << 53) - 1
@@ -21,9 +21,10 @@ class DeviceStreams:
     Holds what does not change between draws: keys and multipliers of all rounds.
     """
 
-    def __init__(self, key: np.ndarray, device: torch.device) -> None:
-        """Bring the keys [stream, 2] of ``Streams`` to a device."""
-        signed = key.view(np.int64).T[:, :, None]  # [word, stream, 1]
+    def __init__(self, streams: Streams, device: torch.device) -> None:
+        """Bring random streams to a device."""
+        self._begun = torch.from_numpy(streams.begun).to(device)
+        signed = streams.key.view(np.int64).T[:, :, None]  # [word, stream, 1]
         steps, by = KEY_STEPS.view(np.int64), MULTIPLIERS.view(np.int64)
         keys = np.stack([signed + turn * steps for turn in range(ROUNDS)])
         halves = np.stack([by & _LOW, by >> _HALF & _LOW], axis=-1)[..., None, :]
@@ -44,10 +45,10 @@ class DeviceStreams:
         purpose: Int64[Tensor, " draw"],
     ) -> Float64[Tensor, "stream draw 4"]:
         """Draw the four numbers of each block, counted from 0, of each stream."""
-        streams = self._rounds[0][0].shape[1]
-        counter = torch.stack([block + 1, turn, torch.full_like(turn, token), purpose])
-        counter = counter[:, None].expand(WORDS, streams, -1)
-        multiplied, others = counter[0::2].contiguous(), counter[1::2]
+        draws = len(self._begun), len(block)
+        own = (token - self._begun)[:, None].expand(draws)
+        multiplied = torch.stack([(block + 1).expand(draws), own])
+        others = torch.stack([turn, purpose])[:, None].expand(2, *draws)
         for keys, by, halves in self._rounds:
             top, bottom = _multiply(multiplied, by, halves)
             multiplied, others = top ^ others.flip(0) ^ keys, bottom

@@ -5,7 +5,7 @@ target falls with the length of lanes in reach: the agents would crowd on what i
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
@@ -51,6 +51,14 @@ class DensityControl:
         lanes_m = _around_m(segments, scene, ego_m, radius_m)
         at_now = population.count_others(radius_m)
         return cls(at_now, lanes_m, segments, scene, radius_m)
+
+    def put(
+        self, rollouts: Int64[np.ndarray, " replaced"], others: "DensityControl"
+    ) -> "DensityControl":
+        """Replace the numbers of some rollouts by those of others."""
+        at_now, lanes_m = self.at_now.copy(), self.lanes_m.copy()
+        at_now[rollouts], lanes_m[rollouts] = others.at_now, others.lanes_m
+        return replace(self, at_now=at_now, lanes_m=lanes_m)
 
     def wanted(
         self, ego_m: Float32[np.ndarray, "rollout 2"]

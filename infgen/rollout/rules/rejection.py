@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float32, Int64
 
 from infgen.clock import CLOCK
 from infgen.rollout.population import Population
-from infgen.rollout.recording import RolloutStart, number_maps
 from infgen.rollout.rules.collision import COMPARED_STEPS, find_collisions, repeat
 from infgen.rollout.rules.off_road import RoadEdgeTiles, find_off_road
 from infgen.tokens.scene_tokens import Presence
@@ -128,14 +127,3 @@ class MotionCheck:
 @lru_cache(maxsize=8)
 def _lengths_m(vocabulary: MotionVocabulary) -> Float32[np.ndarray, "3 motion_token"]:
     return np.linalg.norm(vocabulary.end_pose[..., :2], axis=-1)
-
-
-def make_motion_check(
-    starts: Sequence[RolloutStart], vocabulary: MotionVocabulary, *, reject_off_road: bool
-) -> MotionCheck:
-    """Make the motion check of some rollouts; those of one scene share its map."""
-    maps, scene = number_maps(starts)
-    road_edge_tiles = (
-        [RoadEdgeTiles(start.scene) for start in maps] if reject_off_road else []
-    )
-    return MotionCheck(vocabulary, road_edge_tiles, scene)

@@ -6,6 +6,7 @@ parked and hardly lets it set off again. In a rollout one such vehicle blocks al
 
 import math
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 import torch
@@ -48,12 +49,41 @@ class StallRule:
             lines: Stop lines of those maps.
             tokens: Token steps after which a vehicle has stalled.
         """
-        self._scene, self._lines, self._tokens = scene, lines, tokens
+        self._lines, self._tokens = lines, tokens
         self._lanes = [lane_segments(one) for one in maps]
+        self._start(scene)
+
+    def without_history(self, scene: Int64[np.ndarray, " rollout"]) -> "StallRule":
+        """Return the same rule for other rollouts on the same maps."""
+        other = copy(self)
+        other._start(scene)
+        return other
+
+    def _start(self, scene: Int64[np.ndarray, " rollout"]) -> None:
+        self._scene = scene
         self._agent_number = np.zeros((len(scene), 0), dtype=np.int32)
         self._from_m = np.zeros((*self._agent_number.shape, 2), dtype=np.float32)
         self._since = np.zeros(self._agent_number.shape, dtype=np.int64)
         self._in_lane = np.zeros(self._agent_number.shape, dtype=bool)
+        self._begun = np.zeros(len(scene), dtype=np.int64)
+
+    def go_on_from(
+        self,
+        other: "StallRule",
+        replaced: Int64[np.ndarray, " replaced"],
+        begun: Int64[np.ndarray, " rollout"],
+    ) -> None:
+        """Take over what another rule knows of agents, but for replaced rollouts.
+
+        Args:
+            other: Of the same batch on other maps.
+            replaced: Rollouts that took the place of others.
+            begun: Token step of the batch that is the first of each rollout's own.
+        """
+        self._agent_number = other._agent_number.copy()
+        self._agent_number[replaced] = NOBODY
+        self._from_m, self._since = other._from_m, other._since
+        self._in_lane, self._begun = other._in_lane, begun
 
     def stalled(self, everyone: Population, token: int) -> Bool[np.ndarray, "rollout row"]:
         """Tell which vehicles have stalled in a lane; call it at every token step.
@@ -81,11 +111,13 @@ class StallRule:
     def _remember(self, everyone: Population, token: int) -> None:
         """Update since when each agent stands; rows with a new agent start anew."""
         xy_m = everyone.pose[..., :2]
-        if self._agent_number.shape != everyone.agent_number.shape:
-            self._agent_number = np.full_like(everyone.agent_number, NOBODY)
-            self._from_m = np.zeros_like(xy_m)
-            self._since = np.zeros(everyone.agent_number.shape, dtype=np.int64)
-            self._in_lane = np.zeros(everyone.agent_number.shape, dtype=bool)
+        more = everyone.agent_number.shape[1] - self._agent_number.shape[1]
+        if more:
+            rows = ((0, 0), (0, more))
+            self._agent_number = np.pad(self._agent_number, rows, constant_values=NOBODY)
+            self._from_m = np.pad(self._from_m, (*rows, (0, 0)))
+            self._since = np.pad(self._since, rows)
+            self._in_lane = np.pad(self._in_lane, rows)
         stays = (everyone.agent_number == self._agent_number) & (
             everyone.agent_number != NOBODY
         )
@@ -124,7 +156,7 @@ class StallRule:
         shown = self._lines.shown_ahead(
             torch.from_numpy(pose).to(device),
             scene,
-            torch.full_like(scene, token),
+            torch.from_numpy(token - self._begun[rollout]).to(device),
             WAITS_M,
         )
         return shown[:, list(RED)].any(dim=1).cpu().numpy()

@@ -18,7 +18,7 @@ from infgen.rollout.random_streams import Purpose, Streams
 def test_blocks_are_those_of_the_host(seed, token, turn, block):
     streams = Streams.of([(seed, "abc", index) for index in range(3)])
     purposes = (Purpose.ADD, Purpose.HEADING)
-    device = DeviceStreams(streams.key, torch.device("cpu"))
+    device = DeviceStreams(streams, torch.device("cpu"))
 
     ours = device.uniform(
         torch.full((2,), block), torch.full((2,), turn), token, torch.tensor(purposes)

@@ -1,0 +1,24 @@
+"""Network and scenes of an environment that is given none: those of the package."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from importlib import import_module
+from typing import cast
+
+from infgen.rollout.simulator import Simulator
+from infgen.scene import Scene
+
+_PACKAGED = "pipeline.stages.packaged"
+"""Knows how weights and records lie on disk, as ``infgen`` does not; imported when used."""
+
+
+@lru_cache(maxsize=1)
+def packaged_simulator() -> Simulator:
+    """Return the weights that come with the package, loaded once per process."""
+    return cast(Simulator, import_module(_PACKAGED).packaged_simulator())
+
+
+@lru_cache(maxsize=1)
+def packaged_scenes() -> Sequence[Scene]:
+    """Return the training scenes that come with the package, read once per process."""
+    return cast(Sequence[Scene], import_module(_PACKAGED).packaged_scenes())
