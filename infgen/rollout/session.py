@@ -144,8 +144,8 @@ class Session:
         """Replace the poses of the egos at the end of the last token step.
 
         For callers that ask for a token step before the ego has driven it: the network has
-        not seen its end yet, and will see the egos exactly here, with the motion tokens that
-        come closest. Motion and insertions of that token step stay as they are.
+        not seen its end yet, and will see the egos exactly here, with the motion tokens
+        that come closest. Motion and insertions of that token step stay as they are.
 
         Args:
             ego_pose: Where the egos are: x, y, heading in the frame of the scene.

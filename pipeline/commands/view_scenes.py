@@ -49,7 +49,7 @@ def find_in_root(root: Root, prefix: str, rollouts: Sequence[int] | None) -> See
                 "some, and makes what is missing before (-n: only says what)"
             )
         return Seen(_find_log(root, prefix), ())
-    units = _units_of_scenes(played, "unit")
+    units = units_of_scenes(played, "unit")
     if not units or (rollouts is None and prefix and not _matching(units, prefix)):
         return Seen(_find_log(root, prefix), ())
     scenario_id = choose(units, prefix, f"the rollouts below {root.path}")
@@ -65,7 +65,7 @@ def find_in_records(patterns: Sequence[str], prefix: str) -> Scene:
     """
     passed: list[str] = []
     bad: list[str] = []
-    for scenario_id, data in _records(find_urls(patterns), bad):
+    for scenario_id, data in readable_records(find_urls(patterns), bad):
         if scenario_id.startswith(prefix):
             return decode_scene(data)
         passed.append(scenario_id)
@@ -106,7 +106,7 @@ def _some(ids: Sequence[str]) -> str:
     return ", ".join(ids[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _records(urls: Sequence[str], bad: list[str]) -> Iterator[tuple[str, bytes]]:
+def readable_records(urls: Sequence[str], bad: list[str]) -> Iterator[tuple[str, bytes]]:
     """Ids and bytes of all records that can be read so far as to have one.
 
     Why others cannot is added to ``bad``.
@@ -123,7 +123,7 @@ def _records(urls: Sequence[str], bad: list[str]) -> Iterator[tuple[str, bytes]]
             yield scenario_id, record.data
 
 
-def _units_of_scenes(stage: Path, column: str) -> dict[str, str]:
+def units_of_scenes(stage: Path, column: str) -> dict[str, str]:
     """Name of the unit that holds each scene of a made stage, in order."""
     import polars as pl  # noqa: PLC0415
 
@@ -148,7 +148,7 @@ def _find_log(root: Root, prefix: str) -> Scene:
             f"{root.path} holds no scenes; `infgen demo` makes some, "
             "`infgen view RECORDS.tfrecord` shows a log without a root"
         )
-    units = _units_of_scenes(made, "source")
+    units = units_of_scenes(made, "source")
     scenario_id = choose(units, prefix, str(root.path))
     folder = _unit_folder(root, "ingest", made, units[scenario_id])
     return open_scene_lookup([str(folder)]).find(scenario_id)

@@ -15,28 +15,15 @@ from typing import TYPE_CHECKING, Any
 from infgen.config import RolloutSettings
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage, Unit
 from pipeline.stages.calibration import Biases, read_found
+from pipeline.stages.recorded import collect_recorded, find_recorded, plan_recorded
 from pipeline.stages.simulation import begin, load_simulator, read_some, simulate_all
-from pipeline.storage.parquet import Fields, make_table, read_tables
-from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
+from pipeline.storage.parquet import make_table, read_tables
+from pipeline.storage.rollouts import INDEX, ROLLOUTS_SCHEMA, index_row
 from pipeline.storage.splits import files_of_split, spread_evenly
 
 if TYPE_CHECKING:
     from infgen.rollout.recording import RolloutStart
-    from infgen.rollout.rollout import Rollout
     from infgen.rollout.simulator import Simulator
-
-INDEX: Fields = {
-    "scenario_id": str,
-    "rollout": int,
-    "unit": str,
-    "group": int,
-    "row": int,
-    "agents": int,
-    "inserted": int,
-    "left": int,
-    "steps": int,
-}
-
 
 OF_ENTRIES = (
     "add_bias",
@@ -54,8 +41,10 @@ OF_EXITS = ("remove_bias", "removal_radius_m")
 
 
 def normalize(sections: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Reset settings of insertion and removal where these are off."""
+    """Reset settings of insertion and removal where these are off; all for recordings."""
     settings: RolloutSettings = sections["rollout"]
+    if settings.recordings:
+        return {"rollout": RolloutSettings(recordings=settings.recordings)}
     idle = (() if settings.inserts else OF_ENTRIES) + (() if settings.removes else OF_EXITS)
     usual = RolloutSettings()
     return {"rollout": replace(settings, **{name: getattr(usual, name) for name in idle})}
@@ -65,8 +54,10 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
     """Cut each shard, or a part of it, into units of about equally many scenes.
 
     Raises:
-        PlanError: if there is no scene of the split.
+        PlanError: if there is no scene of the split, or recordings are of other records.
     """
+    if settings.recordings:
+        return plan_recorded(inputs)
     weights = inputs.folder("train")
     identity = inputs.content("train", "model.safetensors", "model.json")
     found = read_found(inputs.folder("calibrate"))
@@ -107,6 +98,8 @@ def simulate(
     from infgen.rollout.rollout import Rollout  # noqa: PLC0415
     from pipeline.storage.zarr_store import write_records  # noqa: PLC0415
 
+    if settings.recordings:
+        return collect_recorded(unit, target, progress)
     biases = Biases(**unit.task["biases"])
     settings = biases.over(settings)
     folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
@@ -121,7 +114,7 @@ def simulate(
     for group, rollouts in enumerate(simulate_all(simulator, starts, weights, tell)):
         path = target / f"rollouts-{group:03d}.zarr"
         write_records(path, rollouts, Rollout, ROLLOUTS_SCHEMA, compress=True)
-        rows += [_row(unit.name, group, at, done) for at, done in enumerate(rollouts)]
+        rows += [index_row(unit.name, group, at, done) for at, done in enumerate(rollouts)]
     make_table(rows, INDEX).write_parquet(target / "index.parquet")
     pace = {"rollouts_per_s": round(_rate(len(rows), begun), 4)}
     told = {"add_bias": settings.add_bias, "remove_bias": settings.remove_bias}
@@ -175,20 +168,6 @@ def _starts(unit: Unit, simulator: "Simulator") -> "tuple[list[RolloutStart], li
     return starts, refused
 
 
-def _row(unit: str, group: int, at: int, rollout: "Rollout") -> dict[str, Any]:
-    return {
-        "scenario_id": rollout.scenario_id,
-        "rollout": rollout.index,
-        "unit": unit,
-        "group": group,
-        "row": at,
-        "agents": len(rollout.id),
-        "inserted": int((~rollout.logged).sum()),
-        "left": int((rollout.exit_step >= 0).sum()),
-        "steps": rollout.num_steps,
-    }
-
-
 def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
     totals = {
         name: sum(row[name] for row in rows) for name in ("agents", "inserted", "left")
@@ -203,9 +182,11 @@ STAGE = Stage(
     plan=plan,
     work=simulate,
     finish=finish,
+    reads=find_recorded,
     normalize=normalize,
     modules=(
         "pipeline.stages.calibration",
+        "pipeline.stages.recorded",
         "pipeline.stages.simulation",
         "pipeline.stages.rollout",
     ),
