@@ -95,7 +95,10 @@ class ExportOptions:
     root: RootFolder = WORK
     records: Annotated[
         str | None,
-        typer.Option(help="Their logs: TFRecords, or an ingested folder; default: root's."),
+        typer.Option(
+            help="Their logs: TFRecords, or an ingested folder; default: a saved drive's "
+            "own, or the root's."
+        ),
     ] = None
     about: Annotated[
         Path | None, typer.Option(help="YAML file that describes the submission (wosac).")
@@ -107,14 +110,17 @@ class ExportOptions:
         from pipeline.commands.export import export  # noqa: PLC0415
         from pipeline.commands.export_job import Order  # noqa: PLC0415
         from pipeline.commands.export_wosac import read_description  # noqa: PLC0415
+        from pipeline.storage.recordings import SCENE, is_recording  # noqa: PLC0415
         from pipeline.storage.scene_lookup import open_scene_lookup  # noqa: PLC0415
 
         root = find_root(self.root)
-        logs = split_names(self.records) if self.records else [str(root.latest / "ingest")]
+        rollouts = self.rollouts or root.latest / "rollout"
+        own = rollouts / SCENE if is_recording(rollouts) else root.latest / "ingest"
+        logs = split_names(self.records) if self.records else [str(own)]
         about = read_description(self.about, root) if self.about else None
         order = Order(
             to=self.to,
-            rollouts=self.rollouts or root.latest / "rollout",
+            rollouts=rollouts,
             logs=open_scene_lookup(logs),
             out=self.out,
             about=about,
@@ -130,7 +136,8 @@ class ViewOptions:
     source: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[ROOT | RECORDS...]", help="A root, or TFRecords to see a log of."
+            metavar="[ROOT | RECORDS...]",
+            help="A root, TFRecords to see a log of, or a saved drive.",
         ),
     ] = None
     root: RootFolder = WORK
@@ -156,15 +163,19 @@ class ViewOptions:
     def write(self, tell: Callable[[Event], None]) -> "Shown":
         """Write it, with progress events."""
         from pipeline.commands.view import Wanted, check_records, is_root, view  # noqa: PLC0415
+        from pipeline.storage.recordings import is_recording  # noqa: PLC0415
 
         words = [part for word in self.source or () for part in split_names(word)]
-        root = Path(words[0]) if len(words) == 1 and is_root(Path(words[0])) else None
-        for word in () if root else words:
+        only = Path(words[0]) if len(words) == 1 else None
+        root = only if only and is_root(only) else None
+        recording = only if only and is_recording(only) else None
+        for word in () if root or recording else words:
             check_records(word)
         width_px, height_px = _size(self.size)
         wanted = Wanted(
             root=find_root(root or self.root),
-            records=() if root else tuple(words),
+            records=() if root or recording else tuple(words),
+            recording=recording,
             scene=self.scene,
             rollouts=_indices(self.rollouts),
             log=self.log,

@@ -39,6 +39,7 @@ class Wanted:
     Attributes:
         root: Of the experiment.
         records: TFRecords to show a log of, without any root; empty for the root's.
+        recording: Folder of a recorded drive to show, without any root.
         scene: Start of the scene's id; empty for the first there is.
         rollouts: Indices; None for the first few.
         log: Whether the log is shown beside them.
@@ -55,6 +56,7 @@ class Wanted:
 
     root: Root
     records: tuple[str, ...] = ()
+    recording: Path | None = None
     scene: str = ""
     rollouts: tuple[int, ...] | None = None
     log: bool = True
@@ -147,11 +149,18 @@ def find_view_model(wanted: Wanted) -> "ViewModel":
         ConfigError: if there is no such scene or rollout.
     """
     from infgen.views.scene.view_model import make_view_model  # noqa: PLC0415
-    from pipeline.commands.view_scenes import find_in_records, find_in_root  # noqa: PLC0415
+    from pipeline.commands.view_scenes import (  # noqa: PLC0415
+        find_in_records,
+        find_in_root,
+        find_recorded,
+    )
 
     if wanted.records:
         return make_view_model(find_in_records(wanted.records, wanted.scene), ())
-    scene, rollouts = find_in_root(wanted.root, wanted.scene, wanted.rollouts)
+    if wanted.recording is not None:
+        scene, rollouts = find_recorded(wanted.recording, wanted.rollouts)
+    else:
+        scene, rollouts = find_in_root(wanted.root, wanted.scene, wanted.rollouts)
     # Without rollouts there is only the log to see.
     return make_view_model(scene, rollouts, log=wanted.log or not rollouts)
 
@@ -162,7 +171,7 @@ def is_root(folder: Path) -> bool:
 
 
 def check_records(word: str) -> None:
-    """Refuse a word that is neither a root nor the name of records.
+    """Refuse a word that is neither a root, a recording nor the name of records.
 
     Raises:
         ConfigError: saying so.
@@ -172,7 +181,7 @@ def check_records(word: str) -> None:
     if not there and word != BUILTIN and "://" not in word and not has_magic(word):
         raise ConfigError(
             f"{word} is neither a root nor records; expected the --root of a run, "
-            f"TFRecords, or a folder of {RECORDS_IN_FOLDER}"
+            f"TFRecords, a folder of {RECORDS_IN_FOLDER}, or a drive that was saved"
         )
 
 

@@ -1,6 +1,6 @@
 """A scene and its rollouts: found in a root by the start of its id, or in records."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -55,6 +55,26 @@ def find_in_root(root: Root, prefix: str, rollouts: Sequence[int] | None) -> See
     scenario_id = choose(units, prefix, f"the rollouts below {root.path}")
     found = _read_rollouts(root, played, units[scenario_id], scenario_id, rollouts)
     return Seen(_find_log(root, scenario_id), found)
+
+
+def find_recorded(folder: Path, rollouts: Sequence[int] | None) -> Seen:
+    """Read a recorded drive and its log.
+
+    Args:
+        folder: Of the recording.
+        rollouts: Indices; None for all that it holds.
+
+    Raises:
+        ConfigError: if it has no such rollout.
+    """
+    from pipeline.storage.recordings import SCENE  # noqa: PLC0415
+    from pipeline.storage.rollouts import read_rollouts  # noqa: PLC0415
+    from pipeline.storage.scene_lookup import open_scene_lookup  # noqa: PLC0415
+
+    there = {rollout.index: rollout for rollout in read_rollouts(folder)}
+    first = next(iter(there.values()))
+    scene = open_scene_lookup([str(folder / SCENE)]).find(first.scenario_id)
+    return Seen(scene, _chosen(there, first.scenario_id, rollouts))
 
 
 def find_in_records(patterns: Sequence[str], prefix: str) -> Scene:
@@ -166,6 +186,12 @@ def _read_rollouts(
             found[rollout.index] = rollout
         elif found:
             break  # Those of a scene lie together.
+    return _chosen(found, scenario_id, asked)
+
+
+def _chosen(
+    found: "Mapping[int, Rollout]", scenario_id: str, asked: Sequence[int] | None
+) -> "tuple[Rollout, ...]":
     wanted = sorted(found)[:MOST_ROLLOUTS] if asked is None else list(dict.fromkeys(asked))
     missing = [index for index in wanted if index not in found]
     if missing:
