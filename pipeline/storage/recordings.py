@@ -58,6 +58,8 @@ def write_recording(target: Path, rollout: Rollout, scene: Scene, about: About) 
     from infgen.settings import key_values  # noqa: PLC0415
     from pipeline.storage.zarr_store import write_records  # noqa: PLC0415
 
+    if target.exists():
+        raise StoreError(f"{target} is in the way; expected a name that is free")
     now = datetime.now(UTC).isoformat(timespec="seconds")
     with publish(target) as folder:
         write_records(
