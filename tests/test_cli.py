@@ -29,7 +29,7 @@ profiles:
 VERBS = [
     *("run", "ingest", "build-vocab", "tokenize", "train", "rollout", "score", "report"),
     *("plan", "status", "dag", "gc", "verify", "show", "diff", "init", "doctor", "demo"),
-    *("towns", "calibrate", "reference", "wosac", "export", "view", "settings"),
+    *("towns", "calibrate", "reference", "wosac", "export", "view", "settings", "drive"),
 ]
 
 

@@ -98,6 +98,7 @@ class Session:
             simulator.tensor(simulator.vocabulary.stationary),
         )
         self._driven_to: np.ndarray | None = None
+        self._ego_from = self.population.pose[:, EGO_ROW]
 
     @property
     def ego_pose(self) -> Float32[np.ndarray, "rollout 3"]:
@@ -222,6 +223,7 @@ class Session:
 
     def _begin(self, before: Population, path: np.ndarray | None) -> BegunStep:
         """Let all agents move, egos along their paths if these are known."""
+        self._ego_from = before.pose[:, EGO_ROW]
         said = self._ask_motion(before)
         choices = self._sampler.sample(before, said, self.token + 1)
         moved, paths = self._move(before, choices, said, path)
@@ -267,6 +269,23 @@ class Session:
         paths[:, EGO_ROW] = path
         moved = replace(moved, motion_token=motion_token, pose=pose)
         return replace(begun, moved=moved, path=paths)
+
+    def correct_ego(self, ego_pose: Float32[np.ndarray, "rollout 3"]) -> None:
+        """Replace the poses of the egos at the end of the last token step.
+
+        For callers that ask for a token step before the ego has driven it: the network has
+        not seen its end yet, and will see the egos exactly here, with the motion tokens
+        that come closest. Motion and insertions of that token step stay as they are.
+
+        Args:
+            ego_pose: Where the egos are: x, y, heading in the frame of the scene.
+        """
+        agent_type = self.population.agent_type[:, EGO_ROW]
+        pose, token = self.population.pose.copy(), self.population.motion_token.copy()
+        token[:, EGO_ROW], _ = follow(ego_pose, self._ego_from, agent_type, self._table)
+        pose[:, EGO_ROW] = ego_pose
+        self.population = replace(self.population, pose=pose, motion_token=token)
+        self._driven_to = None
 
     def _ask_motion(self, population: Population) -> MotionStep:
         """Show the network all agents; return what follows."""

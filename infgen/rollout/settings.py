@@ -7,7 +7,16 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from infgen.clock import CLOCK
-from infgen.settings import RULES, AtLeastOne, Bool, Count, Float, NonNegative, Seed
+from infgen.settings import (
+    NOT_IN_KEY,
+    RULES,
+    AtLeastOne,
+    Bool,
+    Count,
+    Float,
+    NonNegative,
+    Seed,
+)
 
 Temperature = Annotated[Float, Field(gt=0)]
 Nucleus = Annotated[Float, Field(gt=0, le=1)]
@@ -151,6 +160,9 @@ class RolloutSettings:
     more."""
     seed: Seed = 0
     """Seed of all random streams."""
+    recordings: Annotated[str, NOT_IN_KEY] = ""
+    """Folder of drives that `infgen drive` saved: they are taken, and nothing is simulated.
+    The other settings, but `split`, have no effect then."""
 
     @model_validator(mode="after")
     def _check(self) -> "RolloutSettings":

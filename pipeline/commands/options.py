@@ -3,7 +3,7 @@
 import inspect
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -85,6 +85,45 @@ class RequestOptions:
             overrides=self.set or (),
             environ=os.environ,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class DriveOptions:
+    """What is driven, and where the page is."""
+
+    scene: Annotated[
+        str, typer.Argument(help="Start of a scene's id; default: the first.")
+    ] = ""
+    weights: Annotated[
+        str, typer.Option(help="A folder, or builtin; default: the root's, or builtin.")
+    ] = ""
+    seed: Annotated[int, typer.Option(help="Other traffic for another seed.", min=0)] = 0
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to save drives in; default: ROOT/drives.")
+    ] = None
+    port: Annotated[
+        int, typer.Option(help="Of the page; 0: any free one.", min=0, max=65535)
+    ] = 0
+    browser: Annotated[bool, typer.Option(help="Open the page in a browser.")] = True
+
+    def serve(
+        self,
+        request_options: RequestOptions,
+        say: Callable[[str], None],
+        log: Callable[[str], None],
+    ) -> None:
+        """Serve the page until a signal arrives; its address is said."""
+        from pipeline.commands.drive import Wanted, drive  # noqa: PLC0415
+
+        request = request_options.request()
+        wanted = Wanted(
+            request=request,
+            file=request.stages(os.environ),
+            profile=request_options.profile,
+            records=tuple(request_options.named_records),
+            **asdict(self),
+        )
+        drive(wanted, say, log)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +10,15 @@ import typer
 
 from infgen.errors import ConfigError
 from pipeline.commands import tables
-from pipeline.commands.options import WORK, Json, RootFolder, gathers, split_names
+from pipeline.commands.options import (
+    WORK,
+    DriveOptions,
+    Json,
+    RequestOptions,
+    RootFolder,
+    gathers,
+    split_names,
+)
 from pipeline.commands.screen import Screen
 from pipeline.commands.verbs import FAILED, print_json
 from pipeline.engine import signals
@@ -86,7 +95,10 @@ class ExportOptions:
     root: RootFolder = WORK
     records: Annotated[
         str | None,
-        typer.Option(help="Their logs: TFRecords, or an ingested folder; default: root's."),
+        typer.Option(
+            help="Their logs: TFRecords, or an ingested folder; default: a saved drive's "
+            "own, or the root's."
+        ),
     ] = None
     about: Annotated[
         Path | None, typer.Option(help="YAML file that describes the submission (wosac).")
@@ -125,7 +137,7 @@ class ViewOptions:
         list[str] | None,
         typer.Argument(
             metavar="[ROOT | RECORDS...]",
-            help="A root, saved rollouts, or TFRecords to see a log of.",
+            help="A root, saved rollouts or drives, or TFRecords to see a log of.",
         ),
     ] = None
     root: RootFolder = WORK
@@ -250,6 +262,22 @@ def export(json_: Json = False, *, exporting: ExportOptions) -> None:
         print_json(found.to_json())
     else:
         tables.show_exported(found)
+
+
+@app.command()
+@gathers(request_options=RequestOptions, driving=DriveOptions)
+def drive(*, request_options: RequestOptions, driving: DriveOptions) -> None:
+    """Drive the ego by hand on a local page; the network drives everyone else.
+
+    Example: infgen drive
+
+    Example: infgen drive 637f20 --root R --weights builtin --no-browser --port 8080
+
+    Prints the address of the page and goes on until Ctrl-C. Drives that are saved there can
+    be read by `infgen view`, `infgen export`, and `infgen score` (rollout.recordings).
+    """
+    with signals.handling_signals():
+        driving.serve(request_options, typer.echo, partial(typer.echo, err=True))
 
 
 @app.command()

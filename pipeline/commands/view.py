@@ -171,7 +171,7 @@ def is_root(folder: Path) -> bool:
 
 
 def check_records(word: str) -> None:
-    """Refuse a word that is neither a root nor the name of records.
+    """Refuse a word that is neither a root, a recording nor the name of records.
 
     Raises:
         ConfigError: saying so.
@@ -181,7 +181,8 @@ def check_records(word: str) -> None:
     if not there and word != BUILTIN and "://" not in word and not has_magic(word):
         raise ConfigError(
             f"{word} is neither a root nor records; expected the --root of a run, "
-            f"TFRecords, a folder of {RECORDS_IN_FOLDER}, or scenes of another source"
+            f"TFRecords, a folder of {RECORDS_IN_FOLDER}, scenes of another source, or "
+            "saved rollouts"
         )
 
 

@@ -17,6 +17,7 @@ from pipeline.engine.stage import FinishedUnit, Inputs, Progress, Report, Stage,
 from pipeline.stages.batch_memory import BatchSize
 from pipeline.stages.calibration import Biases, read_found
 from pipeline.stages.devices import decide_device, device_of_units, on_device
+from pipeline.stages.recorded import collect_recorded, find_recorded, plan_recorded
 from pipeline.stages.simulation import (
     about_run,
     begin,
@@ -48,8 +49,10 @@ OF_EXITS = ("remove_bias", "removal_radius_m")
 
 
 def normalize(sections: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Reset settings of insertion and removal where these are off."""
+    """Reset settings of insertion and removal where these are off; all for recordings."""
     settings: RolloutSettings = sections["rollout"]
+    if settings.recordings:
+        return {"rollout": RolloutSettings(recordings=settings.recordings)}
     idle = (() if settings.inserts else OF_ENTRIES) + (() if settings.removes else OF_EXITS)
     usual = RolloutSettings()
     return {"rollout": replace(settings, **{name: getattr(usual, name) for name in idle})}
@@ -59,8 +62,10 @@ def plan(inputs: Inputs, settings: RolloutSettings) -> list[Unit]:
     """Cut each shard, or a part of it, into units of about equally many scenes.
 
     Raises:
-        PlanError: if there is no scene of the split.
+        PlanError: if there is no scene of the split, or recordings are of other records.
     """
+    if settings.recordings:
+        return plan_recorded(inputs)
     weights = inputs.folder("train")
     identity = inputs.content("train", "model.safetensors", "model.json")
     biases = read_found(inputs.folder("calibrate")).used_by(settings)
@@ -95,6 +100,8 @@ def simulate(
     unit: Unit, target: Path, settings: RolloutSettings, progress: Progress
 ) -> Report:
     """Simulate all rollouts of some scenes in batches, and write them as groups."""
+    if settings.recordings:
+        return collect_recorded(unit, target, progress)
     biases = Biases(**unit.task["biases"])
     settings = on_device(biases.over(settings), unit.task["device"])
     folder, identity = Path(unit.task["weights"]), unit.inputs["weights"]
@@ -180,11 +187,13 @@ STAGE = Stage(
     plan=plan,
     work=simulate,
     finish=finish,
+    reads=find_recorded,
     normalize=normalize,
     modules=(
         "pipeline.stages.batch_memory",
         "pipeline.stages.calibration",
         "pipeline.stages.devices",
+        "pipeline.stages.recorded",
         "pipeline.stages.simulation",
         "pipeline.stages.rollout",
         "pipeline.storage.rollouts",

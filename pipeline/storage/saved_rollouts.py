@@ -11,6 +11,7 @@ So commands that read units read this folder.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from infgen.errors import ConfigError
@@ -50,9 +51,20 @@ def is_saved(folder: Path) -> bool:
 
 
 def write_saved(
-    folder: Path, scene: Scene, rollouts: Sequence[Rollout], settings: Mapping[str, Any]
+    folder: Path,
+    scene: Scene,
+    rollouts: Sequence[Rollout],
+    settings: Mapping[str, Any],
+    more: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Write a folder, whole or not at all.
+
+    Args:
+        folder: Where to.
+        scene: The log.
+        rollouts: Its rollouts.
+        settings: Of the rollouts, by name.
+        more: What else the manifest says.
 
     Raises:
         ConfigError: if there is something already.
@@ -71,7 +83,7 @@ def write_saved(
         write_records(scenes / group, [scene], Scene, SCENES_SCHEMA, compress=True)
         row = dict(zip(_SCENES, (scene.scenario_id, "", group, 0), strict=True))
         make_table([row], _SCENES).write_parquet(scenes / "index.parquet")
-        about = {"schema": SCHEMA, "settings": {"rollout": dict(settings)}}
+        about = {**more, "schema": SCHEMA, "settings": {"rollout": dict(settings)}}
         write_json(partial / MANIFEST, {**about, "files": list_files(partial)})
 
 

@@ -56,7 +56,7 @@ def find_in_root(
                 "some, and makes what is missing before (-n: only says what)"
             )
         return Seen(_find_log(root, prefix), ())
-    units = _units_of_scenes(played, "unit")
+    units = units_of_scenes(played, "unit")
     if not units or (rollouts is None and prefix and not _matching(units, prefix)):
         return Seen(_find_log(root, prefix), ())
     scenario_id = choose(units, prefix, f"the rollouts below {root.path}")
@@ -133,7 +133,7 @@ def _some(ids: Sequence[str]) -> str:
     return ", ".join(ids[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _units_of_scenes(stage: Path, column: str) -> dict[str, str]:
+def units_of_scenes(stage: Path, column: str) -> dict[str, str]:
     """Name of the unit that holds each scene of a made stage, in order."""
     import polars as pl  # noqa: PLC0415
 
@@ -158,7 +158,7 @@ def _find_log(root: Root, prefix: str) -> Scene:
             f"{root.path} holds no scenes; `infgen demo` makes some, "
             "`infgen view RECORDS.tfrecord` shows a log without a root"
         )
-    units = _units_of_scenes(made, "source")
+    units = units_of_scenes(made, "source")
     scenario_id = choose(units, prefix, str(root.path))
     folder = _unit_folder(root, "ingest", made, units[scenario_id])
     return open_scene_lookup([str(folder)]).find(scenario_id)

@@ -97,6 +97,31 @@ def test_others_react_in_the_next_half_second_and_not_before(session):
     assert not np.array_equal(ahead[1].path[0, 1:], aside[1].path[0, 1:])
 
 
+def test_a_corrected_ego_is_as_one_that_was_right_at_once(session):
+    right, corrected = session(motion_top_k=0), session(motion_top_k=0)
+    right.step(pose(-25))
+    corrected.step(pose(-28, 6.0, 1.2))
+
+    corrected.correct_ego(pose(-25)[None])
+
+    for _ in range(2):
+        expected, frame = right.step(pose(-20)), corrected.step(pose(-20))
+        np.testing.assert_array_equal(frame.path, expected.path)
+    np.testing.assert_array_equal(
+        corrected.population.motion_token, right.population.motion_token
+    )
+
+
+def test_a_corrected_ego_stands_exactly_where_it_is_said_to(session):
+    driven = session()
+    driven.step()
+
+    driven.correct_ego(pose(-25.4, 0.2, 0.03)[None])
+
+    np.testing.assert_array_equal(driven.ego_pose, [pose(-25.4, 0.2, 0.03)])
+    assert driven.population.motion_token[0, 0] == 5  # From -30; moves are whole metres.
+
+
 def test_the_network_takes_over_from_where_the_ego_really_is(session):
     driven = session()
     driven.step(pose(-25.4, 0.2))  # No move of the vocabulary ends there.

@@ -9,7 +9,7 @@ const [EGO, INSERTED] = [0, 2];
 const looks = LOOKS.agents;
 
 /** Outline and marks of one agent in its own frame, in metres, x ahead. */
-function buildShape(kind, length, width) {
+export function buildShape(kind, length, width) {
   const body = new Path2D();
   const mark = new Path2D();
   if (kind === 0) addCar(body, mark, length, width);

@@ -6,7 +6,7 @@ import { LOOKS } from "./looks.js";
 const COLOURS = ["stop", "go", "caution", "unknown"];
 const [STOP, GO, CAUTION, NO_SIGNAL] = [0, 1, 2, 4];
 
-/** Draw all lights. Once the log is over they stay as they were last, and pale. */
+/** Draw all lights. Once the log is over they stay as they were last, and pale unless `held`. */
 export function drawLights(context, view, lights, time, colours) {
   if (!lights.steps) return;
   const step = Math.min(Math.max(0, Math.floor(time)), lights.steps - 1);
@@ -16,7 +16,8 @@ export function drawLights(context, view, lights, time, colours) {
     const state = lights.state[light * lights.steps + step];
     if (state === NO_SIGNAL) continue;
     enter(context, view, lights, light);
-    context.globalAlpha = time > lights.steps - 1 ? LOOKS.lights.heldAlpha : 1;
+    const over = time > lights.steps - 1 && !lights.held;
+    context.globalAlpha = over ? LOOKS.lights.heldAlpha : 1;
     drawLight(context, state, size, colours);
   }
   context.globalAlpha = 1;

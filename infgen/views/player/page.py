@@ -6,10 +6,10 @@ they are joined here. What comes from records enters as data or escaped.
 
 import json
 import re
-from collections.abc import Mapping
 from html import escape
 from importlib.resources import files
 
+from infgen.views.page_source import fill
 from infgen.views.player.payload import pack
 from infgen.views.scene.style import DARK, LIGHT, for_scripts
 from infgen.views.scene.view_model import ViewModel
@@ -34,7 +34,6 @@ MODULES = (
 """Scripts, each after those that it imports."""
 _IMPORT = re.compile(r'^import (\{[^}]*\}) from "\./(\w+)\.js";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export ((?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
-_GAP = re.compile(r"\{\{(\w+)\}\}")
 
 
 def player_page(view_model: ViewModel) -> str:
@@ -43,13 +42,13 @@ def player_page(view_model: ViewModel) -> str:
     about = f"Scene {view_model.scenario_id}: {names}."
     if view_model.weights:
         about += f" Weights {view_model.weights}."
-    return _fill(
+    return fill(
         _read("page.html"),
         {
             "title": escape(f"{view_model.scenario_id} - InfGen"),
             "scene": escape(view_model.scenario_id),
             "about": escape(about),
-            "style": _fill(_read("page.css"), {"light": LIGHT.css(), "dark": DARK.css()}),
+            "style": fill(_read("page.css"), {"light": LIGHT.css(), "dark": DARK.css()}),
             "looks": json.dumps(for_scripts()),
             "payload": pack(view_model),
             "script": joined_scripts(),
@@ -67,11 +66,6 @@ def _scoped(name: str, script: str) -> str:
     exports = ", ".join(found[2] for found in _EXPORT.finditer(script))
     body = _EXPORT.sub(r"\1", _IMPORT.sub(r"const \1 = $\2;", script))
     return f"const ${name} = (() => {{\n{body}return {{ {exports} }};\n}})();"
-
-
-def _fill(text: str, parts: Mapping[str, str]) -> str:
-    """Fill all gaps at once, so that nothing is filled into what was filled in."""
-    return _GAP.sub(lambda gap: parts[gap[1]], text)
 
 
 def _read(name: str) -> str:

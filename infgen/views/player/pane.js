@@ -21,8 +21,9 @@ export class Pane {
     this.over = element.querySelector(".over");
     this.bar = element.querySelector(".bar");
     this.picture = new RoadPicture(roads);
-    this.shapes = buildShapes(showing);
-    this.rows = new Map(Array.from(showing.id, (id, row) => [id, row]));
+    // A showing that grows while it is shown keeps these itself.
+    this.shapes = showing.shapes ?? buildShapes(showing);
+    this.rows = showing.rows ?? new Map(Array.from(showing.id, (id, row) => [id, row]));
     this.poses = [];
     this.centre = { x: 0, y: 0 };
     this.said = "";

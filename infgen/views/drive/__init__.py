@@ -1,0 +1,1 @@
+"""The page of `infgen drive`; it draws with the scripts of the player."""

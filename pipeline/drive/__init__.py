@@ -1,0 +1,1 @@
+"""Driving the ego by hand in simulated traffic: `infgen drive`."""
