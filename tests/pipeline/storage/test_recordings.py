@@ -64,16 +64,16 @@ def test_a_recording_is_read_back(tmp_path, scenes):
     assert is_recording(folder)
     assert not is_recording(tmp_path)
     about = read_about(folder)
-    assert (about["source"], about["scenario_id"]) == (SOURCE, scenes[0].scenario_id)
+    assert about["drive"]["source"] == SOURCE
     assert about["settings"]["rollout"]["add_bias"] == 0.25
-    assert "scene/index.parquet" in about["files"]
+    assert "scenes/index.parquet" in about["files"]
 
 
 def test_nothing_is_written_over(tmp_path, scenes):
     (tmp_path / "drive").mkdir()
     (tmp_path / "drive/file").write_text("")
 
-    with pytest.raises(StoreError, match="in the way"):
+    with pytest.raises(ConfigError, match="name another folder"):
         record(tmp_path / "drive", scenes[0])
     assert not list(tmp_path.glob("*.partial"))
 
