@@ -38,7 +38,7 @@ def test_the_checker_of_gymnasium_finds_nothing(crossing, simulator, observation
     assert [words for words in said if "symmetric and normalized" not in words] == []
 
 
-def played(env, seed, steps=12, **options):
+def played(env, seed, steps=7, **options):
     """All that an episode tells."""
     observed, info = env.reset(seed=seed, options=options)
     told = [(observed, 0.0, info)]

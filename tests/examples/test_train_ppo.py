@@ -40,6 +40,7 @@ def test_the_last_observation_of_an_episode_is_told(ppo):
     assert batch.observation_space.contains(infos[1]["terminal_observation"])
 
 
+@pytest.mark.slow
 def test_a_policy_is_trained_and_written(ppo, tmp_path, capsys):
     path = tmp_path / "policy.safetensors"
     words = "--steps 32 --environments 2 --rollout-steps 16"

@@ -85,7 +85,7 @@ def test_rollouts_do_not_notice_that_another_is_replaced(
     replaced_at(replaced, 1, other, logged_step([other], 24))
     driven_step(kept)
 
-    for _ in range(4):
+    for _ in range(3):
         one, another = driven_step(replaced), driven_step(kept)
         np.testing.assert_array_equal(
             one.agent_number[[0, 2]], another.agent_number[[0, 2]]
