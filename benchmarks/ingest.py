@@ -4,8 +4,8 @@ The promises: at least 25 scenes a second and core, at most a third of the recor
 disk, at most 1 GiB of memory whatever the input. The floor is to gunzip the same records,
 check their checksums and walk every field of their messages, and no more.
 
-Shared scenes of other sources stand beside, where they are there, each source alone: there is
-no floor for them.
+Shared scenes of other sources stand beside, where they are there, each source alone. There
+is no floor for them.
 
     python benchmarks/ingest.py [RECORDS...]
 """
