@@ -4,6 +4,9 @@ The promises: at least 25 scenes a second and core, at most a third of the recor
 disk, at most 1 GiB of memory whatever the input. The floor is to gunzip the same records,
 check their checksums and walk every field of their messages, and no more.
 
+Shared scenes of other sources stand beside, where they are there, each source alone. There
+is no floor for them.
+
     python benchmarks/ingest.py [RECORDS...]
 """
 
@@ -22,11 +25,14 @@ from infgen.sources import wire
 from infgen.sources.tfrecord import Record, iter_records
 from infgen.sources.wire import BYTES, Spans, tag
 from infgen.sources.womd import scene_or_bad_record
-from pipeline.engine.stage import Report, Unit
+from pipeline.engine.layout import Root
+from pipeline.engine.stage import FinishedUnit, Report, Source, Unit
 from pipeline.stages.ingest import STAGE
+from pipeline.storage.source_files import find_sources
 
 SHARED = Path(__file__).parents[1] / "../shared/data/womd"
 BUILTIN = Path(infgen.__file__).parent / "sources/towns/records"
+OTHERS = ("av2", "scenarionet")
 TOTALS = ("scenes", "quarantined", "record_bytes", "disk_bytes")
 
 TRACK, DYNAMIC_STATE, FEATURE = tag(2, BYTES), tag(7, BYTES), tag(8, BYTES)
@@ -54,7 +60,55 @@ def main() -> None:
     ingest(urls[:1])  # What is imported on the way is not counted.
     reports: list[Report] = []
     seconds.append(cpu_s(lambda: reports.extend(ingest(urls))))
-    report({name: sum(int(r[name]) for r in reports) for name in TOTALS}, seconds)
+    others = measure_others()
+    totals = {name: sum(int(r[name]) for r in reports) for name in TOTALS}
+    report(totals, seconds, others)
+
+
+def measure_others() -> dict[str, dict[str, float]]:
+    """Ingest the shared scenes of other sources, and say how fast and how large."""
+    found: dict[str, dict[str, float]] = {}
+    for folder in OTHERS if SHARED.is_dir() else ():
+        with tempfile.TemporaryDirectory(prefix="infgen-bench-") as root:
+            sources = find_sources([str(SHARED.parent / folder)], Root(Path(root)))
+            units = STAGE.plan(_Files(sources), IngestSettings())
+            reports: list[Report] = []
+            spent_s = cpu_s(partial(_ingest_units, units, Path(root), reports))
+        totals = {name: sum(int(r[name]) for r in reports) for name in TOTALS}
+        found[folder] = {
+            "scenes": totals["scenes"],
+            "scenes_per_s_per_core": round(totals["scenes"] / spent_s, 1),
+            "bytes_over_raw": round(totals["disk_bytes"] / totals["record_bytes"], 4),
+        }
+    return found
+
+
+class _Files:
+    """Inputs of a stage that reads only source files."""
+
+    def __init__(self, sources: Sequence[Source]) -> None:
+        self.sources = sources
+
+    def units(self, stage: str) -> Sequence[FinishedUnit]:
+        """There are no stages before this one."""
+        return ()
+
+    def folder(self, stage: str) -> Path:
+        """There are no stages before this one."""
+        raise KeyError(stage)
+
+    def key(self, stage: str) -> str:
+        """There are no stages before this one."""
+        raise KeyError(stage)
+
+    def content(self, stage: str, *names: str) -> str:
+        """There are no stages before this one."""
+        raise KeyError(stage)
+
+
+def _ingest_units(units: Sequence[Unit], root: Path, reports: list[Report]) -> None:
+    for unit in units:
+        reports.append(STAGE.work(unit, root / unit.name, IngestSettings(), no_progress))
 
 
 def default_records() -> list[str]:
@@ -130,7 +184,11 @@ def no_progress(done: float, total: float, note: str = "") -> None:
     """Say nothing."""
 
 
-def report(totals: dict[str, int], seconds: Sequence[float]) -> None:
+def report(
+    totals: dict[str, int],
+    seconds: Sequence[float],
+    others: dict[str, dict[str, float]],
+) -> None:
     """Print the table and the line of JSON."""
     scenes, raw_mb = max(1, totals["scenes"]), totals["record_bytes"] / 1e6
     steps = (
@@ -142,6 +200,11 @@ def report(totals: dict[str, int], seconds: Sequence[float]) -> None:
     print(f"{'CPU time per scene':42}{'ms':>8}{'MB/s':>8}")
     for step, spent_s in zip(steps, seconds, strict=True):
         print(f"{step:42}{1e3 * spent_s / scenes:8.1f}{raw_mb / spent_s:8.0f}")
+    for name, of in others.items():
+        rate, share = of["scenes_per_s_per_core"], of["bytes_over_raw"]
+        print(
+            f"{name:42}{1e3 / rate:8.1f}   {share:.2f} of the bytes, {of['scenes']} scenes"
+        )
     figures = {
         "scenes_per_s_per_core": round(scenes / seconds[-1], 1),
         "bytes_over_raw": round(totals["disk_bytes"] / (1e6 * raw_mb), 4),
@@ -153,6 +216,7 @@ def report(totals: dict[str, int], seconds: Sequence[float]) -> None:
             "peak_rss_mib": 1024,
         },
         **totals,
+        "others": others,
     }
     print(json.dumps(figures))
 

@@ -1,8 +1,9 @@
 """Logs as scene files of ScenarioNet and MetaDrive.
 
-Inverse of ``infgen.sources.scenarionet``. Nothing is rounded: positions are float64 in the world frame, so that the same ``Scene``
-comes back. A light's rows are named by its lane; where the order of lanes within a step is
-not theirs, or a stop point moves, that stands among the light's states.
+Inverse of ``infgen.sources.scenarionet``. Nothing is rounded: positions are float64 in the
+world frame, so that the same ``Scene`` comes back. A light's rows are named by its lane;
+where the order of lanes within a step is not theirs, or a stop point moves, that stands
+among the light's states.
 """
 
 from pathlib import Path

@@ -4,7 +4,7 @@ WOMD's TFRecords are streams of many scenes (``tfrecord``, ``womd``) and not amo
 """
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from infgen.sources.scene_files import (
 )
 from infgen.sources.tfrecord import is_record_header
 
-SOURCES: Mapping[str, SceneSource] = {
+SOURCES: dict[str, SceneSource] = {
     "argoverse2": argoverse2,
     "scenarionet": scenarionet,
 }

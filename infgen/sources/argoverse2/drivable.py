@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from infgen.sources.open_ends import at_open_ends
+from infgen.sources.open_ends import OpenEnds
 from infgen.sources.polylines import (
     arc_length_m,
     densify,
@@ -46,11 +46,11 @@ def road_edges(
     """
     rings = [_counter_clockwise(area) for area in areas]
     rings = [ring for ring in rings if len(ring) > 3]
-    edges = []
+    ends, edges = OpenEnds(lanes), []
     for ring in rings:
         line_m = densify(ring, SPACING_M)
         outside = _outside(line_m, rings)
-        kept = outside & ~at_open_ends(line_m, outside, lanes)
+        kept = outside & ~ends.parts(line_m, outside)
         edges += [
             edge
             for edge in kept_chains(line_m, kept)

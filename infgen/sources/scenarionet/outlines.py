@@ -5,7 +5,7 @@ from jaxtyping import Float64
 
 from infgen.scene import FeatureType, RoadEdgeType
 from infgen.sources.map_builder import MapBuilder
-from infgen.sources.open_ends import at_open_ends
+from infgen.sources.open_ends import OpenEnds
 from infgen.sources.polylines import (
     densify,
     drop_repeats,
@@ -42,6 +42,7 @@ class Outlines:
         Where a lane goes through an outline, the map ends and not the road.
         """
         lanes = road_map.lines_m(FeatureType.LANE)
+        ends = OpenEnds(lanes)
         points_m = np.concatenate([np.zeros((1, 3)) if not lanes else lanes[0], *lanes])
         low_m, high_m = points_m[:, :2].min(axis=0), points_m[:, :2].max(axis=0)
         for depth, line_m in zip(self._depths(), self._lines, strict=True):
@@ -50,7 +51,7 @@ class Outlines:
             middle_m = (ring_m[:-1, :2] + ring_m[1:, :2]) / 2
             near = (middle_m >= low_m - MARGIN_M) & (middle_m <= high_m + MARGIN_M)
             kept = near.all(axis=1)
-            kept &= ~at_open_ends(ring_m, kept, lanes)
+            kept &= ~ends.parts(ring_m, kept)
             for part_m in kept_chains(ring_m, kept):
                 road_map.feature(first_id, FeatureType.ROAD_EDGE, kind, part_m)
                 first_id += 1
