@@ -33,8 +33,8 @@ from infgen.config import (  # noqa: E402
     TrainSettings,
 )
 from infgen.model.batching.batch import Limits, collate  # noqa: E402
-from infgen.model.batching.index import BatchIndex  # noqa: E402
-from infgen.model.batching.packed import PackedBatch  # noqa: E402
+from infgen.model.device.index import BatchIndex  # noqa: E402
+from infgen.model.device.packed import PackedBatch  # noqa: E402
 from infgen.model.network import Network  # noqa: E402
 from infgen.model.stepping import Stepper  # noqa: E402
 from infgen.model.training.losses import losses  # noqa: E402
