@@ -27,6 +27,7 @@ from torch import Tensor
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
 from infgen.model.batching.batch import Batch, Limits
 from infgen.model.batching.tensors import map_tensors
+from infgen.model.device.packed import PackedBatch
 from infgen.tokens.scene_tokens import SceneTokens
 from pipeline.commands.screen import show_table
 from pipeline.engine.events import Events
@@ -92,7 +93,7 @@ def batch_rate(recipe: Recipe, workers: int) -> float:
         return per_s(len(parts[0].scenario_ids) for parts in batches)
 
 
-def batch_bytes(batch: Batch) -> int:
+def batch_bytes(batch: Batch | PackedBatch) -> int:
     """Bytes of all tensors of a batch."""
     sizes: list[int] = []
 

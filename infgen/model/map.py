@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from infgen.model.batching.batch import MapTokens
-from infgen.model.batching.index import MapIndex
+from infgen.model.device.index import MapIndex
 from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.map_grid import MapGrid
 from infgen.model.neighbours import MapFeatures, NeighbourRows, NeighbourSpec, SignalStates

@@ -5,6 +5,7 @@ products touch them.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float32, Float64, Int64
@@ -62,6 +63,8 @@ def nearest(
     The same as ``tokens.motion_tokens.nearest_motion_tokens``: of equally near motion
     tokens the first.
     """
+    if wanted.device.type != "cpu":
+        return _measured(wanted, agent_type, ends)
     motion_token = torch.empty_like(agent_type)
     for number in range(len(ends.pose)):
         for rows in torch.split((agent_type == number).nonzero()[:, 0], _ROWS_AT_ONCE):
@@ -113,6 +116,16 @@ def wrap_angle(angle_rad: Tensor) -> Tensor:
     return torch.where(wrapped >= torch.pi, -torch.pi, wrapped)
 
 
+def _measured(wanted: Tensor, agent_type: Tensor, ends: MotionTokenEnds) -> Tensor:
+    """The same by measuring all motion tokens: to choose few makes the host wait."""
+    found = []
+    parts = (torch.split(x, _ROWS_AT_ONCE) for x in (wanted.double(), agent_type))
+    for aim, own in zip(*parts, strict=True):
+        aim_m = _corners(aim, ends.size_lw_m[own])
+        found.append(_mean_gap(ends.corners_m[own], aim_m[:, None]).argmin(dim=1))
+    return torch.cat(found)
+
+
 def _nearest(wanted: Tensor, number: int, ends: MotionTokenEnds) -> Tensor:
     """Return the nearest motion token of one agent type to each pose wanted (float64)."""
     aim_m = _corners(wanted, ends.size_lw_m[number])
@@ -148,9 +161,16 @@ def _mean_gap(one_m: Tensor, other_m: Tensor) -> Tensor:
 
 def _corners(pose: Tensor, size_lw_m: Tensor) -> Tensor:
     """Return the corners [row, 8] of boxes: x of all four, then y of all four."""
-    signs = pose.new_tensor([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
+    signs = _signs(pose.dtype, pose.device)
     corners_m = _rotate(size_lw_m[..., None, :] * signs, pose[:, None, 2])
     return (corners_m + pose[:, None, :2]).transpose(1, 2).flatten(1)
+
+
+@lru_cache(maxsize=4)
+def _signs(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Where the corners of a box are, in lengths and widths; copied to a device once."""
+    signs = [[1, 1], [-1, 1], [-1, -1], [1, -1]]
+    return torch.tensor(signs, dtype=dtype, device=device) / 2
 
 
 def _spread(pose: Tensor, reach_m: Tensor) -> Tensor:

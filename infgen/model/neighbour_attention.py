@@ -38,7 +38,7 @@ class Shared:
             through it, so their gradients are complete when its own arrives.
         pulled: Where layers add their gradients to.
         copies: The values in other precisions, made on first use.
-        covers: Who is present, and what hides the others: of ``fused.attention``.
+        covers: Who is present, and what hides the others: of ``device.attention``.
     """
 
     values: Tensor

@@ -9,9 +9,9 @@ from torch.nn import functional
 from infgen.clock import CLOCK
 from infgen.model.agents import AgentContext, AgentEmbedding, AgentRows, MotionStack
 from infgen.model.batching.batch import Agents, Batch
-from infgen.model.batching.index import BatchIndex
 from infgen.model.cell_features import CellSources
-from infgen.model.fused.together import launched_together
+from infgen.model.device.index import BatchIndex
+from infgen.model.device.together import launched_together
 from infgen.model.insertion import CellStack, DetailStack
 from infgen.model.layers import initialise, normed
 from infgen.model.logits import (

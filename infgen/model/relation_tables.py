@@ -75,7 +75,7 @@ class RelationEmbedding(FourierEmbedding):
 
         In float32 also under autocast, as ``look_up``: geometry needs its digits.
         """
-        if self.evaluated is not None:  # By ``fused.tables``, for all embeddings at once.
+        if self.evaluated is not None:  # By ``device.tables``, for all embeddings at once.
             return self.evaluated
         with torch.autocast(self.frequency.weight.device.type, enabled=False):
             return torch.cat([self._nodes(i, span) for i, span in enumerate(self.spans)])

@@ -8,7 +8,8 @@ import json
 import sys
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import asdict, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,16 @@ DEVICE = set_up()
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 
-from infgen.config import ModelSettings, RolloutSettings, TokenSettings, TrainSettings  # noqa: E402
+from infgen.config import (  # noqa: E402
+    CalibrateSettings,
+    ModelSettings,
+    RolloutSettings,
+    TokenSettings,
+    TrainSettings,
+)
+from infgen.model.batching.batch import Limits, collate  # noqa: E402
+from infgen.model.device.index import BatchIndex  # noqa: E402
+from infgen.model.device.packed import PackedBatch  # noqa: E402
 from infgen.model.network import Network  # noqa: E402
 from infgen.model.stepping import Stepper  # noqa: E402
 from infgen.model.training.losses import losses  # noqa: E402
@@ -39,6 +49,10 @@ from infgen.scene import Scene  # noqa: E402
 from infgen.sources.towns import builtin_records  # noqa: E402
 from infgen.sources.womd import iter_scenes  # noqa: E402
 from infgen.tokens.tokenizer import tokenize_scene  # noqa: E402
+from pipeline.engine.stage import Unit  # noqa: E402
+from pipeline.settings.stages_file import DEFAULT_FILE, load_stages  # noqa: E402
+from pipeline.stages import calibrate  # noqa: E402
+from pipeline.stages.calibration import Biases  # noqa: E402
 from pipeline.stages.train import setup  # noqa: E402
 from pipeline.stages.train.loader import TokenScenes, train_batches  # noqa: E402
 from pipeline.stages.train.optimizer_step import OptimizerStep, StepResult  # noqa: E402
@@ -50,7 +64,9 @@ from pipeline.storage.checkpoint import (  # noqa: E402
     load_checkpoint,
     save_checkpoint,
 )
+from pipeline.storage.scenes import SCENES_SCHEMA  # noqa: E402
 from pipeline.storage.weights import load_network  # noqa: E402
+from pipeline.storage.zarr_store import write_records  # noqa: E402
 
 CPU = torch.device("cpu")
 RULES = {
@@ -85,10 +101,15 @@ Found = dict[str, Any]
 
 def town() -> Scene:
     """The first built-in scene held out."""
+    return towns(1)[0]
+
+
+def towns(count: int) -> list[Scene]:
+    """The first built-in scenes held out."""
     path = next(path for path in builtin_records() if "validation" in path.name)
-    scene = next(iter(iter_scenes(path)))
-    assert isinstance(scene, Scene)
-    return scene
+    scenes = [each for each in islice(iter_scenes(path), count) if isinstance(each, Scene)]
+    assert len(scenes) == count
+    return scenes
 
 
 def session(
@@ -203,6 +224,7 @@ FEATURES = {
     "signals_each_step": True,
     "signal_ahead_m": 40.0,
 }
+SIZES = ("width", "heads", "map_blocks", "motion_blocks", "scene_blocks", "fourier_bands")
 VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "paper": ({}, {}),
     "features": (FEATURES, {"motion_noise_neighbours": 5, "map_noise_neighbours": 3}),
@@ -267,6 +289,69 @@ def training(shards: str, name: str) -> Found:
     return {"ours": ours, "theirs": theirs, "apart": max(apart), **costs(tally)}
 
 
+def step_costs(scenes: str) -> Found:
+    """What an optimizer step of the paper's network costs, with dropout, on towns."""
+    known = load_network(builtin_weights())
+    books = known.motion_vocabulary(), known.map_vocabulary()
+    grid, count = known.grid_settings, int(scenes)
+    records = [tokenize_scene(scene, *books, grid) for scene in towns(count)]
+    how = TrainSettings(batch_scenes=count, warmup_steps=0)
+    limits = Limits.of(ModelSettings(), how, grid)
+    setup.own_device = lambda: DEVICE
+    with StandIn():
+        given = TrainingSetup(ModelSettings(), how, grid, TokenScenes([]), [], Path())
+        state = setup.begin(given, *books)
+        stepper = OptimizerStep(state, how, ProcessGroup(device=DEVICE), 1)
+        for step in range(2):
+            batch = PackedBatch.of(collate(records, limits, step)).pin()
+            with counted() as tally:
+                stepper.step([batch], range(1), step)
+    return costs(tally)
+
+
+def calibrated(folder: str) -> Found:
+    """Count simulated traffic for calibration on both devices, from one scene."""
+    scene = town()
+    write_records(
+        Path(folder) / "scenes-000.zarr", [scene], Scene, SCENES_SCHEMA, compress=True
+    )
+    unit = Unit(
+        name="biases-0-000",
+        inputs={"weights": "weights"},
+        task={
+            "weights": str(builtin_weights()),
+            "biases": asdict(Biases(0.2, 0.1)),
+            "point": 0,
+            "pieces": [{"scenes": folder, "rows": [0]}],
+        },
+    )
+    settings = {
+        "tokenize": load_network(builtin_weights()).grid_settings,
+        "rollout": RolloutSettings(seconds=2.0, count=1),
+        "calibrate": CalibrateSettings(method="simulate"),
+    }
+
+    def counts(device: torch.device) -> Found:
+        load = calibrate.load_simulator
+
+        def moved(*arguments: Any) -> tuple[Simulator, str]:
+            simulator, weights = load(*arguments)
+            network = load_network(builtin_weights()).to(device).eval()
+            return replace(simulator, stepper=Stepper(network), device=device), weights
+
+        calibrate.load_simulator = moved
+        try:
+            return calibrate.work(
+                unit, Path(folder) / device.type, settings, lambda *_: None
+            )
+        finally:
+            calibrate.load_simulator = load
+
+    plain = counts(CPU)
+    with StandIn():
+        return {"ours": counts(DEVICE), "theirs": plain}
+
+
 def resuming(shards: str, folder: str) -> Found:
     """Save, load, go on: as if training had never stopped."""
     given = course(Path(shards), "paper")
@@ -288,14 +373,22 @@ def resuming(shards: str, folder: str) -> Found:
     return {"devices": sorted(devices), "equal": equal, "step": step}
 
 
-def compiled(shards: str, name: str) -> Found:
-    """The network traced by the compiler, but not compiled, against the network itself."""
+def compiled(shards: str, name: str, profile: str = "") -> Found:
+    """The network traced by the compiler, but not compiled, against the network itself.
+
+    The sizes are tiny; all other settings of the model are a profile's, if one is named.
+    """
     given = course(Path(shards), name)
+    if profile:
+        own = load_stages(DEFAULT_FILE, {}).choose(profile).build("model", ModelSettings)
+        tiny = {name: getattr(TINY, name) for name in (*SIZES, "dropout")}
+        given = replace(given, model=replace(own, **tiny))
     network = begun(given, CPU).network
     batch = given.recipe(ProcessGroup())[0][0]
+    how = {"hidden_roads": True, "index": BatchIndex.of(batch)}
     traced = torch.compile(network, dynamic=True, backend="eager")
-    plain = losses(network(batch, hidden_roads=True), batch, given.train)
-    found = losses(traced(batch, hidden_roads=True), batch, given.train)
+    plain = losses(network(batch, **how), batch, given.train)
+    found = losses(traced(batch, **how), batch, given.train)
     return {
         "ours": {key: float(term.loss) for key, term in found.items()},
         "theirs": {key: float(term.loss) for key, term in plain.items()},
@@ -373,6 +466,7 @@ def gpu_rows() -> Found:
 
 CASES: dict[str, Callable[..., Found]] = {
     "benchmarks": benchmarks,
+    "calibrated": calibrated,
     "compiled": compiled,
     "counts": counts,
     "device": device,
@@ -380,6 +474,7 @@ CASES: dict[str, Callable[..., Found]] = {
     "insertion": insertion,
     "resuming": resuming,
     "rollout": rollout,
+    "step": step_costs,
     "training": training,
 }
 

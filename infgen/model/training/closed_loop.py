@@ -9,6 +9,7 @@ come to.
 Where the log says an agent is means its quantised pose, as batches hold it.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -104,19 +105,41 @@ def _move(
 ) -> None:
     """Write the next motion token of all agents seen at both steps, and its end pose."""
     who = logged.observed[:, token] & logged.visible[:, token - 1]  # [scene, agent]
-    before, true = played.pose[:, token - 1][who], logged.pose[:, token][who]
-    agent_type = logged.agent_type[who]
+    take, write = _rows_of(who)
+    before, true = take(played.pose[:, token - 1]), take(logged.pose[:, token])
+    agent_type = take(logged.agent_type)
     wanted = to_local(true, before)
-    likely = logits[who].topk(top).indices.sort().values
+    likely = take(logits).topk(top).indices.sort().values
     taken = nearest_of(wanted, agent_type, likely, ends)
 
     # Agents at their logged poses with logged tokens keep these bit for bit.
-    strays = off[:, token - 1][who] | (taken != logged.motion_token[:, token][who])
+    strays = take(off[:, token - 1]) | (taken != take(logged.motion_token[:, token]))
     led = to_world(ends.pose[agent_type, taken], before)
-    off[:, token][who] = strays
-    played.motion_token[:, token][who] = taken
-    played.label[:, token][who] = nearest(wanted, agent_type, ends)
-    played.pose[:, token][who] = torch.where(strays[:, None], led, true)
+    write(off[:, token], strays)
+    write(played.motion_token[:, token], taken)
+    write(played.label[:, token], nearest(wanted, agent_type, ends))
+    write(played.pose[:, token], torch.where(strays[:, None], led, true))
+
+
+def _rows_of(
+    who: Tensor,
+) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor], None]]:
+    """How rows of [scene, agent] are taken, and written to the places that a mask names.
+
+    A CPU takes those rows alone; elsewhere the host would wait to know them, so there all
+    are taken.
+    """
+
+    def write(values: Tensor, rows: Tensor) -> None:
+        if who.device.type == "cpu":
+            values[who] = rows
+            return
+        mask = who if values.dim() == who.dim() else who[..., None]
+        values.copy_(torch.where(mask, rows.view_as(values), values))
+
+    if who.device.type == "cpu":
+        return lambda values: values[who], write
+    return lambda values: values.flatten(0, 1), write
 
 
 def _column(agents: Agents, token: int) -> TokenStep:

@@ -19,8 +19,8 @@ from jaxtyping import Int64
 from torch.utils.data import DataLoader, Dataset
 
 from infgen.model.batching.batch import Batch, Limits, collate
-from infgen.model.batching.packed import PackedBatch
 from infgen.model.batching.perturbation import Perturbation
+from infgen.model.device.packed import PackedBatch
 from infgen.tokens.scene_tokens import SceneTokens
 from pipeline.stages.tokenize import open_tokens
 from pipeline.stages.train.sampler import ScenePermutation

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import Batch
-from infgen.model.batching.packed import IndexedBatch, PackedBatch, prepared
+from infgen.model.device.packed import IndexedBatch, PackedBatch, prepared
 from infgen.model.training.closed_loop import close_loop
 from infgen.model.training.diagnostics import motion_surprise
 from infgen.model.training.loss_weights import TERMS, supervised

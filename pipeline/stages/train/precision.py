@@ -14,8 +14,8 @@ from torch import Tensor
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import Batch
-from infgen.model.batching.index import BatchIndex
 from infgen.model.batching.tensors import in_float32
+from infgen.model.device.index import BatchIndex
 from infgen.model.logits import Outputs
 from infgen.model.network import Network
 

@@ -5,8 +5,8 @@ from contextlib import contextmanager, nullcontext
 
 from torch import nn
 
-from infgen.model.fused.attention import folded_together
-from infgen.model.fused.tables import tables_together
+from infgen.model.device.attention import folded_together
+from infgen.model.device.tables import tables_together
 from infgen.model.layers import Attention
 from infgen.model.relation_tables import RelationEmbedding
 

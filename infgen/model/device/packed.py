@@ -11,8 +11,8 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from infgen.model.batching.batch import Batch
-from infgen.model.batching.index import BatchIndex
 from infgen.model.batching.tensors import map_tensors
+from infgen.model.device.index import BatchIndex
 
 ALIGNED_BYTES = 16
 """Tensors begin at multiples of this, as products on GPUs want them to."""

@@ -7,10 +7,10 @@ import torch
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
-from infgen.model.batching.index import BatchIndex
 from infgen.model.batching.tensors import in_float32
-from infgen.model.fused.attention import _FusedPairs, _Gate
-from infgen.model.fused.together import launched_together
+from infgen.model.device.attention import _FusedPairs, _Gate
+from infgen.model.device.index import BatchIndex
+from infgen.model.device.together import launched_together
 from infgen.model.neighbour_attention import Shared
 from infgen.model.network import Network
 from infgen.model.relation_tables import (

@@ -1,1 +1,0 @@
-"""The same network with fewer launches, for training on a GPU."""
