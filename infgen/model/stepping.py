@@ -74,8 +74,8 @@ class _InsertionBlocks:
 def _full_precision(x: Tensor) -> AbstractContextManager[object]:
     """Compute logits in float32 under autocast too: rounded ones choose otherwise.
 
-    In bf16 they are off by up to 0.25, and one in four choices of motion tokens differs
-    from float32; with heads in float32 it is one in 25 (``tests/rollout/test_precision``).
+    With heads in bf16 one in four choices of motion tokens differs from float32; with heads
+    in float32 it is one in 25 (``tests/rollout/test_precision``).
     """
     return torch.autocast(x.device.type, enabled=False)
 
