@@ -25,13 +25,13 @@ from infgen.rollout.device.positions import DeviceMask
 from infgen.rollout.device.random_numbers import DeviceStreams
 from infgen.rollout.insertion import INSIDE, of_type, sample_heading
 from infgen.rollout.insertion_state import TURN_PURPOSES, InsertionRequest
-from infgen.rollout.population import Population
+from infgen.rollout.population import InsertedAgents, Population, insertion_pose
 from infgen.rollout.random_streams import WORDS, Purpose
 from infgen.rollout.sampling import choose, sample_event
 from infgen.tokens.scene_tokens import FIRST_MOTION_TOKEN, Presence
 
 LOGGED = 8
-"""Numbers that are logged of an inserted agent: row, type, box and pose."""
+"""Numbers that are logged of an inserted agent: row, type, box, position and heading."""
 FEWEST = 8
 """A pass for fewer rollouts saves nothing."""
 
@@ -75,12 +75,16 @@ class _Proposal:
         cell: Cell that was sampled.
         agent_type: ``AgentType``.
         size_lwh_m: Box.
+        position_m: Position in the grid frame of the ego ...
+        turned_rad: ... and heading relative to it.
         pose: Pose in the scene's frame.
     """
 
     cell: Int64[Tensor, " asked"]
     agent_type: Int64[Tensor, " asked"]
     size_lwh_m: Float32[Tensor, "asked 3"]
+    position_m: Float32[Tensor, "asked 2"]
+    turned_rad: Float32[Tensor, " asked"]
     pose: Float32[Tensor, "asked 3"]
 
 
@@ -230,6 +234,8 @@ class DeviceInsertion:
             cell,
             agent_type,
             of_type(details.size_lwh_m, agent_type),
+            position_m,
+            turned_rad,
             torch.cat([xy_m, heading_rad[:, None]], dim=1),
         )
 
@@ -275,7 +281,7 @@ class DeviceInsertion:
             observed=torch.zeros_like(placed)[None],
             cell=self._grid.encode_cell(in_grid_m)[None],
         )
-        rows = Rows(at, step.presence)
+        rows = Rows(at, step.presence)  # Nobody looks up the number of a place.
         step = step.put(at, new.where(placed[None], step.pick(at)))
         running.entries = self._simulator.stepper.entry_add(entries, step, rows, placed)
         if running.soon is not None:
@@ -285,13 +291,15 @@ class DeviceInsertion:
         running.num_agents.index_add_(0, asked, placed.long())
         near = placed & self._near_ego(proposal.pose, ego_pose)
         running.num_others.index_add_(0, asked, near.long())
-        told = [row, proposal.agent_type]
-        logged = torch.cat(
-            [torch.stack(told, dim=1).float(), proposal.size_lwh_m, proposal.pose], dim=1
-        )
+        told = [
+            torch.stack([row, proposal.agent_type], dim=1).float(),
+            proposal.size_lwh_m,
+            proposal.position_m,
+            proposal.turned_rad[:, None],
+        ]
         slot = torch.where(placed, running.turn[asked], self._turns)
         at = asked * (self._turns + 1) + slot
-        running.log.flatten(0, 1).index_copy_(0, at, logged)
+        running.log.flatten(0, 1).index_copy_(0, at, torch.cat(told, dim=1))
 
 
 def _kept(going: Bool[np.ndarray, " asked"]) -> Int64[np.ndarray, " kept"]:
@@ -310,15 +318,25 @@ def _kept(going: Bool[np.ndarray, " asked"]) -> Int64[np.ndarray, " kept"]:
 def _inserted(
     population: Population, log: Float32[np.ndarray, "rollout turn 8"]
 ) -> Population:
-    """Return the population with the logged agents."""
+    """Return the population with the logged agents.
+
+    Their poses are computed by the host, as those of all agents: to the last bit.
+    """
     rollout, turn = np.nonzero(log[..., 0] >= 0)
     told = log[rollout, turn]
+    agents = InsertedAgents(
+        who=np.ones(len(told), dtype=bool),
+        position_m=told[:, 5:7],
+        turned_rad=told[:, 7],
+        agent_type=told[:, 1].astype(np.int8),
+        size_lwh_m=told[:, 2:5],
+    )
     new, at = population.copy(), (rollout, told[:, 0].astype(np.int64))
     new.agent_number[at] = population.num_agents_so_far[rollout] + turn
     np.add.at(new.num_agents_so_far, rollout, 1)
-    new.agent_type[at] = told[:, 1]
-    new.size_lwh_m[at] = told[:, 2:5]
-    new.pose[at] = told[:, 5:8]
+    new.agent_type[at] = agents.agent_type
+    new.size_lwh_m[at] = agents.size_lwh_m
+    new.pose[at] = insertion_pose(population.pose[rollout, EGO], agents)
     new.motion_token[at] = FIRST_MOTION_TOKEN
     new.presence[at] = Presence.INSERTED
     new.observed[at] = False

@@ -68,4 +68,4 @@ def _multiply(word: Tensor, by: Tensor, halves: Tensor) -> tuple[Tensor, Tensor]
 
 def _halves(word: Int64[Tensor, "*shape"]) -> Int64[Tensor, "*shape 2"]:
     """Split words into their lower and their upper 32 bits, as numbers of 64 bits."""
-    return word.view(torch.int32).long().unflatten(-1, (-1, 2)) & _LOW
+    return word.view(torch.int32).long().view(*word.shape, 2) & _LOW
