@@ -28,7 +28,7 @@ from infgen.sources.womd import scene_or_bad_record
 from pipeline.engine.layout import Root
 from pipeline.engine.stage import FinishedUnit, Report, Source, Unit
 from pipeline.stages.ingest import STAGE
-from pipeline.storage.source_files import find_sources
+from pipeline.storage.sources.source_files import find_sources
 
 SHARED = Path(__file__).parents[1] / "../shared/data/womd"
 BUILTIN = Path(infgen.__file__).parent / "sources/towns/records"

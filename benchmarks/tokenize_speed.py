@@ -30,7 +30,7 @@ from pipeline.settings.request import Request
 from pipeline.settings.stages_file import DEFAULT_FILE
 from pipeline.stages.vocabulary import load_vocabularies
 from pipeline.storage.scenes import read_scenes
-from pipeline.storage.source_files import BUILTIN
+from pipeline.storage.sources.source_files import BUILTIN
 
 SHARED = Path(__file__).parents[1] / "../shared/data/womd"
 DEFAULT_RECORDS = ("training.*-0000[0-2]-of-*", "validation.*-00000-of-*")

@@ -104,6 +104,12 @@ class Population:
         """Take some rollouts."""
         return _take(self, rollouts)
 
+    def put(
+        self, rollouts: Int64[np.ndarray, " replaced"], others: "Population"
+    ) -> "Population":
+        """Replace some rollouts by others. Inverse of ``take``."""
+        return _put(self, rollouts, others)
+
     def copy(self) -> "Population":
         """Return arrays of its own."""
         return replace(self, **{f.name: getattr(self, f.name).copy() for f in fields(self)})

@@ -26,7 +26,7 @@ from pipeline.engine.manifest import read_manifest
 from pipeline.stages.reference import measure_log
 from pipeline.stages.reference_files import read_against, read_logged
 from pipeline.stages.reference_tables import mean_log_counts
-from pipeline.stages.score import score_rollout
+from pipeline.stages.score.stage import score_rollout
 from pipeline.storage.scene_lookup import unit_folders
 
 if TYPE_CHECKING:

@@ -22,10 +22,10 @@ from pipeline.settings.request import Request
 from pipeline.settings.stages_file import StagesFile
 from pipeline.stages.calibration import read_found
 from pipeline.stages.simulation import load_simulator
-from pipeline.storage.raw_scenes import RawScene, RecordPlace, iter_raw_scenes
 from pipeline.storage.scene_lookup import open_scene_lookup
 from pipeline.storage.scene_rollouts import choose, units_of_scenes
-from pipeline.storage.source_files import BUILTIN, find_records
+from pipeline.storage.sources.raw_scenes import RawScene, RecordPlace, iter_raw_scenes
+from pipeline.storage.sources.source_files import BUILTIN, find_records
 
 if TYPE_CHECKING:
     from pipeline.drive.garage import Garage, Scenes

@@ -17,7 +17,7 @@ from pipeline.engine.plan import Plan, PlanError
 from pipeline.engine.runner import RunOptions
 from pipeline.settings.request import Request, complete_request, find_file, read_request
 from pipeline.settings.stages_file import load_stages
-from pipeline.storage.source_files import absolute
+from pipeline.storage.sources.source_files import absolute
 from pipeline.workers.dask_cluster import choose_workers
 
 RootFolder = Annotated[

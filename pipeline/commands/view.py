@@ -25,7 +25,7 @@ from pipeline.api.view_files import (
 from pipeline.engine.events import Event
 from pipeline.engine.layout import Root
 from pipeline.storage.scenes import file_name
-from pipeline.storage.source_files import BUILTIN, RECORDS_IN_FOLDER
+from pipeline.storage.sources.source_files import BUILTIN, RECORDS_IN_FOLDER
 
 if TYPE_CHECKING:
     from infgen.views.scene.view_model import ViewModel

@@ -6,7 +6,7 @@ from pathlib import Path
 from infgen.errors import ConfigError
 from pipeline.comparison.runs import Comparison
 from pipeline.engine.events import Event
-from pipeline.storage.source_files import find_records as find_raw
+from pipeline.storage.sources.source_files import find_records as find_raw
 from pipeline.storage.towns import Order, write_towns
 
 TOWNS = "towns"

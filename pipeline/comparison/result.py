@@ -10,7 +10,7 @@ from pipeline.comparison.execution import ExecutedRun
 from pipeline.comparison.scores import Scored, read_logs, read_scored
 from pipeline.comparison.statistics import Numbers, combine, ratio
 from pipeline.settings.presets import Arm, Preset
-from pipeline.stages.score_summary import Tally
+from pipeline.stages.score.summary import Tally
 
 LONG, MOTION_ONLY, OFFICIAL_PLAY = "long", "motion-only", "wosac"
 """Modes of rollouts: whose rollout set is which of the paper's tables."""

@@ -16,10 +16,10 @@ from pipeline.engine.layout import read_json
 from pipeline.engine.manifest import read_manifest
 from pipeline.engine.plan import Plan
 from pipeline.stages.reference_files import read_against, read_binned, read_logged
-from pipeline.stages.score_proper import PROPER, read_proper
-from pipeline.stages.score_summary import Tally
-from pipeline.stages.score_tables import WOSAC
-from pipeline.stages.score_write import read_tally
+from pipeline.stages.score.proper import PROPER, read_proper
+from pipeline.stages.score.summary import Tally
+from pipeline.stages.score.tables import WOSAC
+from pipeline.stages.score.write import read_tally
 
 REFERENCE = "reference"
 OFFICIAL = "wosac"

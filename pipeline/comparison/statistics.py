@@ -10,7 +10,7 @@ from infgen.metrics.long_term.protocols import FEATURES, PROTOCOLS
 from infgen.metrics.long_term.table import named
 from infgen.views.sheets import Measured
 from pipeline.comparison.scores import Scored
-from pipeline.stages.score_summary import Tally
+from pipeline.stages.score.summary import Tally
 
 _T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
 """Student's t that 97.5 % lie below, by degrees of freedom from 1."""

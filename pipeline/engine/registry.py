@@ -12,7 +12,7 @@ MODULES = {
     "calibrate": "pipeline.stages.calibrate",
     "rollout": "pipeline.stages.rollout",
     "reference": "pipeline.stages.reference",
-    "score": "pipeline.stages.score",
+    "score": "pipeline.stages.score.stage",
     "report": "pipeline.stages.report.stage",
 }
 """In the order of the data."""

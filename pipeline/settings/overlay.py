@@ -12,7 +12,7 @@ from infgen.errors import ConfigError
 from pipeline.engine.layout import Root
 from pipeline.engine.stage import Source
 from pipeline.settings.lined_yaml import LinedMapping, did_you_mean, inner, known
-from pipeline.storage.source_files import find_sources
+from pipeline.storage.sources.source_files import find_sources
 
 
 @dataclass(frozen=True, slots=True)

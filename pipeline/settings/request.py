@@ -18,7 +18,7 @@ from pipeline.engine.plan import Plan, PlanError, make_plan
 from pipeline.settings.lined_yaml import LinedMapping, inner, load
 from pipeline.settings.stages_file import DEFAULT_FILE, StagesFile, load_stages
 from pipeline.storage.initial_weights import INITIAL_WEIGHTS
-from pipeline.storage.source_files import absolute
+from pipeline.storage.sources.source_files import absolute
 
 NO_PROFILE = "default"
 LAST = "last"

@@ -1,7 +1,7 @@
 """Ingest: raw records -> scenes in Zarr, an index of them, and a quarantine of the rest.
 
-One unit per TFRecord, or per group of scene files (``pipeline.storage.scene_groups``).
-Memory stays bounded whatever the file holds: scenes are written in groups of bounded size
+One unit per TFRecord, or per group of scene files
+(``pipeline.storage.sources.scene_groups``). Memory stays bounded whatever the file holds: scenes are written in groups of bounded size
 as they come. A record that cannot be used is a named row of ``quarantine.parquet``; it
 never stops the file, and the file never stops the stage.
 """
@@ -240,7 +240,7 @@ STAGE = Stage(
         "pipeline.stages.ingest",
         "pipeline.stages.ingest_records",
         "pipeline.storage.parquet",
-        "pipeline.storage.scene_groups",
+        "pipeline.storage.sources.scene_groups",
         "pipeline.storage.splits",
         "pipeline.storage.zarr_store",
     ),

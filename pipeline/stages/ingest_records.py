@@ -11,7 +11,7 @@ from typing import Any
 from infgen.scene import Scene
 from infgen.sources.tfrecord import BadRecord, Record, RecordError, iter_records
 from infgen.sources.womd import scene_or_bad_record
-from pipeline.storage.scene_groups import scene_of
+from pipeline.storage.sources.scene_groups import scene_of
 
 WOMD = "womd"
 ANNOTATION_HZ = 10.0

@@ -127,6 +127,6 @@ STAGE = Stage(
         "pipeline.stages.reference",
         "pipeline.stages.reference_files",
         "pipeline.stages.reference_tables",
-        "pipeline.stages.score_write",
+        "pipeline.stages.score.write",
     ),
 )

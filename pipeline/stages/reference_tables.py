@@ -13,8 +13,8 @@ from infgen.metrics.proper.retrieval import LogCourse, sample_logs
 from infgen.metrics.windows import cut_windows
 from pipeline.engine.stage import Progress
 from pipeline.stages import reference_files as files
-from pipeline.stages.score_summary import Tally
-from pipeline.stages.score_write import ROWS, join_parts, rows_of, write_part, write_tally
+from pipeline.stages.score.summary import Tally
+from pipeline.stages.score.write import ROWS, join_parts, rows_of, write_part, write_tally
 
 LOG_PREFIX = "log/"
 """Before the metrics of a log that is scored as if it were a rollout."""

@@ -13,8 +13,8 @@ from infgen.scene import Scene
 from pipeline.engine.atomic import MANIFEST
 from pipeline.engine.layout import KEY_DIGITS, Root
 from pipeline.engine.manifest import read_manifest
-from pipeline.storage.raw_scenes import RawScene, iter_raw_scenes
-from pipeline.storage.source_files import RawRecords, find_records
+from pipeline.storage.sources.raw_scenes import RawScene, iter_raw_scenes
+from pipeline.storage.sources.source_files import RawRecords, find_records
 from pipeline.storage.splits import in_split, split_of
 
 if TYPE_CHECKING:

@@ -9,10 +9,10 @@ from infgen.errors import ConfigError
 from infgen.scene import Scene
 from pipeline.engine.layout import Root
 from pipeline.engine.manifest import read_manifest
-from pipeline.storage.raw_scenes import iter_raw_scenes
 from pipeline.storage.rollouts import read_rollouts
 from pipeline.storage.saved_rollouts import read_saved
-from pipeline.storage.source_files import find_records
+from pipeline.storage.sources.raw_scenes import iter_raw_scenes
+from pipeline.storage.sources.source_files import find_records
 
 if TYPE_CHECKING:
     from infgen.rollout.rollout import Rollout

@@ -10,7 +10,7 @@ from pipeline.comparison.runs import ArmRun
 from pipeline.comparison.scores import Scored
 from pipeline.settings.overlay import Overlay
 from pipeline.settings.presets import Arm, Preset
-from pipeline.stages.score_summary import Tally
+from pipeline.stages.score.summary import Tally
 
 NOTHING = Overlay((), {})
 

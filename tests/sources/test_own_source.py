@@ -13,7 +13,7 @@ from infgen.sources.scene_files import SceneSource
 from pipeline.engine.layout import Root
 from pipeline.stages.ingest import STAGE
 from pipeline.storage.scenes import read_scenes
-from pipeline.storage.source_files import find_sources
+from pipeline.storage.sources.source_files import find_sources
 from tests.pipeline.stages.test_ingest import Files, no_progress
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

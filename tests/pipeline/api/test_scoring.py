@@ -9,8 +9,8 @@ from infgen.errors import ConfigError
 from infgen.metrics.long_term.protocols import PROTOCOLS
 from infgen.metrics.wosac import metric as wosac
 from pipeline.stages.reference import measure_log
-from pipeline.stages.score import _Scorer
-from pipeline.stages.score_summary import Tally
+from pipeline.stages.score.stage import _Scorer
+from pipeline.stages.score.summary import Tally
 from tests.exports.replays import replay
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
+from tests.pipeline.stages.test_score import as_rollout
 
 from cli import main
 from infgen.config import IngestSettings
@@ -21,7 +22,6 @@ from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
 from pipeline.storage.zarr_store import write_records
 from tests.metrics.golden import GOLDEN, golden_metrics, needs_goldens
 from tests.metrics.wosac.test_submission import scenario, submission
-from tests.pipeline.stages.test_score import as_rollout
 
 SCENES = 3
 NAMED = {

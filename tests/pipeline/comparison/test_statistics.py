@@ -6,7 +6,7 @@ import pytest
 from infgen.metrics.long_term.protocols import FEATURES
 from infgen.views.sheets import Measured
 from pipeline.comparison.statistics import mean_curve, over_seeds, ratio, student_t, truth
-from pipeline.stages.score_summary import Tally
+from pipeline.stages.score.summary import Tally
 from tests.pipeline.compared import scored
 
 

@@ -13,7 +13,7 @@ from pipeline.comparison.figures import charts, curve_sheet
 from pipeline.comparison.result import ComparisonResult
 from pipeline.comparison.runs import ArmRun
 from pipeline.comparison.tables import caveats, standing_alone, tables
-from pipeline.stages.score_summary import Tally
+from pipeline.stages.score.summary import Tally
 from tests.pipeline.compared import arm, compared, scored
 
 INFGEN = arm("infgen", label="InfGen", published="InfGen")

@@ -15,9 +15,9 @@ from infgen.sources.towns import builtin_records
 from pipeline.engine.layout import Root
 from pipeline.engine.stage import Source, Unit
 from pipeline.stages.ingest import STAGE
-from pipeline.storage import scene_groups
 from pipeline.storage.scenes import read_scenes
-from pipeline.storage.source_files import find_sources
+from pipeline.storage.sources import scene_groups
+from pipeline.storage.sources.source_files import find_sources
 from pipeline.storage.splits import split_of
 from tests.pipeline.stages.test_ingest import Files, no_progress
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
+from tests.pipeline.stages.test_score import REFERENCE, Inputs, ingested
 
 from infgen.config import ReferenceSettings, TokenSettings
 from infgen.metrics.agent_count import mean_counts
@@ -20,7 +21,6 @@ from pipeline.stages.reference_files import (
     read_courses,
     read_logged,
 )
-from tests.pipeline.stages.test_score import REFERENCE, Inputs, ingested
 
 FILES = [f"validation.tfrecord-0000{at}-of-00002" for at in range(2)]
 

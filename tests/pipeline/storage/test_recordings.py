@@ -12,7 +12,6 @@ from cli import main
 from infgen.config import RolloutSettings
 from infgen.errors import ConfigError
 from infgen.settings import key_values
-from pipeline.engine.atomic import StoreError
 from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import FinishedUnit
 from pipeline.stages import rollout as stage

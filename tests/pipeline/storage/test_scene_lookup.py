@@ -20,7 +20,7 @@ from pipeline.storage.scene_lookup import (
     open_split,
     unit_folders,
 )
-from pipeline.storage.source_files import RawRecords
+from pipeline.storage.sources.source_files import RawRecords
 
 
 def silent(done, total, note=""):

@@ -23,10 +23,11 @@ from infgen.sources.towns import builtin_records
 from infgen.sources.womd import iter_scenes
 from pipeline.engine.atomic import write_json
 from pipeline.engine.stage import FinishedUnit, Stage
-from pipeline.stages import reference, score
+from pipeline.stages import reference
 from pipeline.stages.reference_files import read_counts
 from pipeline.stages.report import stage as report
 from pipeline.stages.report.passport import times
+from pipeline.stages.score import stage as score
 from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
 from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.zarr_store import write_records

@@ -32,7 +32,7 @@ from infgen.metrics.windows import cut_windows
 from infgen.rollout.rollout import Rollout
 from infgen.scene import Scene
 from infgen.spatial.road_edges import RoadEdges
-from pipeline.stages.score_write import SUM_SCHEMA
+from pipeline.stages.score.write import SUM_SCHEMA
 
 PARTS, SUMS = "proper.parquet", "proper_sums.parquet"
 CURVES = "proper_curves.parquet"

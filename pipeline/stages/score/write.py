@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.stages.score_summary import Tally
+from pipeline.stages.score.summary import Tally
 
 SCHEMA = {
     "scenario_id": pl.String,

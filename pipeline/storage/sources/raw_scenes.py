@@ -7,7 +7,7 @@ from infgen.scene import Scene
 from infgen.sources.registry import FoundScene
 from infgen.sources.tfrecord import BadRecord, RecordError, iter_records, read_record
 from infgen.sources.womd import decode_scene, read_scenario_id
-from pipeline.storage.source_files import RawRecords
+from pipeline.storage.sources.source_files import RawRecords
 
 
 class RecordPlace(NamedTuple):

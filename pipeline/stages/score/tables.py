@@ -9,11 +9,11 @@ from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import read_json
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress
 from pipeline.stages.reference_files import read_counts
-from pipeline.stages.score_proper import CURVES as PROPER_CURVES
-from pipeline.stages.score_proper import ProperTally, read_proper, write_proper_curves
-from pipeline.stages.score_proper_summary import summarize
-from pipeline.stages.score_summary import Gathered, Summary, Tally
-from pipeline.stages.score_write import ROWS, join_parts, read_tally, write_curves
+from pipeline.stages.score.proper import CURVES as PROPER_CURVES
+from pipeline.stages.score.proper import ProperTally, read_proper, write_proper_curves
+from pipeline.stages.score.proper_summary import summarize
+from pipeline.stages.score.summary import Gathered, Summary, Tally
+from pipeline.stages.score.write import ROWS, join_parts, read_tally, write_curves
 
 WOSAC = "wosac.json"
 

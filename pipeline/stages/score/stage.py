@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from infgen.rollout.rollout import Rollout
     from infgen.scene import Scene
     from infgen.spatial.road_edges import RoadEdges
-    from pipeline.stages.score_proper import SceneEnsemble
-    from pipeline.stages.score_write import ScoreRow
+    from pipeline.stages.score.proper import SceneEnsemble
+    from pipeline.stages.score.write import ScoreRow
 
 
 def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
@@ -83,9 +83,9 @@ def work(
         read_logged,
         write_counts,
     )
-    from pipeline.stages.score_proper import write_proper  # noqa: PLC0415
-    from pipeline.stages.score_tables import WOSAC  # noqa: PLC0415
-    from pipeline.stages.score_write import ROWS, write_part, write_tally  # noqa: PLC0415
+    from pipeline.stages.score.proper import write_proper  # noqa: PLC0415
+    from pipeline.stages.score.tables import WOSAC  # noqa: PLC0415
+    from pipeline.stages.score.write import ROWS, write_part, write_tally  # noqa: PLC0415
     from pipeline.storage.rollouts import read_lights, read_rollouts  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
@@ -126,8 +126,8 @@ class _Scorer:
         settings: Mapping[str, Any],
     ) -> None:
         from infgen.metrics.long_term.reference import no_counts  # noqa: PLC0415
-        from pipeline.stages.score_proper import ProperTally  # noqa: PLC0415
-        from pipeline.stages.score_summary import Tally  # noqa: PLC0415
+        from pipeline.stages.score.proper import ProperTally  # noqa: PLC0415
+        from pipeline.stages.score.summary import Tally  # noqa: PLC0415
 
         self.tally: Tally = Tally()
         self.counts: Counts = no_counts()
@@ -144,7 +144,7 @@ class _Scorer:
         from infgen.metrics.long_term.reference import count_simulated  # noqa: PLC0415
         from infgen.metrics.long_term.table import make_row  # noqa: PLC0415
         from infgen.spatial.road_edges import scene_road_edges  # noqa: PLC0415
-        from pipeline.stages.score_write import rows_of  # noqa: PLC0415
+        from pipeline.stages.score.write import rows_of  # noqa: PLC0415
 
         edges, radius_m = scene_road_edges(scene), self._settings.presence_radius_m
         self.official.append(_score_wosac(scene, rollouts, self._settings.wosac_version))
@@ -169,7 +169,7 @@ class _Scorer:
         self, scene: "Scene", edges: "RoadEdges | None", rollouts: "Sequence[Rollout]"
     ) -> "SceneEnsemble | None":
         """Begin to gather rollouts for protocol ``proper``, if it is asked for."""
-        from pipeline.stages.score_proper import SceneEnsemble  # noqa: PLC0415
+        from pipeline.stages.score.proper import SceneEnsemble  # noqa: PLC0415
 
         if not self._settings.proper:
             return None
@@ -178,7 +178,7 @@ class _Scorer:
 
     def rows(self) -> "list[ScoreRow]":
         """Rows of the rollouts, of protocol ``proper``, and of the official metric."""
-        from pipeline.stages.score_write import rows_of  # noqa: PLC0415
+        from pipeline.stages.score.write import rows_of  # noqa: PLC0415
 
         found = list(self._rows)
         for scenario_id in self.proper.parts:
@@ -280,7 +280,7 @@ def finish(
     progress: Progress,
 ) -> Report:
     """Join the units' scores; write tables, curves and the summary."""
-    from pipeline.stages.score_tables import gather  # noqa: PLC0415
+    from pipeline.stages.score.tables import gather  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
     return asdict(gather(inputs, units, target, settings, progress))
@@ -295,11 +295,11 @@ STAGE = Stage(
     finish=finish,
     modules=(
         "pipeline.stages.reference_files",
-        "pipeline.stages.score",
-        "pipeline.stages.score_proper",
-        "pipeline.stages.score_proper_summary",
-        "pipeline.stages.score_summary",
-        "pipeline.stages.score_tables",
-        "pipeline.stages.score_write",
+        "pipeline.stages.score.stage",
+        "pipeline.stages.score.proper",
+        "pipeline.stages.score.proper_summary",
+        "pipeline.stages.score.summary",
+        "pipeline.stages.score.tables",
+        "pipeline.stages.score.write",
     ),
 )

@@ -8,7 +8,7 @@ from infgen.config import ReferenceSettings, ScoreSettings
 from infgen.metrics.intervals import bootstrap
 from infgen.metrics.proper.quantities import QUANTITIES
 from infgen.metrics.proper.split import split_numbers
-from pipeline.stages.score_proper import ProperTally
+from pipeline.stages.score.proper import ProperTally
 
 
 def summarize(

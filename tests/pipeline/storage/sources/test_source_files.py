@@ -18,8 +18,8 @@ from pipeline.engine.runner import RunOptions, run
 from pipeline.engine.status import stage_statuses
 from pipeline.settings.request import Request
 from pipeline.settings.stages_file import DEFAULT_FILE
-from pipeline.storage.fingerprints import fingerprint
-from pipeline.storage.source_files import absolute, find_sources
+from pipeline.storage.sources.fingerprints import fingerprint
+from pipeline.storage.sources.source_files import absolute, find_sources
 
 
 def masked(data):
@@ -128,7 +128,7 @@ def test_identities_are_remembered_until_a_file_changes(write, root, monkeypatch
     path = write("a.tfrecord", tfrecord(b"one"))
     (before,) = find_sources([str(path)], root)
     monkeypatch.setattr(
-        "pipeline.storage.fingerprints.fingerprint", lambda path: "read again"
+        "pipeline.storage.sources.fingerprints.fingerprint", lambda path: "read again"
     )
 
     (known,) = find_sources([str(path)], root)

@@ -12,7 +12,8 @@ from infgen.metrics.long_term.protocols import FEATURES, PROTOCOLS
 from infgen.rollout.rollout import NEVER, Rollout
 from infgen.scene import Scene
 from pipeline.engine.stage import FinishedUnit
-from pipeline.stages import reference, score
+from pipeline.stages import reference
+from pipeline.stages.score import stage as score
 from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
 from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.zarr_store import write_records

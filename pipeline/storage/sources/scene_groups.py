@@ -13,7 +13,7 @@ from typing import Any
 from infgen.sources.registry import FoundScene
 from infgen.sources.scene_files import SceneFiles
 from pipeline.engine.stage import Source
-from pipeline.storage.fingerprints import FingerprintCache
+from pipeline.storage.sources.fingerprints import FingerprintCache
 from pipeline.storage.splits import group_name
 
 SCENES_PER_GROUP = 64

@@ -16,7 +16,7 @@ from infgen.errors import ConfigError
 from infgen.sources.remote import file_system
 from pipeline.engine.layout import Root
 from pipeline.engine.stage import Source
-from pipeline.storage.fingerprints import FingerprintCache
+from pipeline.storage.sources.fingerprints import FingerprintCache
 
 if TYPE_CHECKING:
     from infgen.sources.registry import FoundScene
@@ -55,7 +55,7 @@ def find_sources(patterns: Sequence[str], root: Root) -> tuple[Source, ...]:
     memory = FingerprintCache(root)
     found = [Source(url, _name(url), memory.fingerprint(url)) for url in urls]
     if scenes:
-        from pipeline.storage.scene_groups import group_scenes  # noqa: PLC0415
+        from pipeline.storage.sources.scene_groups import group_scenes  # noqa: PLC0415
 
         found += group_scenes(scenes, memory)
     memory.save()

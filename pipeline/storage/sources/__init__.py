@@ -1,0 +1,1 @@
+"""Raw records and scene files: which there are, what they are, and their scenes."""
