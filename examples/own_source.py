@@ -1,7 +1,7 @@
 """A source of one's own in three functions: logs as JSON files, a scene in each.
 
-`docs/own-source.md` explains it. A file holds `{"id", "split", "ego", "agents"}`; agents are
-`{"name", "xy_m": [[x, y], ...], "heading_rad": [...], "size_lwh_m": [l, w, h]}`.
+`docs/own-source.md` explains it. A file holds `{"id", "split", "ego", "agents"}`; an agent
+is `{"name", "xy_m": [[x, y], ...], "heading_rad": [...], "size_lwh_m": [l, w, h]}`.
 """
 
 import json
