@@ -9,6 +9,7 @@ from infgen.geometry import (
     boxes_overlap,
     grid_squares,
     to_local,
+    wrap_angle,
 )
 
 CAR = np.array([4.0, 2.0])
@@ -73,3 +74,16 @@ def test_squares_above_each_other_are_consecutive_and_columns_far_apart():
     number = grid_squares(xy_m, 10.0)
 
     assert number.tolist() == [[0, 0], [1, -SQUARES_PER_COLUMN]]
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_angles_wrap_to_the_bits_of_a_remainder(kind):
+    turn, half = kind(2 * np.pi), kind(np.pi)
+    ends = np.array([-half, half, 0.0, -0.0, -turn, turn, 3 * half, -3 * half], dtype=kind)
+    near = [np.nextafter(ends, kind(way)) for way in (-9, 9)]
+    wide = np.random.default_rng(0).uniform(-9, 9, 10_000).astype(kind)
+    for angle_rad in (np.concatenate([ends, *near]), wide, 100 * wide):
+        expected = (angle_rad + half) % turn - half
+        expected = np.where(expected >= half, -half, expected)
+
+        assert wrap_angle(angle_rad).tobytes() == expected.tobytes()
