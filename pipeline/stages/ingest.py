@@ -1,9 +1,10 @@
 """Ingest: raw records -> scenes in Zarr, an index of them, and a quarantine of the rest.
 
 One unit per TFRecord, or per group of scene files
-(``pipeline.storage.sources.scene_groups``). Memory stays bounded whatever the file holds: scenes are written in groups of bounded size
-as they come. A record that cannot be used is a named row of ``quarantine.parquet``; it
-never stops the file, and the file never stops the stage.
+(``pipeline.storage.sources.scene_groups``). Memory stays bounded whatever the file holds:
+scenes are written in groups of bounded size as they come. A record that cannot be used is a
+named row of ``quarantine.parquet``; it never stops the file, and the file never stops the
+stage.
 """
 
 from collections.abc import Sequence
