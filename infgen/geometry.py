@@ -16,7 +16,7 @@ def wrap_angle(angle_rad: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Bring angles to [-pi, pi)."""
     turn = angle_rad.dtype.type(2 * np.pi)
     half = angle_rad.dtype.type(np.pi)
-    wrapped = _remainder(angle_rad + half, turn) - half
+    wrapped = _remainder(np.asarray(angle_rad + half), turn) - half
     # Rounding may lift an angle just below -pi to exactly +pi.
     return np.where(wrapped >= half, -half, wrapped)
 
