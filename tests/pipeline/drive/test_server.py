@@ -1,4 +1,7 @@
-"""The server as others see it: real sockets, real requests."""
+"""The server as others see it: real sockets, real requests.
+
+Together they take more than ten seconds; the rules themselves are in ``test_access.py``.
+"""
 
 import asyncio
 import json
@@ -12,6 +15,7 @@ from tornado.websocket import websocket_connect
 from pipeline.drive.assets import PAGE
 from pipeline.drive.server import DriveServer
 
+pytestmark = pytest.mark.slow
 UPGRADE = {
     "Connection": "Upgrade",
     "Upgrade": "websocket",
