@@ -8,17 +8,17 @@ from typing import cast
 from infgen.rollout.simulator import Simulator
 from infgen.scene import Scene
 
-_PACKAGED = "pipeline.stages.packaged"
-"""Knows how weights and records lie on disk, as ``infgen`` does not; imported when used."""
+_FACADE = "infgen"
+"""Knows how weights and records lie on disk, as its parts do not; imported when used."""
 
 
 @lru_cache(maxsize=1)
 def packaged_simulator() -> Simulator:
     """Return the weights that come with the package, loaded once per process."""
-    return cast(Simulator, import_module(_PACKAGED).packaged_simulator())
+    return cast(Simulator, import_module(_FACADE).load("towns").simulator)
 
 
 @lru_cache(maxsize=1)
 def packaged_scenes() -> Sequence[Scene]:
     """Return the training scenes that come with the package, read once per process."""
-    return cast(Sequence[Scene], import_module(_PACKAGED).packaged_scenes())
+    return tuple(import_module(_FACADE).open_scenes("builtin", split="training"))

@@ -25,7 +25,7 @@ class PlannerSession(Session):
     ) -> None:
         with one_thread():
             super().__init__(simulator, starts)
-        self._starts, self._weights = list(starts), weights
+        self._weights = weights
         self._settings = simulator.settings
         self._frames: list[Frame] = []
 

@@ -83,6 +83,11 @@ class TrafficSimulator:
         return PlannerSession(simulator, begin(simulator, scene), self.weights)
 
     @property
+    def simulator(self) -> "Simulator":
+        """The network with its settings, as ``infgen.environment`` takes it."""
+        return self._loaded[0]
+
+    @property
     def weights(self) -> str:
         """Fingerprint of the weights."""
         return self._loaded[1]
