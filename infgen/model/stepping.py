@@ -179,7 +179,7 @@ class Stepper:
                 past.flatten(0, 2), past_index, sight.past_relation, sight.past_present
             )
             x = block(x, own, sight)
-            past.flatten(0, 1)[rows.at, place] = before
+            past.flatten(0, 1)[rows.at, place] = before.to(past.dtype)
         memory.pose[:, :, place] = token_step.pose
         memory.visible[:, :, place] = visible
         memory.columns += 1
@@ -263,7 +263,7 @@ class Stepper:
             flat = kept.flatten(0, 1)
             if real is not None:
                 new = torch.where(real[:, None], new, flat[fresh.at])
-            flat.index_copy_(0, fresh.at, new)
+            flat.index_copy_(0, fresh.at, new.to(flat.dtype))
         return replace(entries, token_step=token_step, within=entries.within | within)
 
     @torch.no_grad()

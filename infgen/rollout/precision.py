@@ -10,8 +10,10 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from infgen.model.batching.tensors import in_float32
+from infgen.model.neighbours import MapFeatures
 from infgen.model.network import Network
 from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.stepping import Stepper
@@ -55,6 +57,20 @@ class PrecisionStepper(Stepper):
         """Encode maps and start with an empty past."""
         with self._context_of_products():
             return in_float32(super().begin(*args, **named))
+
+    def encode_maps(self, *args: Any, **named: Any) -> Tensor:
+        """Return what every map token is, map after map."""
+        with self._context_of_products():
+            return super().encode_maps(*args, **named).float()
+
+    def lay_out_maps(self, *args: Any, **named: Any) -> MapFeatures:
+        """Put maps side by side that were encoded before."""
+        with self._context_of_products():
+            return in_float32(super().lay_out_maps(*args, **named))
+
+    def begin_on(self, *args: Any, **named: Any) -> StepMemory:
+        """Start with an empty past on encoded maps; no product is made."""
+        return super().begin_on(*args, **named)
 
     def motion_step(self, *args: Any, **named: Any) -> MotionStep:
         """Append a column to the past and say what follows it."""

@@ -4,9 +4,14 @@ from typing import Literal, TypedDict
 
 
 class RolloutOverrides(TypedDict, total=False):
-    """Any of ``RolloutSettings``, which says what each means (`infgen settings` too)."""
+    """Any of ``RolloutSettings``, which says what each means (`infgen settings` too).
+
+    Only stage ``rollout`` takes recorded drives (``recordings``).
+    """
 
     split: str
+    device: Literal["auto", "cpu", "cuda"]
+    precision: Literal["auto", "float32", "bf16"]
     mode: Literal["long", "motion-only", "wosac"]
     seconds: float | None
     count: int

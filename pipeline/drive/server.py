@@ -7,10 +7,10 @@ import asyncio
 import time
 from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from socket import create_server
 from typing import Any
 
 from tornado.httpserver import HTTPServer
-from tornado.netutil import bind_sockets
 from tornado.web import Application
 
 from pipeline.drive import messages
@@ -64,10 +64,11 @@ class DriveServer:
             OSError: if the port is taken.
             ValueError: if the first scene cannot be simulated.
         """
-        sockets = bind_sockets(port, LOOPBACK)
-        self.access = Access.at(sockets[0].getsockname()[1])
+        listening = create_server((LOOPBACK, port))  # Closed if the port is taken.
+        listening.setblocking(False)
+        self.access = Access.at(listening.getsockname()[1])
         server = HTTPServer(self._application(), max_header_size=8192, max_body_size=1024)
-        server.add_sockets(sockets)
+        server.add_socket(listening)
         try:
             await self._load(self._number, self._seed)
             opened(self.access.url)

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.pipeline.stages.test_score import as_rollout
 
 from infgen.config import TokenSettings
 from infgen.metrics.flow import FlowCounts, add_up, count_flow
 from infgen.metrics.traffic import from_log, from_rollout
+from tests.pipeline.stages.score.test_stage import as_rollout
 
 TOKENS = 14
 """Token steps of 8 s that are looked at."""

@@ -37,9 +37,13 @@ AGREEMENT = 0.93
 class Recorder(Stepper):
     """A stepper that keeps what it was shown and what it said."""
 
-    def begin(self, *given):
-        self.given, self.steps = given, []
-        return super().begin(*given)
+    def encode_maps(self, roads):
+        self.roads = roads
+        return super().encode_maps(roads)
+
+    def begin_on(self, maps, scene, rows):
+        self.begun, self.steps = (scene, rows), []
+        return super().begin_on(maps, scene, rows)
 
     def motion_step(self, memory, token_step, rows=None):
         said = super().motion_step(memory, token_step, rows)
@@ -108,7 +112,7 @@ def bf16(network, recorded):
     """The same token steps in bfloat16: the memory, the answers, and who made bfloat16."""
     stepper = make_stepper(network, "bf16")
     with Bf16Lines() as lines:
-        memory = stepper.begin(*recorded.given)
+        memory = stepper.begin(recorded.roads, *recorded.begun)
         said = [stepper.motion_step(memory, *shown) for *shown, _ in recorded.steps]
     return memory, said, lines.counts
 

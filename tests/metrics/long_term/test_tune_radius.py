@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.pipeline.stages.test_score import as_rollout
 
 from infgen.config import TokenSettings
 from infgen.metrics.long_term.binned import bin_traffic
@@ -18,6 +17,7 @@ from infgen.metrics.long_term.tune_radius import (
 from infgen.metrics.traffic import from_log, from_rollout
 from infgen.metrics.windows import cut_windows
 from infgen.spatial.road_edges import scene_road_edges
+from tests.pipeline.stages.score.test_stage import as_rollout
 
 
 def against_counts(counts):

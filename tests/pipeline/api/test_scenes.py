@@ -20,10 +20,10 @@ def ids():
 
 COUNTED = """
 import infgen
-from pipeline.storage import scene_lookup
+from pipeline.storage.sources import raw_scenes
 
-decoded, decode = [], scene_lookup.decode_scene
-scene_lookup.decode_scene = lambda data: decoded.append(0) or decode(data)
+decoded, decode = [], raw_scenes.decode_scene
+raw_scenes.decode_scene = lambda data: decoded.append(0) or decode(data)
 scenes = infgen.open_scenes("builtin", split="validation")
 part = scenes[2:5]
 print(len(decoded))

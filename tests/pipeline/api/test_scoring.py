@@ -20,7 +20,8 @@ def reference(builtin):
 
 
 def test_long_term_scores_are_those_of_the_stage(rollouts, reference):
-    scorer = _Scorer(reference.against, ReferenceSettings(), ScoreSettings())
+    settings = {"reference": ReferenceSettings(), "score": ScoreSettings(proper=False)}
+    scorer = _Scorer(reference.against, [], False, settings)
     scorer.take(rollouts.scene, rollouts.rollouts)
     scorer.tally.close_unit()
     expected = scorer.tally.means[rollouts.scene.scenario_id]

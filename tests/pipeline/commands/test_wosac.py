@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
-from tests.pipeline.stages.test_score import as_rollout
 
 from cli import main
 from infgen.config import IngestSettings
@@ -22,6 +21,7 @@ from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
 from pipeline.storage.zarr_store import write_records
 from tests.metrics.golden import GOLDEN, golden_metrics, needs_goldens
 from tests.metrics.wosac.test_submission import scenario, submission
+from tests.pipeline.stages.score.test_stage import as_rollout
 
 SCENES = 3
 NAMED = {

@@ -23,7 +23,7 @@ def test_code_without_a_source_is_refused():
 
 
 def test_what_decides_rollouts_is_found_through_imports():
-    found = imported_modules(("pipeline.stages.rollout", "pipeline.stages.simulation"))
+    found = imported_modules(load_stage("pipeline.stages.rollout").modules)
 
     assert found.keys() >= {"infgen.geometry", "infgen.rollout.session", "infgen.model"}
     assert "infgen.config" not in found, "settings are in keys by their values"

@@ -25,9 +25,9 @@ class LimitedStepper(Stepper):
         super().__init__(network)
         self.most, self.begun = most, []
 
-    def begin(self, roads, scene, rows):
+    def begin_on(self, maps, scene, rows):
         self.begun.append(len(scene))
-        return super().begin(roads, scene, rows)
+        return super().begin_on(maps, scene, rows)
 
     def motion_step(self, memory, token_step, rows=None):
         if len(memory.scene) > self.most and memory.columns == FAILS_AT:

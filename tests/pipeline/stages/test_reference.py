@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
-from tests.pipeline.stages.test_score import REFERENCE, Inputs, ingested
 
 from infgen.config import ReferenceSettings, TokenSettings
 from infgen.metrics.agent_count import mean_counts
@@ -21,6 +20,7 @@ from pipeline.stages.reference_files import (
     read_courses,
     read_logged,
 )
+from tests.pipeline.stages.score.test_stage import REFERENCE, Inputs, ingested
 
 FILES = [f"validation.tfrecord-0000{at}-of-00002" for at in range(2)]
 

@@ -63,7 +63,7 @@ def vocabularies(tmp_path, metre_moves, bent_roads):
 
 @pytest.fixture
 def scenes(drive, crossing, parked):
-    named = {"a": drive(), "b": crossing(), "bad": drive(now=13), "c": parked()}
+    named = {"a": drive(), "b": crossing(), "bad": drive(now=3), "c": parked()}
     return [dataclasses.replace(scene, scenario_id=name) for name, scene in named.items()]
 
 

@@ -221,7 +221,7 @@ def test_scenes_without_cyclists_or_maps_still_give_whole_vocabularies(
 
 
 def test_scenes_that_cannot_be_tokenized_still_give_moves(tmp_path, drive):
-    odd = dataclasses.replace(drive(now=13), scenario_id="ends between tokens")
+    odd = dataclasses.replace(drive(now=3), scenario_id="ends between tokens")
     files = {"training.tfrecord-0": [odd], "validation.tfrecord-0": [odd]}
     _, figures = build(ingested(tmp_path / "ingest", files), tmp_path)
     assert figures["real"]["vehicle"] >= 1

@@ -139,7 +139,7 @@ def test_the_id_is_that_of_the_decoded_scene(records):
 
 
 def test_ids_are_those_of_the_records_in_order_and_read_as_far_as_needed(source, records):
-    found = RecordLookup([str(source)])
+    found = RecordLookup(RawRecords([str(source)], []))
 
     assert list(found.scenario_ids(2)) == list(records)[:2]
     assert list(found.scenario_ids()) == list(records)
