@@ -1,7 +1,7 @@
 """Rows of ``benchmarks/gpu.py``: each measures one thing on a device."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from typing import Any, Literal
@@ -24,7 +24,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from infgen.clock import CLOCK
 from infgen.config import RolloutSettings, TokenSettings, TrainSettings
-from infgen.model.batching.batch import Limits, collate, to_device
+from infgen.model.batching.batch import Limits, MapTokens, collate, to_device
+from infgen.model.neighbours import MapFeatures
 from infgen.model.network import Network
 from infgen.model.relations import Rows
 from infgen.model.step_memory import StepMemory
@@ -143,10 +144,14 @@ def _floats(record: Any) -> list[Tensor]:
 class _Recorder(Stepper):
     """A stepper that keeps what it was shown and what it said."""
 
-    def begin(self, *given: Any) -> StepMemory:
-        self.given: Sequence[Any] = given
+    def encode_maps(self, roads: MapTokens) -> Tensor:
+        self.roads = roads
+        return super().encode_maps(roads)
+
+    def begin_on(self, maps: MapFeatures, scene: Tensor, rows: int) -> StepMemory:
+        self.scene, self.rows = scene, rows
         self.steps: list[tuple[TokenStep, Rows | None, MotionStep]] = []
-        return super().begin(*given)
+        return super().begin_on(maps, scene, rows)
 
     def motion_step(
         self, memory: StepMemory, token_step: TokenStep, rows: Rows | None = None
@@ -182,8 +187,8 @@ def measure_choices(row: Row, place: Place) -> dict[str, Any]:
     recorder, device = _recorded(place.threads, row.batch), torch.device(place.device)
     network = load_network(builtin_weights()).to(device).eval()
     stepper = make_stepper(network, row.precision)
-    roads, scene, rows = recorder.given
-    memory = stepper.begin(to_device(roads, device), scene.to(device), rows)
+    roads, scene = to_device(recorder.roads, device), recorder.scene.to(device)
+    memory = stepper.begin(roads, scene, recorder.rows)
     same, gap = [], 0.0
     for token_step, shown, said in recorder.steps:
         here = None if shown is None else to_device(shown, device)

@@ -93,7 +93,7 @@ def test_every_link_is_alive_and_leads_to_a_page_without_errors(page, folder):
 def test_machines_and_times_are_shown_within(page):
     inner = page.frame_locator("iframe")
 
-    assert inner.locator("table").count() == 2
+    assert inner.locator("table").count() == 3
     assert "node<7>" in inner.locator("body").inner_text()
 
 

@@ -46,7 +46,8 @@ def played(record, metre_moves, bent_roads, tmp_path_factory, quiet):
         folder.mkdir()
     save_network(weights, network, state_dict_of(network), step=0)
     paths = {"scenes": str(scenes), "weights": str(weights)}
-    unit = Unit("v-00000", {"weights": "random"}, {**paths, "biases": {}, "rows": [0]})
+    task = {**paths, "biases": {}, "rows": [0], "device": "cpu"}
+    unit = Unit("v-00000", {"weights": "random"}, task)
     report = STAGE.work(
         unit, target, RolloutSettings(mode="wosac", batch_rollouts=16), quiet
     )

@@ -219,7 +219,8 @@ def test_a_drive_is_saved_and_can_be_viewed(opened, server, tmp_path):
 
     assert folder.parent == server[1] / "root" / "drives"
     about = json.loads((folder / "manifest.json").read_text())
-    assert (about["schema"], about["scenario_id"]) == ("infgen.recording/1", SCENE)
+    assert about["schema"] == "infgen.saved-rollouts/1"
+    assert about["drive"]["source"].startswith("validation")
     view = [sys.executable, str(REPOSITORY / "cli.py"), "view", str(folder)]
     done = subprocess.run([*view, "--out", str(tmp_path / "x.html")], check=False)
     assert done.returncode == 0
