@@ -28,7 +28,8 @@ class MapGrid:
     Attributes:
         corner_m: Corner of each map's first square.
         size: Squares along x and y: of the largest map.
-        start: Where each square's tokens begin in ``order``; then their number.
+        start: Where each square's tokens begin in ``order``, all maps' one after the other;
+            then where they end.
         order: Tokens by square, those that are none last.
         xy_m: Where the tokens are, in the order of ``order``.
         longest: Most tokens of so many consecutive squares, as far as it is known.
@@ -58,6 +59,8 @@ class MapGrid:
         ordered, order = square.sort(dim=1, stable=True)
         squares = torch.arange(rows * columns + 1, device=pose.device)
         start = torch.searchsorted(ordered, squares.expand(len(pose), -1).contiguous())
+        maps = torch.arange(len(pose), device=pose.device)[:, None]
+        start += maps * order.shape[1]
         ordered_m = xy_m.gather(1, order[..., None].expand_as(xy_m))
         return cls(corner_m, (columns, rows), start, order, ordered_m)
 
@@ -134,7 +137,6 @@ class MapGrid:
         longest = self._longest(length, most)
         steps = torch.arange(longest, device=row.device)
         there = steps < length[..., None]  # [target, row, step]
-        begin = begin + scene[:, None] * self.order.shape[1]
         at = torch.where(there, begin[..., None] + steps, 0).flatten(1)
         return at, there.flatten(1)
 

@@ -180,6 +180,8 @@ def insertion(rollouts: str) -> Found:
     with StandIn():
         settings = {"mode": "long", **OPTIONS["pretrained"], "add_bias": 1.0}
         ours = session(DEVICE, int(rollouts), settings)
+        ours.step()  # The first passes find the fullest squares of the maps.
+        passes.clear()
         ours.step()
     return {"passes": passes}
 
@@ -323,6 +325,7 @@ def calibrated(folder: str) -> Found:
             "biases": asdict(Biases(0.2, 0.1)),
             "point": 0,
             "pieces": [{"scenes": folder, "rows": [0]}],
+            "device": "cpu",  # Of the network that is replaced below.
         },
     )
     settings = {

@@ -34,7 +34,7 @@ _FREE = {
     "slice", "squeeze", "unsqueeze", "unbind", "split", "split_with_sizes", "chunk",
     "detach", "alias", "as_strided", "unfold", "diagonal", "empty", "empty_like",
     "empty_strided", "new_empty", "new_empty_strided", "lift_fresh", "_reshape_alias",
-    "movedim", "narrow", "view_as_real", "set_", "is_same_size",
+    "movedim", "narrow", "view_as_real", "view_as_complex", "set_", "is_same_size",
     "_has_compatible_shallow_copy_type", "resize_", "numel", "size", "stride",
     "storage_offset", "sym_size", "sym_stride", "sym_numel", "sym_storage_offset",
     "is_pinned", "unflatten", "view_as", "expand_as", "flatten", "ravel",
