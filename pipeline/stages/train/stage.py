@@ -195,7 +195,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=4,
+    version=5,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,
