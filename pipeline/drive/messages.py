@@ -123,7 +123,7 @@ def frame_message(world: World, step: WorldStep) -> str:
         "role": np.where(logged, Role.INITIAL, Role.INSERTED).tolist(),
         "removed": frame.removed[0, rows].astype(int).tolist(),
         "size": _rounded(frame.size_lwh_m[0, rows, :2], 2),
-        "path": _rounded(frame.path[0, rows].reshape(len(rows), -1), 3),
+        "path": _rounded(frame.path[0, rows].reshape(len(rows), frame.path[0, 0].size), 3),
     }
     return _write("frame", token=frame.token, **columns)
 

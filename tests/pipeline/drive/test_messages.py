@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -146,6 +147,17 @@ def test_a_frame_names_all_but_the_ego(begin):
     np.testing.assert_allclose(
         np.reshape(said["path"][0], (5, 3)), frame.path[0, 1], atol=6e-4
     )
+
+
+def test_a_frame_without_other_agents_is_empty(begin):
+    drive = begin()
+    alone = np.zeros_like(drive.shown.present)
+    alone[0] = True
+
+    shown = dataclasses.replace(drive.shown, present=alone)
+    said = json.loads(messages.frame_message(drive.world, shown))
+
+    assert said["id"] == said["path"] == said["size"] == []
 
 
 def test_the_state_has_the_figures_of_the_drive(begin):
