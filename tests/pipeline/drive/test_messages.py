@@ -1,4 +1,3 @@
-import dataclasses
 import json
 
 import numpy as np
@@ -154,7 +153,7 @@ def test_a_frame_without_other_agents_is_empty(begin):
     alone = np.zeros_like(drive.shown.present)
     alone[0] = True
 
-    shown = dataclasses.replace(drive.shown, present=alone)
+    shown = drive.shown._replace(present=alone)
     said = json.loads(messages.frame_message(drive.world, shown))
 
     assert said["id"] == said["path"] == said["size"] == []
