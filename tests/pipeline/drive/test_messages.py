@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from infgen.rollout.recording import NOBODY
 from infgen.views.player.payload import unpack
 from infgen.views.scene.view_model import Role
 from pipeline.drive import messages
@@ -150,11 +152,12 @@ def test_a_frame_names_all_but_the_ego(begin):
 
 def test_a_frame_without_other_agents_is_empty(begin):
     drive = begin()
-    alone = np.zeros_like(drive.shown.present)
-    alone[0] = True
+    numbers = np.full_like(drive.shown.frame.agent_number, NOBODY)
+    numbers[0, 0] = drive.shown.frame.agent_number[0, 0]
+    frame = dataclasses.replace(drive.shown.frame, agent_number=numbers)
 
-    shown = drive.shown._replace(present=alone)
-    said = json.loads(messages.frame_message(drive.world, shown))
+    alone = dataclasses.replace(drive.shown, frame=frame)
+    said = json.loads(messages.frame_message(drive.world, alone))
 
     assert said["id"] == said["path"] == said["size"] == []
 
