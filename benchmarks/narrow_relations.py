@@ -123,7 +123,7 @@ def seen_poses(network: Network, scenes: Sequence[Batch]) -> dict[str, Tensor]:
     for name, values in kept.items():
         poses = torch.cat(values)
         embedding = embedding_of(network, name)
-        poses = poses[poses[:, 0] <= embedding.spans[0].last]  # The rest nobody sees.
+        poses = poses[poses[:, 0] <= embedding.spans[0].last]  # Farther ones are not seen.
         found[name] = poses[torch.randperm(len(poses), generator=random)[:POSES]]
     return found
 
