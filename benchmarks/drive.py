@@ -7,7 +7,7 @@ made keys::
     python benchmarks/drive.py [--steps 120] [--weights builtin]
 
 Promised: 99 of 100 world steps of half a second take 250 ms or less with 50 agents, on two
-quiet cores. A step is asked for 300 ms before it is shown. Seconds of the clock decide on
+quiet cores. A step is requested 300 ms before it is shown. Seconds of the clock decide on
 that; those of the processor tell how much of them was waiting for other processes. The last
 line is one JSON object.
 """
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "begin_ms": round(1000 * begin_s, 1),
         "peak_mib": round(peak_mib("cpu"), 1),
     }
-    print(f"a step is asked for {1000 * LEAD_TICKS * TICK_S:.0f} ms before it is shown")
+    print(f"a step is requested {1000 * LEAD_TICKS * TICK_S:.0f} ms before it is shown")
     for name, value in figures.items():
         print(f"{name:12} {value}")
     kept = figures["p99_ms"] <= PROMISED_MS
