@@ -201,6 +201,7 @@ def test_the_slider_the_strip_and_the_arrows_scrub(opened):
     x = page.evaluate("player.chart.x(6)")
     page.mouse.click(frame["x"] + x, frame["y"] + 40)
     assert time_of(page) == pytest.approx(6.0, abs=0.02)
+    settle(page)
     assert page.inner_text("#time") == "6.0 s"
 
 
