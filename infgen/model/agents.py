@@ -19,6 +19,12 @@ from infgen.model.layers import (
     normed,
 )
 from infgen.model.logits import MotionOutputs
+from infgen.model.long_memory import (
+    Density,
+    DensityFeatures,
+    Standing,
+    StandingFeatures,
+)
 from infgen.model.motion_head import MotionHead
 from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import MapFeatures, NeighbourRows, NeighbourSpec
@@ -60,6 +66,7 @@ class AgentRows:
         presence: ``Presence`` [row].
         cell: Cell of the ego's grid, or ``NO_CELL`` [row].
         ego: Whether it is the ego [row].
+        standing: For how long each has stood [row], if that is used.
     """
 
     agent_type: Tensor
@@ -71,6 +78,7 @@ class AgentRows:
     presence: Tensor
     cell: Tensor
     ego: Tensor
+    standing: Standing | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +125,7 @@ class AgentEmbedding(nn.Module):
         self.ego = nn.Parameter(torch.zeros(width)) if settings.ego_embedding else None
         self.presence = nn.Embedding(len(Presence), width) if life else None
         self.fuse = embedding_mlp((4 if life else 2) * width, width)
+        self.standing = StandingFeatures(width) if settings.standing_features else None
 
     def tables(self) -> AgentTables:
         """Embed all motion tokens and cells."""
@@ -147,6 +156,8 @@ class AgentEmbedding(nn.Module):
             cell = torch.where(agents.cell == NO_CELL, self.num_cells, agents.cell)
             parts += [self.presence(agents.presence), gather(tables.cells, cell)]
         embedded: Tensor = self.fuse(torch.cat(parts, dim=-1))
+        if self.standing is not None and agents.standing is not None:
+            embedded = embedded + self.standing(agents.standing)
         return embedded
 
 
@@ -176,6 +187,7 @@ class AgentContext:
         roads: Map tokens around them.
         agents: Rows of the agents around them.
         light: Features of the signals ahead [N, D], if they are used.
+        density: Agents around the ego of each [N], if that is used.
     """
 
     past_relation: Shared
@@ -183,6 +195,7 @@ class AgentContext:
     roads: AttentionSources
     agents: NeighbourRows
     light: Tensor | None
+    density: Density | None
 
 
 class MotionBlock(nn.Module):
@@ -228,6 +241,8 @@ class MotionStack(nn.Module):
         self.shaped = MotionHead(width, shaped, vocabulary) if shaped else None
         leaves = settings.insertion_and_removal and settings.remove_token
         self.leave = mlp(width, width, 1) if leaves else None
+        crowded = leaves and settings.density_features
+        self.density = DensityFeatures(width) if crowded else None
         patterns = settings.validity_pattern_tokens
         self.pattern = mlp(width, width, NUM_PATTERNS) if patterns else None
         ahead_m = settings.signal_ahead_m
@@ -275,7 +290,12 @@ class MotionStack(nn.Module):
         return None if self.shaped is None else self.shaped.table()
 
     def foretell(
-        self, rows: Rows, x_ND: Tensor, agent_type: Tensor, shapes: Tensor | None
+        self,
+        rows: Rows,
+        x_ND: Tensor,
+        agent_type: Tensor,
+        shapes: Tensor | None,
+        sight: AgentContext,
     ) -> MotionOutputs:
         """Say of every row what it does next.
 
@@ -284,11 +304,15 @@ class MotionStack(nn.Module):
             x_ND: Their updated features.
             agent_type: ``AgentType`` of each.
             shapes: ``motion_features``.
+            sight: What they see.
         """
+        leaving = x_ND
+        if self.density is not None and sight.density is not None:
+            leaving = x_ND + self.density(sight.density)
         return MotionOutputs(
             rows,
             self._moves(x_ND, agent_type, shapes),
-            None if self.leave is None else self.leave(x_ND)[:, 0],
+            None if self.leave is None else self.leave(leaving)[:, 0],
             None if self.pattern is None else self.pattern(x_ND),
         )
 

@@ -4,6 +4,7 @@ Shape letters as in ``layers``; S are the turns of inserted agents within one to
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +13,7 @@ from infgen.model.agents import KINDS
 from infgen.model.cell_features import CellFeatures, CellSources, HeadingFeatures
 from infgen.model.layers import Attention, AttentionSources, embedding_mlp, mlp
 from infgen.model.logits import DetailOutputs, InsertionOutputs
+from infgen.model.long_memory import Density, DensityFeatures
 from infgen.model.neighbours import NeighbourSpec
 from infgen.model.relations import Rows, relation_embedding
 from infgen.model.settings import ModelSettings
@@ -66,6 +68,7 @@ class CellStack(nn.Module):
         self.place = None if by_cell else mlp(width, width, 2)
         features = settings.cell_feature_width if by_cell else 0
         self.cell_features = CellFeatures(width, features, grid) if features else None
+        self.density = DensityFeatures(width) if settings.density_features else None
 
     def map_reach(self) -> NeighbourSpec:
         """How the query sees roads."""
@@ -81,16 +84,26 @@ class CellStack(nn.Module):
         )
 
     def forward(
-        self, occupied: Tensor, roads: AttentionSources, agents: AttentionSources
+        self,
+        occupied: Tensor,
+        roads: AttentionSources,
+        agents: AttentionSources,
+        average: Tensor | None,
     ) -> Tensor:
         """Answer queries: features [N, S, D].
 
         Args:
             occupied: 1 where a slot sees an agent in a cell, else 0 [N, S, cell].
             roads: Map tokens around the ego, the same for all slots.
-            agents: Agents around the ego; ``present`` differs by slot.
+            agents: Agents around the ego; ``present`` differs by slot [N, S, K].
+            average: Moving averages of their number before this token step
+                [N, constant], if that is used.
         """
         x = self.query.weight[0] + self.occupancy(occupied)
+        if self.density is not None and average is not None:
+            count = agents.present.sum(dim=-1).view(len(average), -1).to(average.dtype)
+            before = average[:, None].expand(*count.shape, -1)
+            x = x + self.density(Density(count, before))
         for block in self.blocks:
             x = block(x, roads, agents)
         return x
@@ -221,4 +234,28 @@ class DetailStack(nn.Module):
             heading,
             None if turn is None else math.pi * torch.tanh(turn(given)[..., 0]),
             None if offset is None else self.reach_m * torch.tanh(offset(given)),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class InsertionBlocks:
+    """Query blocks of insertion with their neighbour specifications."""
+
+    cells: CellStack
+    details: DetailStack
+    cell_roads: NeighbourSpec
+    cell_agents: NeighbourSpec
+    detail_roads: NeighbourSpec
+    detail_agents: NeighbourSpec
+
+    @classmethod
+    def of(cls, cells: CellStack, details: DetailStack) -> "InsertionBlocks":
+        """Evaluate the tables of their relations for one pass."""
+        return cls(
+            cells,
+            details,
+            cells.map_reach(),
+            cells.agents_reach(0),
+            details.map_reach(),
+            details.agents_reach(),
         )

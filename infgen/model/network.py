@@ -21,6 +21,16 @@ from infgen.model.logits import (
     MotionOutputs,
     Outputs,
 )
+from infgen.model.long_memory import (
+    Density,
+    DensityFeatures,
+    Standing,
+    StandingFeatures,
+    averages_before,
+    count_around,
+    moves_between,
+    standing_at,
+)
 from infgen.model.map import MapEncoder
 from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import (
@@ -32,6 +42,7 @@ from infgen.model.neighbours import (
 from infgen.model.relations import Rows, relations
 from infgen.model.settings import ModelSettings
 from infgen.tokens.grid import Grid, make_grid
+from infgen.tokens.scene_tokens import Presence
 from infgen.tokens.settings import TokenSettings
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
@@ -72,11 +83,21 @@ class Network(nn.Module):
             DetailStack(settings, cells) if settings.insertion_and_removal else None
         )
         self.apply(initialise)
+        for part in self.long_memory().values():
+            part.begin_at_zero()
 
     @property
     def grid(self) -> Grid:
         """Grid of cells and heading bins."""
         return make_grid(self.grid_settings)
+
+    def long_memory(self) -> dict[str, DensityFeatures | StandingFeatures]:
+        """Return the parts, by name, that change no logit before they are trained."""
+        return {
+            name: part
+            for name, part in self.named_modules()
+            if isinstance(part, DensityFeatures | StandingFeatures)
+        }
 
     def motion_vocabulary(self) -> MotionVocabulary:
         """Return the motion tokens that motion logits choose from."""
@@ -120,25 +141,43 @@ class Network(nn.Module):
         rows = Rows.where(agents.visible) if index is None else index.visible
         asked = Rows.where(batch.entries.asked) if index is None else index.asked
         told = Rows.where(batch.details.present) if index is None else index.described
-        x = self.embed(_agent_rows(agents, rows), self.embed.tables())
+        standing = None
+        if self.settings.standing_features:
+            standing = _standing(agents).take(rows.at)
+        x = self.embed(_agent_rows(agents, rows, standing), self.embed.tables())
         raw, cells, details = normed(x), self.cells, self.details
         hidden = None
         if hidden_roads:
             known = roads if self.training else self.roads(batch.roads, covered)
             hidden = self.roads.predict_hidden(batch.roads, known, of_map)
+        density = self._density(agents)
         return Outputs(
-            motion=self._motion(agents, rows, x, roads),
+            motion=self._motion(agents, rows, x, roads, density),
             entries=None
             if cells is None
-            else _entries(cells, batch, asked, rows, raw, roads),
+            else _entries(cells, batch, asked, rows, raw, roads, density),
             details=None
             if details is None
             else _details(details, batch, told, rows, raw, roads),
             roads=None if hidden is None else MapOutputs(*hidden),
         )
 
+    def _density(self, agents: Agents) -> Density | None:
+        """Count the agents around the ego [scene, token], if that is used."""
+        settings = self.settings
+        if not settings.density_features:
+            return None
+        ego_pose, radius_m = agents.pose[:, :, EGO], settings.position_query_radius_m
+        count = count_around(ego_pose, agents.pose, agents.visible, radius_m)
+        return Density(count, averages_before(count))
+
     def _motion(
-        self, agents: Agents, rows: Rows, x: Tensor, roads: MapFeatures
+        self,
+        agents: Agents,
+        rows: Rows,
+        x: Tensor,
+        roads: MapFeatures,
+        density: Density | None,
     ) -> MotionOutputs:
         """Run the motion stack over the visible agents of all tokens."""
         visible, scene = agents.visible, _count(agents.agent_type)
@@ -166,10 +205,12 @@ class Network(nn.Module):
             self.motion.lights_ahead(
                 roads, rows.pack(agents.pose), rows.at // agents.visible[0].numel(), token
             ),
+            None if density is None else density.take(rows.at // visible.shape[1]),
         )
         x = self.motion(x, past_index, sight)
         agent_type = rows.pack(agents.agent_type[:, None].expand(agents.visible.shape))
-        return self.motion.foretell(rows, x, agent_type, self.motion.motion_features())
+        shapes = self.motion.motion_features()
+        return self.motion.foretell(rows, x, agent_type, shapes, sight)
 
     def _past(self, agents: Agents, rows: Rows) -> tuple[Tensor, Tensor, Shared]:
         """Rows, presence and relations of every row's own past, oldest first [N, K]."""
@@ -179,7 +220,11 @@ class Network(nn.Module):
             padded = functional.pad(values, (0, 0, window, 0))  # [scene, token, agent]
             return rows.pack(padded.unfold(1, window, 1)[:, :-1])
 
-        index, present = past(rows.number), past(agents.visible)
+        # Who is inserted has no past, even if the row was another's before.
+        inserted = agents.presence == int(Presence.INSERTED)
+        life = inserted.cumsum(dim=1)
+        present = past(agents.visible) & (past(life) == rows.pack(life)[:, None])
+        index = past(rows.number)
         pose = rows.pack(agents.pose)
         ago = torch.arange(-window, 0, device=pose.device, dtype=pose.dtype)
         ago = ago.expand(len(index), window)[..., None]
@@ -195,6 +240,7 @@ def _entries(
     rows: Rows,
     raw: Tensor,
     roads: MapFeatures,
+    density: Density | None,
 ) -> InsertionOutputs:
     """Ask for the inserted agents of every token, each slot seeing those before it."""
     agents, entries = batch.agents, batch.entries
@@ -228,7 +274,9 @@ def _entries(
         cell_features = stack.cell_features(
             asked.pack(ego_pose), CellSources.roads(roads, map_of), lying
         )
-    return stack.answer(asked, stack(occupied, map_seen, seen), cell_features)
+    average = None if density is None else asked.pack(density.average)
+    x = stack(occupied, map_seen, seen, average)
+    return stack.answer(asked, x, cell_features)
 
 
 def _details(
@@ -276,22 +324,35 @@ def _count(like: Tensor) -> Tensor:
     return torch.arange(len(like), device=like.device)
 
 
-def _agent_rows(agents: Agents, rows: Rows) -> AgentRows:
+def _standing(agents: Agents) -> Standing:
+    """For how long all agents have stood [scene, token, agent]."""
+    before, known = _before(agents)
+    moves = moves_between(before, known, agents.pose, agents.presence)
+    return standing_at(agents.presence, moves & agents.visible)
+
+
+def _before(agents: Agents) -> tuple[Tensor, Tensor]:
+    """Poses one token step earlier, and whether agents were seen there."""
+    pose, visible = agents.pose, agents.visible
+    known = torch.zeros_like(visible)
+    known[:, 1:] = visible[:, :-1]
+    return torch.cat([pose[:, :1], pose[:, :-1]], dim=1), known
+
+
+def _agent_rows(agents: Agents, rows: Rows, standing: Standing | None) -> AgentRows:
     """All visible agents, with where they were one token step earlier."""
-    visible = agents.visible
-    seen_before = torch.zeros_like(visible)
-    seen_before[:, 1:] = visible[:, :-1]
-    pose = agents.pose
-    before = torch.cat([pose[:, :1], pose[:, :-1]], dim=1)
+    before, known = _before(agents)
+    pose, visible = agents.pose, agents.visible
     tokens = pose.shape[1]
     return AgentRows(
         agent_type=rows.pack(agents.agent_type[:, None].expand(-1, tokens, -1)),
         size_lwh_m=rows.pack(agents.size_lwh_m[:, None].expand(-1, tokens, -1, -1)),
         pose=rows.pack(pose),
         before=rows.pack(before),
-        known=rows.pack(seen_before),
+        known=rows.pack(known),
         motion_token=rows.pack(agents.motion_token),
         presence=rows.pack(agents.presence),
         cell=rows.pack(agents.cell),
         ego=rows.at % visible.shape[-1] == EGO,
+        standing=standing,
     )

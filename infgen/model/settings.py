@@ -85,6 +85,12 @@ class ModelSettings:
     at the end of the history; in rollouts `rollout.signals` says what they show. In half of
     the training scenes signals after the history are hidden, so that rollouts may go on
     without them."""
+    density_features: Bool = False
+    """Whether insertion and removal know how many agents are around the ego, beside how
+    many there were over the last 3 s and 30 s."""
+    standing_features: Bool = False
+    """Whether agents know for how long each has stood, and whether it has ever driven: a
+    vehicle that waits from one that is parked."""
     signal_ahead_m: NonNegative = 0.0
     """Every agent sees the signal of its own lane up to so far ahead, and how long it has
     shown that; 0 to see it only among all other map tokens."""

@@ -8,8 +8,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from infgen.model.layers import AttentionSources
+from infgen.model.long_memory import AVERAGED_TOKENS, Standing, next_averages
 from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import MapFeatures
+from infgen.model.settings import ModelSettings
 from infgen.model.token_step import TokenStep
 
 
@@ -28,6 +30,8 @@ class StepMemory:
         pose: Poses of past columns [rollout, row, place, 3].
         visible: Rows visible in them, with the same agent as now [rollout, row, place].
         features: Normed features of them before each block [block, rollout, row, place, D].
+        average: Moving averages of the number of agents around egos [rollout, constant].
+        standing: For how long agents have stood [rollout, row], if that is used.
     """
 
     roads: MapFeatures
@@ -37,6 +41,30 @@ class StepMemory:
     pose: Tensor
     visible: Tensor
     features: Tensor
+    average: Tensor
+    standing: Standing | None
+
+    @classmethod
+    def empty(
+        cls, maps: MapFeatures, scene: Tensor, rows: int, settings: ModelSettings
+    ) -> "StepMemory":
+        """Start without a past on the maps [rollout] of ``scene``."""
+        shape = (len(scene), rows, settings.temporal_window_tokens)
+        pose = torch.zeros((*shape, 3), device=scene.device)
+        visible = torch.zeros(shape, dtype=torch.bool, device=scene.device)
+        return cls(
+            roads=maps,
+            scene=scene,
+            columns=0,
+            begun=torch.zeros_like(scene),
+            pose=pose,
+            visible=visible,
+            features=pose.new_zeros((settings.motion_blocks, *shape, settings.width)),
+            average=pose.new_zeros((len(scene), len(AVERAGED_TOKENS))),
+            standing=Standing.unknown(visible[:, :, 0])
+            if settings.standing_features
+            else None,
+        )
 
     @property
     def window(self) -> int:
@@ -47,6 +75,18 @@ class StepMemory:
         """Pose and visibility of every row in the last column."""
         place = (self.columns - 1) % self.window
         return self.pose[:, :, place], self.visible[:, :, place]
+
+    def averages_before(self, count: Tensor) -> Tensor:
+        """Averages before a column [rollout, constant], given its own numbers [rollout].
+
+        A rollout's first column has nothing before it: there they are its own.
+        """
+        first = self.columns <= self.begun
+        return torch.where(first[:, None], count[:, None], self.average)
+
+    def count(self, count: Tensor) -> None:
+        """Update the averages by the numbers of a column [rollout]."""
+        self.average = next_averages(self.average, count, self.columns <= self.begun)
 
     def put(self, rollouts: Int64[Tensor, " replaced"], others: "StepMemory") -> None:
         """Replace some rollouts by others, whose last columns become the last ones here.
@@ -61,6 +101,9 @@ class StepMemory:
         self.pose[rollouts] = others.pose.roll(turn, dims=2)
         self.visible[rollouts] = others.visible.roll(turn, dims=2)
         self.features[:, rollouts] = others.features.roll(turn, dims=3)
+        self.average[rollouts] = others.average
+        if self.standing is not None and others.standing is not None:
+            self.standing.put(rollouts, others.standing)
 
     def with_rows(self, rows: int) -> "StepMemory":
         """Append free rows, up to so many."""
@@ -70,6 +113,7 @@ class StepMemory:
             pose=pad(self.pose, (0, 0, 0, 0, 0, more)),
             visible=pad(self.visible, (0, 0, 0, more)),
             features=pad(self.features, (0, 0, 0, 0, 0, more)),
+            standing=None if self.standing is None else self.standing.with_rows(more),
         )
 
 
@@ -88,6 +132,10 @@ class Insertions:
         scene: Map of each rollout.
         before: Poses [rollout, row, 3] one token step earlier ...
         known: ... and rows observed then [rollout, row].
+        average: Moving averages of the number of agents before the token step
+            [rollout, constant].
+        standing: For how long the agents had stood before it [rollout, row], if that is
+            used.
         token_step: The agents so far.
         raw: Normed embeddings of all rows, zero in free rows [rollout, row, D].
         relation: How all rows stand to the ego [rollout, row, R].
@@ -103,6 +151,8 @@ class Insertions:
     scene: Tensor
     before: Tensor
     known: Tensor
+    average: Tensor
+    standing: Standing | None
     token_step: TokenStep
     raw: Tensor
     relation: Tensor

@@ -21,7 +21,7 @@ with an empty past, so a freed row can be given to an inserted agent as it is.
 """
 
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float32, Int64
@@ -30,13 +30,13 @@ from torch import Tensor
 from infgen.model.agents import AgentContext, AgentRows
 from infgen.model.batching.batch import MapTokens
 from infgen.model.cell_features import CellSources
-from infgen.model.insertion import CellStack, DetailStack
+from infgen.model.insertion import InsertionBlocks
 from infgen.model.layers import AttentionSources, normed
+from infgen.model.long_memory import Density, Standing, count_around, standing_after
 from infgen.model.map_grid import MapGrid
 from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import (
     MapFeatures,
-    NeighbourSpec,
     cell_pose,
     find_map_neighbours,
     find_neighbours,
@@ -46,29 +46,6 @@ from infgen.model.relations import Rows, relations, within_radius
 from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.token_step import InsertionDetails, MotionStep, PositionOutputs, TokenStep
 from infgen.tokens.scene_tokens import Presence
-
-
-@dataclass(frozen=True, slots=True)
-class _InsertionBlocks:
-    """Query blocks of insertion with their neighbour specifications."""
-
-    cells: CellStack
-    details: DetailStack
-    cell_roads: NeighbourSpec
-    cell_agents: NeighbourSpec
-    detail_roads: NeighbourSpec
-    detail_agents: NeighbourSpec
-
-    @classmethod
-    def of(cls, cells: CellStack, details: DetailStack) -> "_InsertionBlocks":
-        return cls(
-            cells,
-            details,
-            cells.map_reach(),
-            cells.agents_reach(0),
-            details.map_reach(),
-            details.agents_reach(),
-        )
 
 
 def _full_precision(x: Tensor) -> AbstractContextManager[object]:
@@ -94,9 +71,9 @@ class Stepper:
         self._shapes = network.motion.motion_features()
         self._map_reach = network.motion.map_reach()
         self._agents_reach = network.motion.agents_reach()
-        self._asking: _InsertionBlocks | None = None
+        self._asking: InsertionBlocks | None = None
         if network.cells is not None and network.details is not None:
-            self._asking = _InsertionBlocks.of(network.cells, network.details)
+            self._asking = InsertionBlocks.of(network.cells, network.details)
 
     @property
     def insertion_and_removal(self) -> bool:
@@ -138,19 +115,7 @@ class Stepper:
         self, maps: MapFeatures, scene: Int64[Tensor, " rollout"], rows: int
     ) -> StepMemory:
         """Start with an empty past on encoded maps; arguments are those of ``begin``."""
-        settings = self.network.settings
-        shape = (len(scene), rows, settings.temporal_window_tokens)
-        pose = torch.zeros((*shape, 3), device=scene.device)
-        features = pose.new_zeros((settings.motion_blocks, *shape, settings.width))
-        return StepMemory(
-            roads=maps,
-            scene=scene,
-            columns=0,
-            begun=torch.zeros_like(scene),
-            pose=pose,
-            visible=torch.zeros(shape, dtype=torch.bool, device=scene.device),
-            features=features,
-        )
+        return StepMemory.empty(maps, scene, rows, self.network.settings)
 
     @torch.no_grad()
     def motion_step(
@@ -167,7 +132,8 @@ class Stepper:
         visible = token_step.visible
         rows = Rows.where(visible) if rows is None else rows
         memory.visible &= (token_step.presence != int(Presence.INSERTED))[..., None]
-        x = self._embed(*memory.last(), token_step, rows)
+        standing = standing_after(memory.standing, *memory.last(), token_step)
+        x = self._embed(*memory.last(), standing, token_step, rows)
         sight = self._context(memory, token_step, rows)
         x = x if sight.light is None else x + sight.light
         place = memory.columns % memory.window
@@ -182,10 +148,15 @@ class Stepper:
             past.flatten(0, 1)[rows.at, place] = before.to(past.dtype)
         memory.pose[:, :, place] = token_step.pose
         memory.visible[:, :, place] = visible
+        memory.standing = standing
+        if self.network.settings.density_features:
+            memory.count(self._count(token_step))
         memory.columns += 1
         agent_type = rows.pack(token_step.agent_type)
         with _full_precision(x):
-            return MotionStep(motion.foretell(rows, x.float(), agent_type, self._shapes))
+            return MotionStep(
+                motion.foretell(rows, x.float(), agent_type, self._shapes, sight)
+            )
 
     @torch.no_grad()
     def entry_begin(
@@ -221,6 +192,8 @@ class Stepper:
             scene=memory.scene,
             before=before,
             known=known,
+            average=memory.average,
+            standing=memory.standing,
             token_step=nobody,
             raw=raw,
             relation=raw.new_zeros(
@@ -253,7 +226,9 @@ class Stepper:
             fresh = Rows.where(token_step.visible & ~entries.token_step.visible)
         some = torch.ones_like(fresh.at, dtype=torch.bool) if real is None else real
         came = fresh.spread(some)
-        embedded = normed(self._embed(entries.before, entries.known, token_step, fresh))
+        before = entries.before, entries.known
+        standing = standing_after(entries.standing, *before, token_step)
+        embedded = normed(self._embed(*before, standing, token_step, fresh))
         ego_pose = token_step.pose[:, EGO, None].expand_as(token_step.pose)
         described = relations(fresh.pack(ego_pose), fresh.pack(token_step.pose)[:, None])
         reach = self._asked().cell_agents
@@ -272,7 +247,8 @@ class Stepper:
         cells, agents = self._asked().cells, entries.agents()
         occupied = cells.occupied(entries.active(entries.token_step.cell), agents.present)
         roads, cell_features = entries.around()
-        x = cells(occupied[:, None], roads, agents)[:, 0]
+        average = entries.active(entries.average)
+        x = cells(occupied[:, None], roads, agents, average)[:, 0]
         each = torch.arange(len(x), device=x.device)
         rows, queries = Rows(each, each), x[:, None].float()
         with _full_precision(x):
@@ -343,7 +319,7 @@ class Stepper:
         described: Tensor = cell_features(token_step.pose[:, EGO], roads, lying)
         return described
 
-    def _asked(self) -> _InsertionBlocks:
+    def _asked(self) -> InsertionBlocks:
         if self._asking is None:
             raise ValueError(
                 "these weights know motion only (model.insertion_and_removal is false): "
@@ -351,8 +327,22 @@ class Stepper:
             )
         return self._asking
 
+    def _count(self, token_step: TokenStep) -> Tensor:
+        """Count the agents around each ego [rollout]."""
+        return count_around(
+            token_step.pose[:, EGO],
+            token_step.pose,
+            token_step.visible,
+            self.network.settings.position_query_radius_m,
+        )
+
     def _embed(
-        self, before: Tensor, known: Tensor, token_step: TokenStep, rows: Rows
+        self,
+        before: Tensor,
+        known: Tensor,
+        standing: Standing | None,
+        token_step: TokenStep,
+        rows: Rows,
     ) -> Tensor:
         """Embed some rows of a token step, given the poses known before it."""
         agents = AgentRows(
@@ -365,6 +355,7 @@ class Stepper:
             presence=rows.pack(token_step.presence),
             cell=rows.pack(token_step.cell),
             ego=rows.at % token_step.cell.shape[-1] == EGO,
+            standing=None if standing is None else standing.take(rows.at),
         )
         embedded: Tensor = self.network.embed(agents, self._tables)
         return embedded
@@ -397,4 +388,8 @@ class Stepper:
             torch.cat([described, ago], dim=-1), self._past_table
         )
         past = rows.pack(memory.visible)
-        return AgentContext(Shared.of(related), past, roads, around, light)
+        density = None
+        if self.network.settings.density_features:
+            count = self._count(token_step)
+            density = Density(count, memory.averages_before(count)).take(rollout)
+        return AgentContext(Shared.of(related), past, roads, around, light, density)

@@ -35,7 +35,7 @@ from infgen.model.batching.padding import Arrays, pad
 from infgen.model.batching.perturbation import Perturbation, perturb_map
 from infgen.model.batching.tensors import map_tensors
 from infgen.model.settings import ModelSettings
-from infgen.model.training_settings import TrainSettings
+from infgen.model.training.settings import TrainSettings
 from infgen.tokens.grid import make_grid
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.settings import TokenSettings
@@ -51,6 +51,8 @@ FORGOTTEN_SHARE = 0.5
 BARE_RIM_SHARE = 0.5
 """Share of scenes in which nobody from beyond the rim is there from the beginning, as in a
 rollout after its first seconds."""
+UNKNOWN = -1
+"""Whether an agent is to be removed, where nothing is to be learned of that."""
 LEFT_TOKENS = 2
 """An agent unseen for so many token steps is removed; near the end of a log it is
 unknown."""
@@ -75,6 +77,8 @@ class Agents:
         cell: Cell of the ego's grid, or ``NO_CELL``.
         turn: Of an agent that enters at this token, its turn among those that do; -1 for
             all others, ``OUTSIDE`` for insertions outside the grid.
+        removal: 1 if this is to be the agent's last token step, 0 if not, or ``UNKNOWN``.
+            It differs from REMOVED ``presence`` only where the network removes agents.
         told: Whether the log goes on long enough to know the removals at this token.
     """
 
@@ -89,6 +93,7 @@ class Agents:
     pattern: Int64[Tensor, "scene token agent"]
     cell: Int64[Tensor, "scene token agent"]
     turn: Int64[Tensor, "scene token agent"]
+    removal: Int64[Tensor, "scene token agent"]
     told: Bool[Tensor, "scene token"]
 
     @property
@@ -143,12 +148,15 @@ class Insertions:
             at the last of a log).
         count: Inserted agents within the grid at this token, also those beyond the last
             slot.
-        agent: The inserted agent of each turn, or ``NOBODY``.
+        add: Whether an agent is to be inserted at each turn. Where the network inserts
+            agents, that is not always known to be one that ``agent`` could name.
+        agent: The agent to be inserted at each turn, or ``NOBODY``.
         cell: Its cell; 0 in unused slots.
     """
 
     asked: Bool[Tensor, "scene token"]
     count: Int64[Tensor, "scene token"]
+    add: Bool[Tensor, "scene token slot"]
     agent: Int64[Tensor, "scene token slot"]
     cell: Int64[Tensor, "scene token slot"]
 
@@ -350,6 +358,7 @@ def _agents(window: SceneWindow, turn: np.ndarray) -> Arrays:
         "pattern": window.pattern.T,
         "cell": window.cell.T,
         "turn": turn.T,
+        "removal": (window.presence.T == Presence.REMOVED).astype(np.int64),
         "told": np.arange(len(turn.T)) + LEFT_TOKENS < len(turn.T) + window.after,
     }
 

@@ -53,7 +53,8 @@ def insertion_arrays(window: SceneWindow, turn: np.ndarray, limit: int) -> Array
     row, token = np.nonzero(inside & (turn < slots) & asked)
     agent[token, turn[row, token]] = row
     cell = np.where(agent >= 0, window.cell[agent, np.arange(tokens)[:, None]], 0)
-    return {"asked": asked, "count": count, "agent": agent, "cell": cell}
+    add = agent >= 0
+    return {"asked": asked, "count": count, "add": add, "agent": agent, "cell": cell}
 
 
 def detail_arrays(

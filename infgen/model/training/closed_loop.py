@@ -88,23 +88,35 @@ def _play(network: Network, batch: Batch, top: int) -> tuple[Agents, Tensor]:
         cell=logged.cell.clone(),
     )
     for token in range(1, tokens):
-        said = stepper.motion_step(memory, _column(played, token - 1))
-        _move(played, logged, off, token, said.motion_logits, top, ends)
+        said = stepper.motion_step(memory, token_step_at(played, token - 1))
+        who = logged.observed[:, token] & logged.visible[:, token - 1]
+        move_near_log(played, logged, off, token, who, said.motion_logits, top, ends)
         played.cell[:, token] = _cells(played, logged, off, token, grid)
     return played, off
 
 
-def _move(
+def move_near_log(
     played: Agents,
     logged: Agents,
     off: Tensor,
     token: int,
+    who: Tensor,
     logits: Tensor,
     top: int,
     ends: MotionTokenEnds,
 ) -> None:
-    """Write the next motion token of all agents seen at both steps, and its end pose."""
-    who = logged.observed[:, token] & logged.visible[:, token - 1]  # [scene, agent]
+    """Write the next motion tokens of some agents, and where these lead.
+
+    Args:
+        played: All agents as simulated so far; changed in place.
+        logged: The same agents as logged.
+        off: Whether they are not as logged [scene, token, agent]; changed in place.
+        token: The next token step.
+        who: Agents that are seen at both token steps [scene, agent].
+        logits: Of their motion tokens [scene, agent, motion_token].
+        top: Most likely motion tokens that each is chosen from.
+        ends: Where motion tokens end.
+    """
     take, write = _rows_of(who)
     before, true = take(played.pose[:, token - 1]), take(logged.pose[:, token])
     agent_type = take(logged.agent_type)
@@ -142,7 +154,8 @@ def _rows_of(
     return lambda values: values.flatten(0, 1), write
 
 
-def _column(agents: Agents, token: int) -> TokenStep:
+def token_step_at(agents: Agents, token: int) -> TokenStep:
+    """Take the agents of one token step of a batch."""
     return TokenStep(
         agent_type=agents.agent_type,
         size_lwh_m=agents.size_lwh_m,

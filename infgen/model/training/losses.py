@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from infgen.model.batching.batch import Agents, Batch
+from infgen.model.batching.batch import UNKNOWN, Agents, Batch
 from infgen.model.logits import (
     DetailOutputs,
     InsertionOutputs,
@@ -23,7 +23,7 @@ from infgen.model.logits import (
 from infgen.model.neighbours import grid_place
 from infgen.model.network import EGO
 from infgen.model.relations import Rows, wrap_angle
-from infgen.model.training_settings import TrainSettings
+from infgen.model.training.settings import TrainSettings
 from infgen.tokens.scene_tokens import Presence
 
 
@@ -137,6 +137,7 @@ def stay_mask(agents: Agents) -> Tensor:
     leaves. Nor at a log's end, where who is lost for a moment does not come back.
     """
     mask = pattern_mask(agents) & _next(agents.told, False)[..., None]
+    mask &= _next(agents.removal, UNKNOWN) != UNKNOWN
     mask[:, :, EGO] = False
     return mask
 
@@ -178,9 +179,8 @@ def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> 
 
 def _stay(rows: Rows, remove_logit: Tensor, agents: Agents) -> Term:
     mask = rows.pack(stay_mask(agents))
-    following = rows.pack(_next(agents.presence, int(Presence.ABSENT)))
     chosen = Chosen.of(mask)
-    leaves = chosen.take(following) == int(Presence.REMOVED)
+    leaves = chosen.take(rows.pack(_next(agents.removal, 0))) == 1
     return _event(chosen, chosen.take(remove_logit), leaves)
 
 
@@ -198,7 +198,7 @@ def _entries(outputs: InsertionOutputs, batch: Batch, smoothing: float) -> Terms
     slot = torch.arange(entries.agent.shape[2], device=count.device)
     comes = outputs.rows.pack(entries.agent) >= 0
     decided, inserted = Chosen.of(slot <= count), Chosen.of(comes)
-    happens = decided.take(comes)
+    happens = decided.take(outputs.rows.pack(entries.add))
     terms = {"add": _event(decided, decided.take(outputs.add_logit), happens)}
     if outputs.position_logits is not None:
         cell = inserted.take(outputs.rows.pack(entries.cell))

@@ -17,6 +17,7 @@ from infgen.config import TrainSettings
 from infgen.model.batching.batch import Batch
 from infgen.model.device.packed import IndexedBatch, PackedBatch, prepared
 from infgen.model.training.closed_loop import close_loop
+from infgen.model.training.closed_loop_population import close_population_loop
 from infgen.model.training.diagnostics import motion_surprise
 from infgen.model.training.loss_weights import TERMS, supervised
 from infgen.model.training.losses import Term, Terms, losses
@@ -114,7 +115,10 @@ class OptimizerStep:
         """
         training, settings = self._training, self._settings
         training.network.train()
-        batches = [self._prepared(part) for part in parts]
+        batches = [
+            self._prepared(part, noise_of_part(step, settings.seed, number))
+            for number, part in zip(own, parts, strict=True)
+        ]
         weights = [supervised(each.batch, settings) for each in batches]
         weight = torch.stack(weights).sum(dim=0)
         self._process_group.add_up(weight)
@@ -133,13 +137,16 @@ class OptimizerStep:
         _move_average(training, settings, step)
         return StepResult(terms, norm, surprise)
 
-    def _prepared(self, part: Batch | PackedBatch) -> IndexedBatch:
+    def _prepared(self, part: Batch | PackedBatch, seed: int) -> IndexedBatch:
         """Move a part to its device; simulate it for closed-loop fine-tuning."""
         here = prepared(part, self._sums.device)
-        top = self._settings.closed_loop_top_k
+        top, network = self._settings.closed_loop_top_k, self._training.network
         if not top:
             return here
-        return replace(here, batch=close_loop(self._training.network, here.batch, top))
+        if not self._settings.closed_loop_population:
+            return replace(here, batch=close_loop(network, here.batch, top))
+        # Other agents are there than the index of the log has.
+        return IndexedBatch(close_population_loop(network, here.batch, top, seed), None)
 
     def _add(self, indexed: IndexedBatch, weight: Tensor, number: int) -> list[str]:
         """Add the gradient and the sums of one part; return the names of its terms."""
