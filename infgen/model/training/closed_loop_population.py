@@ -31,6 +31,7 @@ from torch.nn.functional import pad
 
 from infgen.model.batching.batch import UNKNOWN, Agents, Batch
 from infgen.model.batching.padding import NOBODY
+from infgen.model.batching.tensors import map_tensors
 from infgen.model.long_memory import count_around
 from infgen.model.nearest_tokens import MotionTokenEnds, to_world
 from infgen.model.network import EGO, Network
@@ -65,15 +66,7 @@ FRESH_TOKENS = 2
 about where agents come into view."""
 ALL_STEPS = 31
 """Validity pattern of an agent that is seen at all steps of a token step."""
-ABSENT, PRESENT, INSERTED, REMOVED = (
-    int(each)
-    for each in (
-        Presence.ABSENT,
-        Presence.PRESENT,
-        Presence.INSERTED,
-        Presence.REMOVED,
-    )
-)
+ABSENT, PRESENT, INSERTED, REMOVED = (int(each) for each in Presence)
 
 
 @torch.no_grad()
@@ -165,7 +158,7 @@ class _Simulation:
             uniforms=UniformNumbers(seed, device),
             logged=logged,
             asked=batch.entries.asked,
-            played=_copied(logged),
+            played=map_tensors(logged, Tensor.clone),
             off=torch.zeros_like(visible),
             turns=InsertionTurns(
                 torch.zeros((scenes, tokens), dtype=torch.int64, device=device),
@@ -401,8 +394,3 @@ def _with_rows(agents: Agents, more: int) -> Agents:
         elif each.name != "told":
             padded[each.name] = pad(values, (0, more), value=fill)
     return replace(agents, **padded)
-
-
-def _copied(agents: Agents) -> Agents:
-    copies = {each.name: getattr(agents, each.name).clone() for each in fields(agents)}
-    return Agents(**copies)

@@ -1,0 +1,286 @@
+"""Scenes with the network's own insertions and removals: what they are, what they teach."""
+
+from dataclasses import fields
+
+import pytest
+import torch
+
+from infgen.config import TrainSettings
+from infgen.model.batching.batch import UNKNOWN, collate
+from infgen.model.batching.insertion_targets import OUTSIDE
+from infgen.model.training.closed_loop_population import (
+    CORRECTION_TOKENS,
+    SURPLUS_ROWS,
+    close_population_loop,
+)
+from infgen.model.training.losses import losses, stay_mask, total
+from infgen.model.training.own_choices import UniformNumbers, choose_among
+from infgen.tokens.grid import from_grid, make_grid
+from infgen.tokens.scene_tokens import NO_CELL, Presence
+
+EGO = 0
+NEVER, ALWAYS = -40.0, 40.0
+
+
+def tensors(batch):
+    for part in (batch.agents, batch.roads, batch.entries, batch.details):
+        for field in fields(part):
+            yield f"{type(part).__name__}.{field.name}", getattr(part, field.name)
+
+
+@pytest.fixture(scope="module")
+def logged(record, limits):
+    lives = [(0, 11), (0, 11), (3, 11), (2, 6), (0, 5), (5, 11), (4, 11)]
+    scene = record(3, tokens=12, lives=lives, spread_m=20.0)
+    return collate([scene, record(4, agents=14, tokens=12, spread_m=25.0)], limits, 7)
+
+
+@pytest.fixture(scope="module")
+def restless(new_network):
+    """A network that inserts and removes many agents."""
+    return biased(new_network().eval(), remove=-1.5)
+
+
+@pytest.fixture(scope="module")
+def played(restless, logged):
+    return close_population_loop(restless, logged, 3, seed=5)
+
+
+def biased(network, *, add=None, remove=None):
+    """The network with always, or never, an insertion or a removal."""
+    with torch.no_grad():
+        for head, bias in ((network.cells.add, add), (network.motion.leave, remove)):
+            if bias is not None:
+                head[-1].weight.zero_()
+                head[-1].bias.fill_(bias)
+        if add is not None and network.cells.cell_features is not None:
+            network.cells.cell_features = None  # It adds to the odds of an insertion.
+    return network
+
+
+def test_agents_are_inserted_live_and_are_removed_in_this_order(played):
+    presence = played.agents.presence
+    before, after = presence[:, :-1], presence[:, 1:]
+    gone = (before == int(Presence.ABSENT)) | (before == int(Presence.REMOVED))
+    free = (after == int(Presence.ABSENT)) | (after == int(Presence.INSERTED))
+
+    assert torch.equal(gone, free)
+    assert not (played.agents.observed & (presence == int(Presence.ABSENT))).any()
+    assert (presence[:, :, EGO] != int(Presence.REMOVED)).all()
+
+
+def test_somebody_is_missing_somebody_surplus_and_somebody_inserted_again(
+    restless, logged, played
+):
+    rows = logged.agents.presence.shape[2]
+    there = logged.agents.visible
+    simulated = played.agents.visible[..., :rows]
+
+    assert played.agents.presence.shape[2] == rows + SURPLUS_ROWS
+    assert (there & ~simulated).any()
+    assert (simulated & ~there).any()
+    assert played.agents.visible[..., rows:].any()
+    again = [
+        (each.agents.presence == int(Presence.INSERTED)).sum(dim=1).max()
+        for each in (close_population_loop(restless, logged, 3, seed) for seed in range(12))
+    ]
+    assert max(again) > 1
+
+
+def test_each_insertion_has_its_turn_and_its_place(logged, played, grid_settings):
+    agents, entries = played.agents, played.entries
+    inside = (agents.turn >= 0) & (agents.turn < OUTSIDE)
+
+    inside &= entries.asked[..., None]
+    assert torch.equal(inside.sum(dim=2), entries.count)
+    assert ((agents.presence == int(Presence.INSERTED)) | ~inside).all()
+    assert (agents.cell[inside] != NO_CELL).all()
+    scene, token, row = inside.nonzero(as_tuple=True)
+    rows = logged.agents.presence.shape[2]
+    known = row < rows
+    pose = agents.pose[scene, token, row]
+    at = scene[known], token[known], row[known]
+    assert torch.equal(pose[known], logged.agents.pose[at])
+    grid = make_grid(grid_settings)
+    cell = agents.cell[scene, token, row][~known]
+    ego_pose = agents.pose[scene, token, EGO][~known]
+    centre_m = from_grid(grid.centre_m[cell.numpy()], ego_pose.numpy())
+    away_m = pose[~known][:, :2].numpy() - centre_m
+    assert abs(away_m).max() < 1.5 * grid.step_m
+
+
+def test_insertions_to_learn_come_first_and_those_named_are_missing(logged, played):
+    entries, agents = played.entries, logged.agents
+    slot = torch.arange(entries.add.shape[2])
+    decided = slot <= entries.count[..., None]
+    add = entries.add & decided & entries.asked[..., None]
+
+    assert add.any()
+    assert (add[..., 1:] <= add[..., :-1] | ~decided[..., 1:]).all()
+    scene, token, turn = (entries.agent >= 0).nonzero(as_tuple=True)
+    row = entries.agent[scene, token, turn]
+    assert add[scene, token, turn].all()
+    assert agents.visible[scene, token, row].all()
+    took = played.agents.turn[scene, token, row]
+    assert ((took == turn) | (took == -1)).all()
+    assert torch.equal(
+        entries.cell[scene, token, turn], played.agents.cell[scene, token, row]
+    )
+
+
+def test_a_network_that_inserts_nobody_is_to_insert_more_than_the_log_does(
+    new_network, logged
+):
+    network = biased(new_network().eval(), add=NEVER, remove=NEVER)
+
+    wanted, came = 0, 0
+    for seed in range(8):
+        played = close_population_loop(network, logged, 3, seed)
+        assert (played.entries.count == 0).all()
+        wanted += int(played.entries.add[..., 0].sum())
+        came += int((logged.entries.count[:, 1:] > 0).sum())
+
+    assert wanted > came
+
+
+def test_a_network_that_removes_everybody_is_to_remove_fewer_and_insert_more(
+    new_network, logged
+):
+    network = biased(new_network().eval(), add=NEVER, remove=ALWAYS)
+
+    played = close_population_loop(network, logged, 3, 0)
+
+    # The first decision is on the second token step.
+    others = played.agents.presence[:, 2:, 1:]
+    told = logged.agents.told[:, 1, None]
+    stayed = played.agents.presence[:, 1, 1:] == int(Presence.PRESENT)
+    assert not (stayed & told).any()
+    assert (others == int(Presence.PRESENT)).sum() < (
+        logged.agents.presence[:, 2:, 1:] == int(Presence.PRESENT)
+    ).sum()
+    assert played.entries.add[:, 2:, 0].float().mean() > 0.5
+
+
+def test_a_network_that_inserts_always_is_to_remove_some_surplus_and_learns_nothing_else(
+    new_network, logged
+):
+    network = biased(new_network().eval(), add=ALWAYS, remove=NEVER)
+
+    played = close_population_loop(network, logged, 3, 0)
+
+    agents, rows = played.agents, logged.agents.presence.shape[2]
+    surplus = agents.removal[..., rows:][agents.observed[..., rows:]]
+    assert set(surplus.tolist()) == {UNKNOWN, 1}
+    mask = stay_mask(agents)
+    unknown = torch.roll(agents.removal, -1, dims=1) == UNKNOWN
+    assert not (mask & unknown).any()
+    assert not played.entries.add[:, 3:, 1:].any()
+
+
+def test_a_share_of_the_excess_is_corrected_by_insertions(new_network, record, limits):
+    """Five agents are missing and nobody new comes: one is to be inserted now and then."""
+    network = biased(new_network().eval(), add=NEVER, remove=NEVER)
+    lives = [(0, 11), *((token, 11) for token in range(2, 7))]
+    logged = collate([record(3, tokens=12, lives=lives, spread_m=15.0)], limits, 7)
+    assert logged.agents.visible[0, 9].sum() == 7
+
+    wanted = [
+        close_population_loop(network, logged, 3, seed).entries.add[0, 9, 0].item()
+        for seed in range(80)
+    ]
+
+    share = 5 / (2 * CORRECTION_TOKENS)
+    assert sum(wanted) / len(wanted) == pytest.approx(share, abs=0.17)
+
+
+def test_surplus_agents_teach_no_motion(logged, played):
+    rows = logged.agents.presence.shape[2]
+    surplus = played.agents.observed.clone()
+    surplus[..., :rows] &= ~logged.agents.visible
+
+    assert surplus.any()
+    assert (played.agents.label[surplus] < 0).all()
+
+
+def test_equal_seeds_simulate_equally_and_others_do_not(restless, logged, played):
+    same = close_population_loop(restless, logged, 3, seed=5)
+    other = close_population_loop(restless, logged, 3, seed=6)
+
+    pairs = zip(tensors(played), tensors(same), strict=True)
+    assert all(torch.equal(a, b) for (_, a), (_, b) in pairs)
+    assert not torch.equal(played.agents.presence, other.agents.presence)
+
+
+def test_the_batch_and_the_mode_of_the_network_are_kept(new_network, logged):
+    network = new_network().train()
+    before = [tensor.clone() for _, tensor in tensors(logged)]
+
+    close_population_loop(network, logged, 3, 0)
+
+    assert network.training
+    pairs = zip(tensors(logged), before, strict=True)
+    assert all(torch.equal(now, then) for (_, now), then in pairs)
+
+
+def test_in_simulation_the_network_saw_what_it_learns_from(restless, played):
+    """Logits of one pass over the scene simulated are those that it was simulated with."""
+    with torch.no_grad():
+        said = restless(played)
+    agents = played.agents
+    moved = agents.observed.clone()
+    moved[:, 1:] &= agents.visible[:, :-1]
+    scene, token, row = moved[:, 1:].nonzero(as_tuple=True)
+    logits = said.motion.rows.spread(said.motion.motion_logits)[scene, token, row]
+    likely = logits.topk(3).indices
+    taken = agents.motion_token[scene, token + 1, row]
+
+    assert (likely == taken[:, None]).any(dim=1).all()
+
+
+def test_what_was_simulated_can_be_learned_from(variant, new_network, logged):
+    network = new_network(variant)
+    if network.cells is None:
+        with pytest.raises(ValueError, match="insertion off"):
+            close_population_loop(network, logged, 3, 0)
+        return
+    settings = TrainSettings(label_smoothing=0.0)
+
+    played = close_population_loop(network, logged, 3, 0)
+    loss = total(losses(network(played), played, settings), settings)
+    loss.backward()
+
+    assert torch.isfinite(loss)
+    heads = [network.motion, network.cells, network.details]
+    for head in heads:
+        gradients = [p.grad for p in head.parameters() if p.grad is not None]
+        assert max(float(g.abs().max()) for g in gradients) > 0
+
+
+def test_there_must_be_something_to_choose_from(network, logged):
+    with pytest.raises(ValueError, match="0 motion tokens"):
+        close_population_loop(network, logged, 0, 0)
+
+
+def test_settings_without_simulated_scenes_are_refused():
+    with pytest.raises(ValueError, match="closed_loop_top_k=32"):
+        TrainSettings(closed_loop_population=True)
+
+
+def test_choices_have_their_probabilities():
+    logits = torch.tensor([0.5, 0.3, 0.2]).log().expand(20_000, 3)
+    uniform = UniformNumbers(0, torch.device("cpu")).draw(20_000)
+
+    chosen = choose_among(logits, uniform)
+    best = choose_among(logits, uniform, top=1)
+
+    share = torch.bincount(chosen) / len(chosen)
+    torch.testing.assert_close(share.double(), logits[0].exp().double(), atol=0.015, rtol=0)
+    assert (best == 0).all()
+
+
+def test_the_log_and_targets_of_a_batch_as_logged_agree(logged):
+    agents, entries = logged.agents, logged.entries
+    removed = agents.presence == int(Presence.REMOVED)
+
+    assert torch.equal(agents.removal == 1, removed)
+    assert torch.equal(entries.add, entries.agent >= 0)
