@@ -231,6 +231,10 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "paper": ({}, {}),
     "features": (FEATURES, {"motion_noise_neighbours": 5, "map_noise_neighbours": 3}),
     "closed-loop": (FEATURES, {"closed_loop_top_k": 4}),
+    "closed-loop-population": (
+        {**FEATURES, "density_features": True, "standing_features": True},
+        {"closed_loop_top_k": 4, "closed_loop_population": True},
+    ),
     "accumulated": ({}, {"gradient_accumulation": 2}),
     "smart": ({"insertion_and_removal": False}, {}),
     "no-remove-token": ({"remove_token": False}, {}),

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+import torch
 
 from infgen.config import ModelSettings, TokenSettings, VocabSettings
 from infgen.errors import ConfigError
@@ -114,6 +115,30 @@ def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_i
     assert "model.width=48 (not 16)" in message
     assert "--profile pretrained" in message
     assert len(message) < 1000
+
+
+def test_parts_without_effect_may_be_missing_in_weights_to_begin_with():
+    with_memory = dataclasses.replace(
+        load_network(builtin_weights()).settings,
+        density_features=True,
+        standing_features=True,
+    )
+    plain = load_network(builtin_weights())
+    network = Network(
+        with_memory,
+        plain.motion_vocabulary(),
+        plain.map_vocabulary(),
+        plain.grid_settings,
+    )
+
+    copy_weights(network, builtin_weights())
+
+    parameters = dict(network.named_parameters())
+    for name, parameter in plain.named_parameters():
+        assert torch.equal(parameters.pop(name), parameter), name
+    parts = tuple(network.long_memory())
+    assert len(parts) == 3
+    assert all(name.startswith(parts) for name in parameters)
 
 
 def test_vocabularies_are_those_of_the_weights_and_measured_on_the_records(tmp_path, drive):

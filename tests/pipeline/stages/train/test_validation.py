@@ -52,8 +52,15 @@ def test_the_log_holds_all_of_it(setup, books, quiet):
     assert lines[-1] == {"step": 6, "validation": trained.validation}
 
 
-def test_scenes_are_played_before_they_are_learned_from(setup, books, quiet):
-    how = replace(setup.train, steps=2, closed_loop_top_k=4, checkpoint_every_steps=0)
+@pytest.mark.parametrize("population", [False, True])
+def test_scenes_are_played_before_they_are_learned_from(setup, books, quiet, population):
+    how = replace(
+        setup.train,
+        steps=2,
+        closed_loop_top_k=4,
+        closed_loop_population=population,
+        checkpoint_every_steps=0,
+    )
     played = replace(setup, train=how)
 
     train(played, begin(played, *books), quiet)
