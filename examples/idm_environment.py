@@ -13,8 +13,8 @@ import gymnasium
 import numpy as np
 
 from infgen.environment import ID
-from infgen.environment.ego import WHEELBASE_SHARE
 from infgen.environment.observation import AGENTS, EGO, ROUTE_SPACING_M, SIGNALS
+from infgen.rollout.bicycle import wheelbase_of
 
 MAX_ACCEL_MPS2, COMFORT_BRAKE_MPS2 = 1.5, 2.0
 DESIRED_MPS = 10.0
@@ -68,7 +68,7 @@ def steer(
     at_m = max(PURSUIT_M, PURSUIT_S * speed_mps) / ROUTE_SPACING_M
     x_m, y_m = (np.interp(at_m, np.arange(len(way_m)), line) for line in way_m.T)
     per_m = 2 * y_m / max(x_m**2 + y_m**2, 1.0)
-    slip_rad = np.arcsin(np.clip(per_m * WHEELBASE_SHARE * length_m / 2, -0.9, 0.9))
+    slip_rad = np.arcsin(np.clip(per_m * wheelbase_of(length_m) / 2, -0.9, 0.9))
     return float(np.arctan(2 * np.tan(slip_rad)))
 
 

@@ -1,8 +1,8 @@
 """The driven cars of a batch of environments, and how actions move them.
 
-Two kinds of action. A kinematic bicycle takes an acceleration and the steering angle of its
-front wheel; a waypoint is the pose that the car has at the end of the step. Cars do not
-drive backwards with a bicycle: braking ends at a stop.
+Two kinds of action. A kinematic bicycle (``infgen.rollout.bicycle``) takes an acceleration
+and the steering angle of its front wheel; a waypoint is the pose that the car has at the
+end of the step. Cars do not drive backwards with a bicycle: braking ends at a stop.
 """
 
 from dataclasses import dataclass
@@ -12,14 +12,16 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from infgen.clock import CLOCK
-from infgen.geometry import to_world, wrap_angle
+from infgen.geometry import to_world
+from infgen.rollout.bicycle import (
+    MAX_STEERING_RAD,
+    curvature_per_m,
+    follow_arc,
+    wheelbase_of,
+)
 
-WHEELBASE_SHARE = 0.6
-"""Distance of the axles over the length of the box (2.8 m of a car of 4.7 m)."""
 ACCEL_MPS2 = (-8.0, 4.0)
 """Strongest braking and acceleration of a bicycle."""
-MAX_STEERING_RAD = 0.6
-"""Largest steering angle of a bicycle, to either side."""
 MAX_SPEED_MPS = 40.0
 """A bicycle does not get faster."""
 WAYPOINT_MPS = ((-10.0, 40.0), (-10.0, 10.0))
@@ -115,13 +117,7 @@ def _drive_bicycle(
     steering_rad: Float64[np.ndarray, " environment"],
     length_m: Float32[np.ndarray, " environment"],
 ) -> EgoState:
-    """Drive one 0.1 s step.
-
-    The kinematic bicycle around the middle between its axles (Rajamani, Vehicle Dynamics
-    and Control, 2012, eq. 2.2): the car moves at the slip angle beta to its heading, with
-    tan(beta) = tan(steering) / 2, and turns by sin(beta) over half the wheelbase per metre.
-    Steering is constant in a step, so the way is an arc of a circle, and exact.
-    """
+    """Drive one 0.1 s step."""
     before, seconds = state.speed_mps, CLOCK.step_s
     speed = np.clip(before + accel_mps2 * seconds, 0.0, MAX_SPEED_MPS)
     # Who stops or reaches the greatest speed within the step does so before its end.
@@ -129,20 +125,13 @@ def _drive_bicycle(
     changes = accel_mps2 != 0
     np.divide(speed - before, accel_mps2, out=changing_s, where=changes)
     way_m = (before + speed) / 2 * changing_s + speed * (seconds - changing_s)
-    slip_rad = np.arctan(np.tan(steering_rad) / 2)
-    turn_rad = way_m * np.sin(slip_rad) / (WHEELBASE_SHARE * length_m / 2)
-    chord_m = way_m * np.sinc(turn_rad / 2 / np.pi)
-    direction_rad = state.pose[:, 2] + slip_rad + turn_rad / 2
-    pose = np.stack(
-        [
-            state.pose[:, 0] + chord_m * np.cos(direction_rad),
-            state.pose[:, 1] + chord_m * np.sin(direction_rad),
-            wrap_angle(state.pose[:, 2] + turn_rad),
-        ],
-        axis=1,
-    )
+    wheelbase_m = wheelbase_of(length_m)
     return EgoState(
-        pose, speed, (speed - before) / seconds, steering_rad, turn_rad / seconds
+        pose=follow_arc(state.pose, way_m, steering_rad, wheelbase_m),
+        speed_mps=speed,
+        accel_mps2=(speed - before) / seconds,
+        steering_rad=steering_rad,
+        yaw_rate_rad_s=curvature_per_m(steering_rad, wheelbase_m) * way_m / seconds,
     )
 
 

@@ -132,7 +132,7 @@ class World:
     def _begin_step(self) -> BegunStep:
         """Return the token step under way; the network is called once for each."""
         if self._begun is None:
-            self._begun = self._session.begin_step()
+            self._begun = self._session.begin_step(driven=True)
             shape = (len(self._begun.path), CLOCK.steps_per_token, 3)
             self._driven = np.zeros(shape, dtype=np.float32)
         return self._begun

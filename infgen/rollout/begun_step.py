@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Int64
 from infgen.clock import CLOCK
 from infgen.rollout.population import Population, place_logged_agents
 from infgen.rollout.recording import NOBODY, RolloutStart
+from infgen.tokens.scene_tokens import Presence
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +22,7 @@ class BegunStep:
         path: x, y, heading of every row at its five steps.
         shown: At which of them it is observed.
         is_history: Rollouts of whose history it is the last token step: nobody is inserted.
+        ego_is_driven: Whether a caller has said where the egos go, or the network chose.
     """
 
     before: Population
@@ -28,11 +30,17 @@ class BegunStep:
     path: Float32[np.ndarray, "rollout row 5 3"]
     shown: Bool[np.ndarray, "rollout row 5"]
     is_history: Bool[np.ndarray, " rollout"]
+    ego_is_driven: bool
 
     @property
     def there(self) -> Bool[np.ndarray, "rollout row"]:
         """Rows that hold an agent."""
         return self.moved.agent_number != NOBODY
+
+    @property
+    def removed(self) -> Bool[np.ndarray, "rollout row"]:
+        """Rows whose agent is there for the last time."""
+        return self.moved.presence == Presence.REMOVED
 
     def with_rows(self, rows: int) -> "BegunStep":
         """Append free rows, up to so many."""
@@ -53,9 +61,14 @@ class BegunStep:
         is_history = self.is_history.copy()
         path[rollouts], shown[rollouts] = others.path, others.shown
         is_history[rollouts] = others.is_history
-        before = self.before.put(rollouts, others.before)
-        moved = self.moved.put(rollouts, others.moved)
-        return BegunStep(before, moved, path, shown, is_history)
+        return replace(
+            self,
+            before=self.before.put(rollouts, others.before),
+            moved=self.moved.put(rollouts, others.moved),
+            path=path,
+            shown=shown,
+            is_history=is_history,
+        )
 
 
 def logged_step(starts: Sequence[RolloutStart], min_rows: int) -> BegunStep:
@@ -81,4 +94,5 @@ def logged_step(starts: Sequence[RolloutStart], min_rows: int) -> BegunStep:
         path[at, rows, :, :2] = tracks.xyz_m[logged, steps, :2]
         path[at, rows, :, 2] = tracks.heading_rad[logged, steps]
         shown[at, rows] = tracks.valid[logged, steps]
-    return BegunStep(before, moved, path, shown, np.ones(len(starts), dtype=bool))
+    is_history = np.ones(len(starts), dtype=bool)
+    return BegunStep(before, moved, path, shown, is_history, ego_is_driven=True)

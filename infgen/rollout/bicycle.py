@@ -3,7 +3,8 @@
 Pure functions over packed states [..., 4]: x and y of the box centre in metres, heading in
 radians, speed in m/s (negative in reverse). The box centre lies midway between the axles;
 wheels do not slip (Kong et al., "Kinematic and dynamic vehicle models for autonomous
-driving control design", IV 2015).
+driving control design", IV 2015). The environment and ``infgen drive`` move their egos so;
+what a driver may ask of a car, and how a car stops, each of them says itself.
 """
 
 from typing import NamedTuple
@@ -17,6 +18,8 @@ X, Y, HEADING, SPEED = range(4)
 """Columns of a state."""
 WHEELBASE_SHARE = 0.6
 """Distance of the axles over the length of the box: of most cars 0.57 to 0.63."""
+MAX_STEERING_RAD = 0.6
+"""Largest angle of the front wheels, to either side."""
 
 _Values = float | int | Float[np.ndarray, "..."]
 
@@ -30,7 +33,7 @@ class VehicleLimits(NamedTuple):
         steering_rate_radps: How fast the front wheels turn.
     """
 
-    max_steering_rad: float = 0.6
+    max_steering_rad: float = MAX_STEERING_RAD
     max_lateral_mps2: float = 5.0
     steering_rate_radps: float = 1.0
 
@@ -49,6 +52,35 @@ def curvature_per_m(steering_rad: _Values, wheelbase_m: _Values) -> _Values:
     return np.cos(slip_rad) * np.tan(steering_rad) / wheelbase_m
 
 
+def follow_arc(
+    pose: Float64[np.ndarray, "*batch 3"],
+    way_m: _Values,
+    steering_rad: _Values,
+    wheelbase_m: _Values,
+) -> Float64[np.ndarray, "*batch 3"]:
+    """Move on a way with constant steering: an arc, followed exactly.
+
+    Args:
+        pose: x, y, heading.
+        way_m: Length of the centre's path; negative in reverse.
+        steering_rad: Angle of the front wheels, positive to the left.
+        wheelbase_m: Distance of the axles.
+    """
+    turn_rad = curvature_per_m(steering_rad, wheelbase_m) * way_m
+    slip_rad = np.arctan(np.tan(steering_rad) / 2)
+    # The chord of an arc; np.sinc(x) is sin(pi x) / (pi x).
+    chord_m = way_m * np.sinc(turn_rad / 2 / np.pi)
+    direction_rad = pose[..., HEADING] + slip_rad + turn_rad / 2
+    return np.stack(
+        [
+            pose[..., X] + chord_m * np.cos(direction_rad),
+            pose[..., Y] + chord_m * np.sin(direction_rad),
+            wrap_angle(np.asarray(pose[..., HEADING] + turn_rad)),
+        ],
+        axis=-1,
+    )
+
+
 def advance(
     state: Float64[np.ndarray, "*batch 4"],
     acceleration_mps2: _Values,
@@ -58,8 +90,8 @@ def advance(
 ) -> Float64[np.ndarray, "*batch 4"]:
     """Move on with constant acceleration and steering.
 
-    The path is an arc and is followed exactly, so that a step of 0.1 s and ten of 0.01 s
-    lead to the same place. Nothing stops at speed 0: see ``stopping_acceleration``.
+    A step of 0.1 s and ten of 0.01 s lead to the same place. Nothing stops at speed 0: see
+    ``stopping_acceleration``.
 
     Args:
         state: x, y, heading, speed.
@@ -70,20 +102,9 @@ def advance(
     """
     speed_mps = state[..., SPEED]
     way_m = speed_mps * seconds + acceleration_mps2 * seconds**2 / 2
-    turn_rad = curvature_per_m(steering_rad, wheelbase_m) * way_m
-    slip_rad = np.arctan(np.tan(steering_rad) / 2)
-    # The chord of an arc; np.sinc(x) is sin(pi x) / (pi x).
-    chord_m = way_m * np.sinc(turn_rad / 2 / np.pi)
-    direction_rad = state[..., HEADING] + slip_rad + turn_rad / 2
-    return np.stack(
-        [
-            state[..., X] + chord_m * np.cos(direction_rad),
-            state[..., Y] + chord_m * np.sin(direction_rad),
-            wrap_angle(np.asarray(state[..., HEADING] + turn_rad)),
-            speed_mps + acceleration_mps2 * seconds,
-        ],
-        axis=-1,
-    )
+    pose = follow_arc(state[..., :SPEED], way_m, steering_rad, wheelbase_m)
+    speed_mps = speed_mps + acceleration_mps2 * seconds
+    return np.concatenate([pose, speed_mps[..., None]], axis=-1)
 
 
 def stopping_acceleration(

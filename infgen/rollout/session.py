@@ -6,6 +6,9 @@
     while planning:
         frame = session.step(ego_pose)      # or session.step(): the network drives
 
+    begun = session.begin_step(plan)        # The same in two halves, for callers that learn
+    frame = session.end_step(begun, driven) # only meanwhile where the egos really go.
+
 The order within a token step is that of SPEC 12.2: every agent moves, removed agents are
 marked, and agents are inserted one by one until the network samples BEGIN MOTION.
 """
@@ -98,7 +101,6 @@ class Session:
             simulator.tensor(simulator.vocabulary.stationary),
         )
         self._driven_to: np.ndarray | None = None
-        self._ego_from = self.population.pose[:, EGO_ROW]
 
     @property
     def ego_pose(self) -> Float32[np.ndarray, "rollout 3"]:
@@ -118,30 +120,47 @@ class Session:
                 poses most closely; each corrects the error of the one before. None lets
                 the network drive the ego.
         """
-        path = None if ego_pose is None else self._ego_path(ego_pose)
-        return self._end(self._begin(self._drive_ego(path), path), path)
+        return self.end_step(self.begin_step(ego_pose))
 
     @torch.inference_mode()
-    def begin_step(self) -> BegunStep:
+    def begin_step(
+        self,
+        ego_pose: Float32[np.ndarray, "*steps 3"] | None = None,
+        *,
+        driven: bool = False,
+    ) -> BegunStep:
         """Let all agents choose what they do in the next token step.
 
-        Whoever drives the egos need not know yet where to: others do not see it before the
-        step has ended. The egos are driven by the network here.
+        The caller may drive the egos otherwise than it says here: others do not see where
+        to before the step has ended.
+
+        Args:
+            ego_pose: Where the egos are to go, as in ``step``. None lets the network choose
+                for them: it goes on from where they really are.
+            driven: Whether a caller that does not know yet where the egos go will say so at
+                the end. The network's choice stands in for it, on from the poses that the
+                network knows of.
         """
-        return self._begin(self.population, None)
+        path = None if ego_pose is None else self._ego_path(ego_pose)
+        known = self.population if driven or path is not None else self._at_driven_poses()
+        return self._begin(known, path)
 
     @torch.inference_mode()
     def end_step(
-        self, begun: BegunStep, ego_pose: Float32[np.ndarray, "rollout 5 3"]
+        self,
+        begun: BegunStep,
+        ego_pose: Float32[np.ndarray, "*steps 3"] | None = None,
     ) -> Frame:
-        """End a token step that has begun, the egos driven along given poses.
+        """End a token step that has begun: agents are inserted.
 
         Args:
             begun: The token step.
-            ego_pose: Poses of the egos at its five steps.
+            ego_pose: Where the egos went, as in ``step``; None where they were to go when
+                it began.
         """
-        path = self._ego_path(ego_pose)
-        return self._end(self._follow(begun, path), path)
+        if ego_pose is not None:
+            begun = self._follow(begun, self._ego_path(ego_pose))
+        return self._end(begun)
 
     @torch.inference_mode()
     def replace(
@@ -223,15 +242,14 @@ class Session:
 
     def _begin(self, before: Population, path: np.ndarray | None) -> BegunStep:
         """Let all agents move, egos along their paths if these are known."""
-        self._ego_from = before.pose[:, EGO_ROW]
         said = self._ask_motion(before)
         choices = self._sampler.sample(before, said, self.token + 1)
         moved, paths = self._move(before, choices, said, path)
         shown = self._observed_steps(before, moved, choices)
         nobody = np.zeros(len(self._streams), dtype=bool)
-        return BegunStep(before, moved, paths, shown, nobody)
+        return BegunStep(before, moved, paths, shown, nobody, path is not None)
 
-    def _end(self, begun: BegunStep, path: np.ndarray | None) -> Frame:
+    def _end(self, begun: BegunStep) -> Frame:
         """Insert agents, and go on to the end of the token step."""
         after = moved = begun.moved
         token = self.token + 1
@@ -243,13 +261,13 @@ class Session:
             insert = insert_agents if self._device is None else self._device.insert
             after = insert(asking, self._memory, moved, token)
         self.population, self.token = after, token
-        self._driven_to = None if path is None else path[:, -1]
+        self._driven_to = begun.path[:, EGO_ROW, -1] if begun.ego_is_driven else None
         return Frame(
             token=token,
             agent_number=moved.agent_number,
             path=begun.path,
             shown=begun.shown,
-            removed=moved.presence == Presence.REMOVED,
+            removed=begun.removed,
             inserted_number=np.where(
                 after.agent_number != moved.agent_number,
                 after.agent_number,
@@ -268,24 +286,7 @@ class Session:
         )
         paths[:, EGO_ROW] = path
         moved = replace(moved, motion_token=motion_token, pose=pose)
-        return replace(begun, moved=moved, path=paths)
-
-    def correct_ego(self, ego_pose: Float32[np.ndarray, "rollout 3"]) -> None:
-        """Replace the poses of the egos at the end of the last token step.
-
-        For callers that ask for a token step before the ego has driven it: the network has
-        not seen its end yet, and will see the egos exactly here, with the motion tokens
-        that come closest. Motion and insertions of that token step stay as they are.
-
-        Args:
-            ego_pose: Where the egos are: x, y, heading in the frame of the scene.
-        """
-        agent_type = self.population.agent_type[:, EGO_ROW]
-        pose, token = self.population.pose.copy(), self.population.motion_token.copy()
-        token[:, EGO_ROW], _ = follow(ego_pose, self._ego_from, agent_type, self._table)
-        pose[:, EGO_ROW] = ego_pose
-        self.population = replace(self.population, pose=pose, motion_token=token)
-        self._driven_to = None
+        return replace(begun, moved=moved, path=paths, ego_is_driven=True)
 
     def _ask_motion(self, population: Population) -> MotionStep:
         """Show the network all agents; return what follows."""
@@ -326,9 +327,9 @@ class Session:
         path[:, -1] = given
         return path
 
-    def _drive_ego(self, path: np.ndarray | None) -> Population:
-        """Return the agents as the network sees them, egos at their driven poses."""
-        if self._driven_to is None or path is not None:
+    def _at_driven_poses(self) -> Population:
+        """Return the agents, egos exactly where they were driven."""
+        if self._driven_to is None:
             return self.population
         pose = self.population.pose.copy()
         pose[:, EGO_ROW] = self._driven_to

@@ -74,8 +74,9 @@ class RolloutSettings:
     scenes_per_unit: AtLeastOne = 8
     """Scenes of one unit of work."""
     batch_rollouts: AtLeastOne = 32
-    """Rollouts that are simulated at once. A batch that does not fit into the memory of a
-    CUDA device is simulated as smaller ones."""
+    """Rollouts that are simulated at once: on a CPU those of one scene, on a CUDA device
+    those of several. A batch that does not fit into the memory of a CUDA device is
+    simulated as smaller ones."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the network computes. `auto` is `cuda` if the process that plans the rollouts
     has a CUDA device, else `cpu`. All units of one run use devices of one type; a worker

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float32
 
+from infgen.rollout.begun_step import BegunStep
 from infgen.rollout.recording import Frame, RolloutStart, collect
 from infgen.rollout.session import Session
 from infgen.rollout.simulator import Simulator
@@ -29,16 +30,24 @@ class PlannerSession(Session):
         self._settings = simulator.settings
         self._frames: list[Frame] = []
 
-    def step(self, ego_pose: Float32[np.ndarray, "*steps 3"] | None = None) -> Frame:
-        """Simulate the next token step; other agents react to the ego one token step later.
-
-        Args:
-            ego_pose: Pose of the ego (x, y, heading in the frame of the scene) at the end
-                of the token step [3], or at each of its five steps [5, 3]; with a first
-                dimension of rollouts for several. None lets the network drive.
-        """
+    def begin_step(
+        self,
+        ego_pose: Float32[np.ndarray, "*steps 3"] | None = None,
+        *,
+        driven: bool = False,
+    ) -> BegunStep:
+        """Let all agents choose what they do in the next token step."""
         with one_thread():
-            frame = super().step(ego_pose)
+            return super().begin_step(ego_pose, driven=driven)
+
+    def end_step(
+        self,
+        begun: BegunStep,
+        ego_pose: Float32[np.ndarray, "*steps 3"] | None = None,
+    ) -> Frame:
+        """End a token step that has begun: agents are inserted."""
+        with one_thread():
+            frame = super().end_step(begun, ego_pose)
         self._frames.append(frame)
         return frame
 

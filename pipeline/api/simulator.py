@@ -42,9 +42,9 @@ class TrafficSimulator:
     ) -> "SceneRollouts":
         """Simulate what may happen after the history of a scene.
 
-        These are the bytes that ``infgen rollout`` writes for the same scene, weights and
-        settings, if its batches are of one scene each too (32 rollouts per scene, as usual,
-        or ``rollout.scenes_per_unit=1``): in others sums may round differently.
+        On a CPU these are the rollouts of ``infgen rollout`` for the same scene, weights,
+        seed, ``count`` and ``batch_rollouts``, bit for bit. On a CUDA device that command
+        fills a batch with several scenes, and sums may round differently.
 
         Args:
             scene: A log; what it holds after ``scene.now`` is not looked at.

@@ -1,10 +1,11 @@
 """One drive through one scene, tick by tick.
 
 Two clocks meet here. The car moves every tick (0.025 s), so that keys act at once; the
-world moves in token steps of 0.5 s. The next token step is asked for ``LEAD_TICKS`` before
-it is shown and computed meanwhile, with the controls held as they are at that moment. Where
-the driver then does otherwise, the session is corrected before the network looks again:
-other agents react to what the ego did up to ``LEAD_TICKS`` before their token step begins.
+world moves in token steps of 0.5 s. ``LEAD_TICKS`` before one is over, its end and the
+beginning of the next one are asked for and computed meanwhile, with the controls held as
+they are at that moment: other agents react to what the ego did up to ``LEAD_TICKS`` before
+their token step begins. Where the driver then does otherwise, the network sees it at the
+end of the next token step.
 
 What comes out depends on the controls at each tick only, never on how fast anything was:
 where the world is late, the clock waits.
@@ -68,7 +69,7 @@ class Drive:
         car: The driven car; None while the network drives.
         at_wheel: Whether a person is to drive.
         late_ticks: Ticks that the clock has waited for the world.
-        inserted: Agents that have entered so far, those of ``shown`` at its end included.
+        inserted: Agents that have entered so far.
         removed: Agents that have left.
         frames: What has been driven, up to ``MAX_RECORDED_S``.
         step_s: Seconds of the last world steps.
@@ -92,9 +93,10 @@ class Drive:
             if self._next is None or not self._next.done():
                 self.late_ticks += 1
                 return None
-            self._record()
+            coming = self._next.result()
+            self._record(coming)
             self._begin = self._path[-1].copy()
-            self._show(self._next.result())
+            self._show(coming)
         before = self._pose
         self._tick += 1
         self._step = self._first_step + self._tick / TICKS_PER_STEP
@@ -137,12 +139,12 @@ class Drive:
     def _show(self, step: WorldStep) -> None:
         """Begin the next token step."""
         self.shown, self._next, self._tick = step, None, 0
-        self._first_step = CLOCK.start_step(step.frame.token)
-        self._path = step.ego_path.copy()
+        self._first_step = CLOCK.start_step(step.token)
+        self._path = step.path[EGO_ROW].copy()
         self._pose = self._begin.copy()
         self._steered = step.driven
         self.inserted += step.num_inserted
-        self.removed += step.num_removed
+        self.removed += int(step.removed.sum())
         self.step_s.append(step.seconds)
         if not step.driven and not self.at_wheel:
             self.car = None
@@ -164,17 +166,20 @@ class Drive:
         if car is None:
             self._next = self._submit(world.step)
             return
-        for _ in range(LEAD_TICKS):
+        driven = self._path.copy()
+        for tick in range(self._tick + 1, TICKS_PER_TOKEN + 1):
             car = car.drive(controls)
-        correction = car.pose
+            if tick % TICKS_PER_STEP == 0:
+                driven[tick // TICKS_PER_STEP - 1] = car.pose
         plan = car.drive_token(controls) if self.at_wheel else None
-        self._next = self._submit(lambda: world.step(correction, plan))
+        self._next = self._submit(lambda: world.step(driven, plan))
 
-    def _record(self) -> None:
-        """Keep the token step as it was driven."""
+    def _record(self, coming: WorldStep) -> None:
+        """Keep the token step that is over, the ego where it was driven to its end."""
+        frame = coming.ended
+        assert frame is not None  # Only the first token step comes after none.
         if self.recorded_s >= MAX_RECORDED_S:
             return
-        frame = self.shown.frame
         if self._steered:
             path = frame.path.copy()
             path[0, EGO_ROW] = self._path

@@ -9,18 +9,23 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 
 from tornado.web import RequestHandler
-from tornado.websocket import WebSocketClosedError, WebSocketHandler
+from tornado.websocket import (
+    WebSocketClosedError,
+    WebSocketHandler,
+    WebSocketProtocol,
+    WebSocketProtocol13,
+)
 
 from pipeline.drive.access import MessageRate
 from pipeline.drive.assets import PAGE
-from pipeline.drive.messages import MessageError, read_message
+from pipeline.drive.messages import MAX_BYTES, MessageError, read_message
 
 if TYPE_CHECKING:
     from pipeline.drive.server import DriveServer
 
 MOST_UNSENT = 400
 """A page that takes ten seconds of messages no more is let go."""
-POLICY_VIOLATION, TRY_AGAIN_LATER = 1008, 1013
+POLICY_VIOLATION, MESSAGE_TOO_BIG, TRY_AGAIN_LATER = 1008, 1009, 1013
 
 
 class _Checked(RequestHandler):
@@ -53,9 +58,13 @@ class _Checked(RequestHandler):
         if why is None and request.method != "GET":
             why = f"method {request.method}, expected GET"
         if why is not None:
-            self.server.refuse(f"{request.remote_ip}: {why}")
+            self.refuse(why)
             self.set_status(HTTPStatus.FORBIDDEN)
             self.finish("refused\n")
+
+    def refuse(self, why: str) -> None:
+        """Log that something was refused."""
+        self.server.refuse(f"{self.request.remote_ip}: {why}")
 
 
 class Files(_Checked):
@@ -65,7 +74,7 @@ class Files(_Checked):
         """Send a file by its fixed name."""
         asset = self.server.assets.get(name)
         if asset is None:
-            self.server.refuse(f"{self.request.remote_ip}: no file {name[:80]!r}")
+            self.refuse(f"no file {name[:80]!r}")
             self.set_status(HTTPStatus.NOT_FOUND)
             self.finish("no such file\n")
             return
@@ -91,11 +100,18 @@ class Driver(_Checked, WebSocketHandler):
         """Allow: ``prepare`` has checked it."""
         return True
 
+    def get_websocket_protocol(self) -> WebSocketProtocol | None:
+        """Return the protocol of the line; what it refuses by itself is logged too."""
+        made = super().get_websocket_protocol()
+        if isinstance(made, WebSocketProtocol13):
+            return _LoggedProtocol(self, made.params)
+        return made
+
     def open(self, *args: str, **_: str) -> None:
         """Take the driver's seat, if it is free."""
         self.set_nodelay(True)
         if not self.server.seat(self):
-            self.server.refuse(f"{self.request.remote_ip}: somebody drives already")
+            self.refuse("somebody drives already")
             self.close(TRY_AGAIN_LATER, "somebody drives already, in another window")
 
     def on_message(self, message: str | bytes) -> None:
@@ -105,7 +121,7 @@ class Driver(_Checked, WebSocketHandler):
                 raise MessageError("too many messages")
             read = read_message(message)
         except MessageError as error:
-            self.server.refuse(f"{self.request.remote_ip}: {error}")
+            self.refuse(str(error))
             self.server.leave(self)
             self.close(POLICY_VIOLATION, "a message was refused")
             return
@@ -118,7 +134,7 @@ class Driver(_Checked, WebSocketHandler):
     def send(self, text: str) -> None:
         """Send a message; a page that no longer reads is let go."""
         if self._unsent > MOST_UNSENT:
-            self.server.refuse(f"{self.request.remote_ip}: it does not read")
+            self.refuse("it does not read")
             self.server.leave(self)
             self.close(POLICY_VIOLATION, "too slow")
             return
@@ -134,3 +150,27 @@ class Driver(_Checked, WebSocketHandler):
         self._unsent -= 1
         if not sent.cancelled():
             sent.exception()  # A page that went away is no error.
+
+
+class _LoggedProtocol(WebSocketProtocol13):
+    """The websocket protocol, which logs why it cuts a line.
+
+    Tornado cuts the line without a word to its handler where a message is longer than
+    allowed, is no text as its type says, or breaks the protocol.
+    """
+
+    def __init__(self, driver: Driver, params: Any) -> None:
+        super().__init__(driver, mask_outgoing=False, params=params)
+        self._refuse = driver.refuse
+
+    def close(self, code: int | None = None, reason: str | None = None) -> None:
+        """Close the line; tornado gives this code before it has read the message."""
+        if code == MESSAGE_TOO_BIG and not self.server_terminated:
+            self._refuse(f"a message of more than {MAX_BYTES} bytes")
+        super().close(code, reason)
+
+    def _abort(self) -> None:
+        # A line that the page has left is closed already.
+        if not self.server_terminated and not self.stream.closed():
+            self._refuse("what it sent breaks the websocket protocol")
+        super()._abort()

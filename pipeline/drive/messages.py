@@ -112,20 +112,20 @@ def scene_message(world: World, scenes: Sequence[str], number: int) -> str:
 
 def frame_message(world: World, step: WorldStep) -> str:
     """Say where all agents but the ego go in a token step."""
-    frame, present = step.frame, step.present.copy()
+    present, moved = step.present.copy(), step.begun.moved
     present[EGO_ROW] = False
     rows = np.flatnonzero(present)
-    ids, number = world.ids(frame.agent_number[0, rows]), frame.agent_number[0, rows]
+    number, path = moved.agent_number[0, rows], step.path[rows]
     logged = number < world.start.history.num_agents
     columns = {
-        "id": ids.tolist(),
-        "kind": frame.agent_type[0, rows].tolist(),
+        "id": world.ids(number).tolist(),
+        "kind": moved.agent_type[0, rows].tolist(),
         "role": np.where(logged, Role.INITIAL, Role.INSERTED).tolist(),
-        "removed": frame.removed[0, rows].astype(int).tolist(),
-        "size": _rounded(frame.size_lwh_m[0, rows, :2], 2),
-        "path": _rounded(frame.path[0, rows].reshape(len(rows), frame.path[0, 0].size), 3),
+        "removed": step.removed[rows].astype(int).tolist(),
+        "size": _rounded(moved.size_lwh_m[0, rows, :2], 2),
+        "path": _rounded(path.reshape(len(rows), step.path[0].size), 3),
     }
-    return _write("frame", token=frame.token, **columns)
+    return _write("frame", token=step.token, **columns)
 
 
 def ego_message(moment: Moment, drive: Drive) -> str:

@@ -202,8 +202,8 @@ class DriveServer:
     def _announce(self, drive: Drive) -> None:
         """Send token steps that the page has not seen, the next one once it is there."""
         for step in (drive.shown, drive.coming):
-            if step is not None and step.frame.token > self._announced:
-                self._announced = step.frame.token
+            if step is not None and step.token > self._announced:
+                self._announced = step.token
                 self._send(messages.frame_message(drive.world, step))
 
     def _send(self, text: str) -> None:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
-from infgen.rollout.population import EGO_ROW, Population
+from infgen.rollout.begun_step import BegunStep
+from infgen.rollout.population import Population
 from infgen.rollout.recording import NOBODY, Frame, RolloutStart
 from infgen.rollout.session import Session
 from infgen.rollout.simulator import Simulator
@@ -14,41 +15,50 @@ from infgen.rollout.simulator import Simulator
 
 @dataclass(frozen=True, slots=True)
 class WorldStep:
-    """One simulated token step.
+    """A token step that has begun, and the end of the one before it.
 
     Attributes:
-        frame: Who moves where.
-        driven: Whether the ego went where it was planned, or as the network chose.
-        seconds: Time that it took to simulate.
+        token: The token step that has begun.
+        begun: Who moves where in it.
+        ended: The one before it as it was driven; None at the beginning of a drive.
+        seconds: Time that both took to simulate.
     """
 
-    frame: Frame
-    driven: bool
+    token: int
+    begun: BegunStep
+    ended: Frame | None
     seconds: float
 
     @property
-    def ego_path(self) -> Float32[np.ndarray, "5 3"]:
-        """Poses of the ego at the five steps."""
-        return self.frame.path[0, EGO_ROW]
+    def driven(self) -> bool:
+        """Whether the ego goes where it is planned to, or as the network chose."""
+        return self.begun.ego_is_driven
+
+    @property
+    def path(self) -> Float32[np.ndarray, "row 5 3"]:
+        """Poses of all rows at the five steps."""
+        return self.begun.path[0]
 
     @property
     def present(self) -> Bool[np.ndarray, " row"]:
         """Rows that hold an agent throughout."""
-        return self.frame.agent_number[0] != NOBODY
+        return self.begun.there[0]
+
+    @property
+    def removed(self) -> Bool[np.ndarray, " row"]:
+        """Rows whose agent is there for the last time."""
+        return self.begun.removed[0]
 
     @property
     def num_inserted(self) -> int:
-        """Agents that enter at its end."""
-        return int((self.frame.inserted_number[0] != NOBODY).sum())
-
-    @property
-    def num_removed(self) -> int:
-        """Agents that are there for the last time."""
-        return int(self.frame.removed[0].sum())
+        """Agents that entered at its beginning."""
+        if self.ended is None:
+            return 0
+        return int((self.ended.inserted_number[0] != NOBODY).sum())
 
 
 class World:
-    """A session with one rollout, whose ego may be driven."""
+    """A session with one rollout, whose ego may be driven: always within a token step."""
 
     def __init__(self, simulator: Simulator, start: RolloutStart) -> None:
         """Feed the history to the network.
@@ -58,6 +68,7 @@ class World:
         """
         self.simulator, self.start = simulator, start
         self._session = Session(simulator, start)
+        self._begun: BegunStep | None = None
         history = start.history
         self._num_logged = history.num_agents
         first_id = int(start.scene.tracks.id.max()) + 1 - self._num_logged
@@ -86,20 +97,21 @@ class World:
 
     def step(
         self,
-        correction: Float32[np.ndarray, "3"] | None = None,
+        driven: Float32[np.ndarray, "5 3"] | None = None,
         plan: Float32[np.ndarray, "5 3"] | None = None,
     ) -> WorldStep:
-        """Simulate the next token step.
+        """End the token step that has begun, and begin the next one.
 
         Args:
-            correction: Where the ego is at its beginning, if not where it was planned.
-            plan: Where it will be at the five steps; None lets the network drive it.
+            driven: Where the ego went, if not where it was planned.
+            plan: Where it will be next; None lets the network drive it.
         """
-        begun = time.perf_counter()
-        if correction is not None:
-            self._session.correct_ego(correction[None])
-        frame = self._session.step(plan)
-        return WorldStep(frame, plan is not None, time.perf_counter() - begun)
+        begun_s, session, ended = time.perf_counter(), self._session, None
+        if self._begun is not None:
+            ended = session.end_step(self._begun, driven)
+        self._begun = session.begin_step(plan)
+        seconds = time.perf_counter() - begun_s
+        return WorldStep(session.token + 1, self._begun, ended, seconds)
 
     def ids(self, number: Int32[np.ndarray, " agent"]) -> Int32[np.ndarray, " agent"]:
         """Return the track ids of agents by their numbers, as recordings have them."""

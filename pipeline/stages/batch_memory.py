@@ -37,6 +37,8 @@ def simulate_in_memory(
     starts: "Sequence[RolloutStart]",
     size: BatchSize,
     tell: Callable[[float], None],
+    *,
+    mix_scenes: bool,
 ) -> "Iterator[tuple[list[RolloutStart], list[Frame]]]":
     """Simulate rollouts in batches.
 
@@ -48,13 +50,14 @@ def simulate_in_memory(
         starts: Where they begin.
         size: Rollouts of a batch; halved in place.
         tell: Called with the number of simulated rollouts at every token step of a batch.
+        mix_scenes: Whether a batch may hold several scenes.
 
     Raises:
         SimulationMemoryError: if a single rollout is too large.
     """
     done = 0
-    for _, group in groupby(starts, key=lambda start: start.history.now):
-        waiting = list(group)  # Histories of one length: a batch steps together.
+    for _, group in groupby(starts, key=_batch_key(mix_scenes)):
+        waiting = list(group)
         while waiting:
             batch = waiting[: size.rollouts]
             frames = _simulate(simulator, batch, done, tell)
@@ -65,6 +68,13 @@ def simulate_in_memory(
                 continue
             yield batch, frames
             done, waiting = done + len(batch), waiting[len(batch) :]
+
+
+def _batch_key(mix_scenes: bool) -> "Callable[[RolloutStart], int]":
+    """Return what neighbouring rollouts of one batch must have in common."""
+    if mix_scenes:
+        return lambda start: start.history.now  # A batch steps together.
+    return lambda start: id(start.scene)
 
 
 def _simulate(

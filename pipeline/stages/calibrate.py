@@ -154,7 +154,9 @@ def work(unit: Unit, target: Path, settings: Settings, progress: Progress) -> Re
         progress(done, len(starts), "rollouts")
 
     size = BatchSize(played.batch_rollouts)
-    rollouts = chain.from_iterable(simulate_all(simulator, starts, weights, tell, size))
+    # One rollout a scene: batches of one scene each would cost far more, for counts alone.
+    groups = simulate_all(simulator, starts, weights, tell, size, mix_scenes=True)
+    rollouts = chain.from_iterable(groups)
     # Beyond the end of a map no agent enters: biases must not compensate for that.
     plays = [
         count_flow(on_map(from_rollout(rollout), lanes), how.count_radius_m, length)

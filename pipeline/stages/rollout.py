@@ -1,7 +1,8 @@
 """Stage ``rollout``: weights and the first second of every scene to rollouts.
 
 One unit is some scenes of one shard with all their rollouts, so a task is long beside its
-overhead. What a rollout does depends on its scene, its index and the seed alone.
+overhead. What a rollout does depends on its scene, its index and the seed alone; its last
+bits depend on the batch it is in, which on a CPU holds rollouts of one scene only.
 """
 
 import math
@@ -182,7 +183,7 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=8,
+    version=9,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=simulate,

@@ -88,6 +88,8 @@ def simulate_all(
     weights: str,
     tell: Callable[[float], None],
     size: BatchSize | None = None,
+    *,
+    mix_scenes: bool | None = None,
 ) -> "Iterator[list[Rollout]]":
     """Simulate rollouts in batches, and collect them a few at a time.
 
@@ -98,6 +100,10 @@ def simulate_all(
         tell: Called with the number of simulated rollouts at every token step of a batch.
         size: Rollouts of a batch, for those who want to know how many it came to; else as
             in the settings.
+        mix_scenes: Whether a batch may hold several scenes. By default it does on a CUDA
+            device, which needs many rollouts to be busy, and not on a CPU, where rollouts
+            then do not depend on which other scenes are simulated, not even in the last
+            bits of sums.
 
     Raises:
         SimulationMemoryError: if a single rollout is too large for the device.
@@ -106,7 +112,10 @@ def simulate_all(
 
     size = size or BatchSize(simulator.settings.batch_rollouts)
     few = max(1, int(TOGETHER_S / simulator.settings.duration_s))
-    for batch, frames in simulate_in_memory(simulator, starts, size, tell):
+    if mix_scenes is None:
+        mix_scenes = simulator.device.type != "cpu"
+    batches = simulate_in_memory(simulator, starts, size, tell, mix_scenes=mix_scenes)
+    for batch, frames in batches:
         for first in range(0, len(batch), few):
             places = range(len(batch))[first : first + few]
             yield collect(batch, frames, weights, places)

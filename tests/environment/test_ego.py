@@ -7,12 +7,12 @@ from hypothesis import strategies as st
 
 from infgen.environment.ego import (
     MAX_SPEED_MPS,
-    WHEELBASE_SHARE,
     EgoState,
     action_bounds,
     drive,
 )
 from infgen.geometry import to_world
+from infgen.rollout.bicycle import advance, wheelbase_of
 
 LENGTH_M = 5.0
 ONE = np.ones(1, dtype=np.float32)
@@ -65,7 +65,7 @@ def test_nobody_gets_faster_than_the_greatest_speed():
 def test_constant_steering_drives_a_circle(side):
     steering_rad = side * 0.3
     slip_rad = np.arctan(np.tan(abs(steering_rad)) / 2)
-    radius_m = WHEELBASE_SHARE * LENGTH_M / 2 / np.sin(slip_rad)
+    radius_m = wheelbase_of(LENGTH_M) / 2 / np.sin(slip_rad)
     speed_mps = 2 * np.pi * radius_m / 10.0  # Once around in 100 steps.
     start = car(speed_mps, pose=(3.0, -2.0, 0.7))
 
@@ -80,6 +80,15 @@ def test_constant_steering_drives_a_circle(side):
     )
     away_m = [np.linalg.norm(state.pose[0, :2] - middle_m) for state in states]
     np.testing.assert_allclose(away_m, radius_m)
+
+
+def test_a_car_moves_as_the_bicycle_model_says():
+    (state,) = bicycle(car(10.0, pose=(3.0, -2.0, 0.7)), 2.0, -0.2)
+
+    start = np.array([3.0, -2.0, 0.7, 10.0])
+    moved = advance(start, 2.0, -0.2, wheelbase_of(LENGTH_M), 0.1)
+    np.testing.assert_allclose([*state.pose[0], state.speed_mps[0]], moved, rtol=1e-12)
+    np.testing.assert_allclose(state.yaw_rate_rad_s[0], (moved[2] - 0.7) / 0.1)
 
 
 def test_steering_turns_nobody_who_stands():

@@ -9,6 +9,7 @@ from infgen.rollout.bicycle import (
     VehicleLimits,
     advance,
     curvature_per_m,
+    follow_arc,
     stopping_acceleration,
     turn_wheels,
     wheelbase_of,
@@ -47,6 +48,19 @@ def test_a_full_circle_leads_back():
 def test_the_centre_turns_on_the_circle_that_geometry_says():
     # The rear axle turns on a circle of 1 m; the centre is 1.5 m ahead of that axle.
     assert curvature_per_m(ONE_METRE, 3.0) == pytest.approx(1 / np.hypot(1, 1.5))
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_half_a_circle_leads_to_its_other_side(side):
+    radius_m = np.hypot(1, 1.5)
+
+    there = follow_arc(np.zeros(3), np.pi * radius_m, side * ONE_METRE, 3.0)
+
+    # The centre moves at the slip angle, of tangent 1.5, and the circle is square to it.
+    slip_rad = np.arctan(1.5)
+    across = 2 * radius_m * np.array([-np.sin(slip_rad), np.cos(slip_rad)])
+    np.testing.assert_allclose(there[:2], across * [1, side], atol=1e-12)
+    assert abs(there[HEADING]) == pytest.approx(np.pi)
 
 
 def test_positive_steering_turns_left_and_in_reverse_the_heading_the_other_way():

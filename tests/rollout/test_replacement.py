@@ -26,12 +26,12 @@ def ego_path(session, ahead_m=1.0):
 
 
 def driven_step(session):
-    return session.end_step(session.begin_step(), ego_path(session))
+    return session.end_step(session.begin_step(driven=True), ego_path(session))
 
 
 def replaced_at(session, place, begin, logged):
     """Replace a rollout in the next token step, its ego as logged."""
-    begun = session.replace(session.begin_step(), [place], [begin])
+    begun = session.replace(session.begin_step(driven=True), [place], [begin])
     path = ego_path(session)
     path[place] = logged.path[0, 0]
     return session.end_step(begun, path)
@@ -100,7 +100,7 @@ def test_until_its_history_ends_a_replaced_rollout_goes_as_logged(
     session = Session(playing, [start(crossing(), at) for at in range(2)])
     driven_step(session)
 
-    begun = session.replace(session.begin_step(), [0], [other])
+    begun = session.replace(session.begin_step(driven=True), [0], [other])
 
     # Row 0 is the ego, at 6 m/s from (-40, 0): steps 6 to 10 of its log.
     np.testing.assert_allclose(
@@ -130,7 +130,7 @@ def test_a_history_of_one_token_step_is_too_short(crossing, start, simulator):
     session = Session(simulator(), start(crossing()))
 
     with pytest.raises(ValueError, match="history of one token step"):
-        session.replace(session.begin_step(), [0], [start(crossing(now=5))])
+        session.replace(session.begin_step(driven=True), [0], [start(crossing(now=5))])
 
 
 def test_a_step_in_two_halves_is_a_step(crossing, start, simulator):

@@ -97,26 +97,34 @@ def test_others_react_in_the_next_half_second_and_not_before(session):
     assert not np.array_equal(ahead[1].path[0, 1:], aside[1].path[0, 1:])
 
 
-def test_a_corrected_ego_is_as_one_that_was_right_at_once(session):
-    right, corrected = session(motion_top_k=0), session(motion_top_k=0)
-    right.step(pose(-25))
-    corrected.step(pose(-28, 6.0, 1.2))
+@pytest.mark.parametrize("plan", [pose(-28, 6.0, 1.2), None], ids=["elsewhere", "none"])
+def test_an_ego_that_goes_elsewhere_than_planned_is_as_if_that_was_planned(session, plan):
+    planned, driven = session(motion_top_k=0), session(motion_top_k=0)
+    ways = [pose(-25), pose(-20)]
+    expected = [planned.step(way) for way in ways]
 
-    corrected.correct_ego(pose(-25)[None])
+    frames = [driven.end_step(driven.begin_step(plan), way) for way in ways]
 
-    for _ in range(2):
-        expected, frame = right.step(pose(-20)), corrected.step(pose(-20))
-        np.testing.assert_array_equal(frame.path, expected.path)
+    for frame, other in zip(frames, expected, strict=True):
+        np.testing.assert_array_equal(frame.path, other.path)
     np.testing.assert_array_equal(
-        corrected.population.motion_token, right.population.motion_token
+        driven.population.motion_token, planned.population.motion_token
     )
 
 
-def test_a_corrected_ego_stands_exactly_where_it_is_said_to(session):
-    driven = session()
-    driven.step()
+def test_a_step_that_ends_as_it_began_is_a_step(session):
+    whole, halves = session(motion_top_k=0), session(motion_top_k=0)
+    for way in (None, pose(-25.4, 0.2), None):
+        expected = whole.step(way)
+        frame = halves.end_step(halves.begin_step(way))
+        np.testing.assert_array_equal(frame.path, expected.path)
+        np.testing.assert_array_equal(halves.ego_pose, whole.ego_pose)
 
-    driven.correct_ego(pose(-25.4, 0.2, 0.03)[None])
+
+def test_a_driven_ego_stands_exactly_where_it_was_driven(session):
+    driven = session()
+
+    driven.end_step(driven.begin_step(), pose(-25.4, 0.2, 0.03))
 
     np.testing.assert_array_equal(driven.ego_pose, [pose(-25.4, 0.2, 0.03)])
     assert driven.population.motion_token[0, 0] == 5  # From -30; moves are whole metres.

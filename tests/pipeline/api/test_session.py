@@ -41,6 +41,18 @@ def test_the_ego_is_recorded_where_the_planner_drove_it(sim, scene):
     assert len(session.rollouts().to_polars().filter("is_ego")) == scene.now + 1 + 20
 
 
+def test_a_step_in_two_halves_is_recorded_where_the_ego_went(sim, scene):
+    session = sim.session(scene)
+    plan, driven = session.ego_pose[0] + [[2, 0, 0], [3, 1, 0]]
+
+    begun = session.begin_step(plan.astype(np.float32))
+    session.end_step(begun, driven.astype(np.float32))
+
+    (rollout,) = session.rollouts()
+    end_m = rollout.xyz_m[rollout.ego, scene.now + 5, :2]
+    np.testing.assert_allclose(end_m, driven[:2], atol=1e-4)
+
+
 def test_before_the_first_step_there_is_nothing_to_show(sim, scene):
     with pytest.raises(ValueError, match=r"nothing has happened yet; call step\(\)"):
         sim.session(scene).rollouts()

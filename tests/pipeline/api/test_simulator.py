@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import fields, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from pipeline.storage.scenes import SCENES_SCHEMA
 from pipeline.storage.zarr_store import write_records
 from tests.pipeline.finished import Finished
 
-SHORT = RolloutSettings(seconds=1.0, count=2, scenes_per_unit=1, seed=7)
+SHORT = RolloutSettings(seconds=1.0, count=2, scenes_per_unit=2, seed=7)
 
 
 def assert_equal(rollouts, others):
@@ -39,21 +40,33 @@ def infgen_command(*words: str) -> None:
     assert not left.value.code
 
 
-def test_rollouts_are_those_of_the_stage(builtin, weights, tmp_path):
-    scenes, folder = list(builtin[3:5]), tmp_path / "validation.tfrecord-0"
+@pytest.mark.parametrize(
+    ("count", "batch_rollouts"),
+    [(1, 32), (3, 32), (5, 2)],
+    ids=["one", "one batch", "two batches and the rest"],
+)
+def test_rollouts_are_those_of_the_stage(builtin, weights, tmp_path, count, batch_rollouts):
+    scenes, folder = list(builtin[3:6]), tmp_path / "validation.tfrecord-0"
     folder.mkdir()
     write_records(folder / "scenes-000.zarr", scenes, Scene, SCENES_SCHEMA, compress=True)
     done = FinishedUnit(folder.name, "key", folder, {"scenes": len(scenes)})
-    sim = infgen.load(weights, seconds=1.0, count=2, scenes_per_unit=1, seed=7)
-    assert sim.settings == SHORT
+    settings = replace(SHORT, count=count, batch_rollouts=batch_rollouts)
+    sim = infgen.load(
+        weights,
+        **{"seconds": 1.0, "scenes_per_unit": 2, "seed": 7},
+        **{"count": count, "batch_rollouts": batch_rollouts},
+    )
+    assert sim.settings == settings
 
-    units = stage.STAGE.plan(Finished([done], weights), SHORT)
-
-    for unit, scene in zip(units, scenes, strict=True):
+    made = []
+    for unit in stage.STAGE.plan(Finished([done], weights), settings):
         target = tmp_path / unit.name
         target.mkdir()
-        stage.STAGE.work(unit, target, SHORT, lambda *_: None)
-        assert_equal(sim.rollout(scene), read_rollouts(target))
+        stage.STAGE.work(unit, target, settings, lambda *_: None)
+        made.append(list(read_rollouts(target)))
+
+    assert [len(rollouts) for rollouts in made] == [2 * count, count]
+    assert_equal(chain(*map(sim.rollout, scenes)), chain(*made))
 
 
 def test_seconds_count_and_seed_go_over_the_settings(scene, weights):
@@ -107,7 +120,7 @@ def root(tmp_path_factory) -> Path:
         "seconds=2",
         "count=2",
         "max_scenes=2",
-        "scenes_per_unit=1",
+        "scenes_per_unit=2",
         "remove_bias=-0.5",
     ]
     chosen = [part for word in words for part in ("-s", f"rollout.{word}")]

@@ -24,8 +24,8 @@ def tick(drive, ticks, controls=RELEASED):
 
 def others(drive):
     """Paths of all but the ego in the token steps so far."""
-    frames = [*drive.frames, drive.shown.frame]
-    return [frame.path[0, EGO_ROW + 1 :] for frame in frames]
+    paths = [frame.path[0] for frame in drive.frames] + [drive.shown.path]
+    return [path[EGO_ROW + 1 :] for path in paths]
 
 
 def same(one, other):
@@ -38,10 +38,10 @@ def test_at_first_the_network_drives_as_in_a_rollout(begin):
 
     assert drive.car is None
     assert [moment.step for moment in moments[:4]] == [10.25, 10.5, 10.75, 11.0]
-    for at, frame in enumerate([*drive.frames, drive.shown.frame]):
+    for at, path in enumerate([*(f.path[0] for f in drive.frames), drive.shown.path]):
         steps = moments[at * TICKS_PER_TOKEN : (at + 1) * TICKS_PER_TOKEN]
         poses = [moment.pose for moment in steps[TICKS_PER_STEP - 1 :: TICKS_PER_STEP]]
-        np.testing.assert_array_equal(poses, frame.path[0, EGO_ROW])
+        np.testing.assert_array_equal(poses, path[EGO_ROW])
 
 
 def test_the_driver_takes_the_wheel_at_once_and_without_a_jump(begin):
@@ -79,6 +79,20 @@ def test_others_do_not_foresee_keys_and_react_soon_after(begin):
     # ... so it is the same, whatever is done meanwhile.
     assert all(equal[:3])
     assert not all(equal[3:])
+
+
+def test_the_network_sees_the_ego_where_it_is(begin):
+    """But for the step from one motion token to the next: errors do not add up."""
+    drive = begin()
+    drive.take_wheel()
+    for throttle in (1.0, 0.6, 0.0, 0.3, 1.0, 0.0, 0.6, 1.0):
+        controls = Controls(throttle=throttle, steer=0.3)
+        end = tick(drive, TICKS_PER_TOKEN, controls)[-1]
+
+        seen = drive.world.population.pose[0, EGO_ROW]
+        np.testing.assert_array_equal(drive.world.ego_pose, end.pose)
+        assert np.linalg.norm(seen[:2] - end.pose[:2]) < 0.25
+        assert abs(seen[2] - end.pose[2]) < 0.05
 
 
 def test_a_drive_depends_on_controls_and_not_on_how_fast_anything_was(begin):
@@ -161,9 +175,10 @@ def test_agents_enter_and_leave_and_are_counted(begin):
     while drive.seconds < 15 and not (drive.inserted and drive.removed):
         tick(drive, TICKS_PER_TOKEN)
 
-    frames = [*drive.frames, drive.shown.frame]
-    assert drive.inserted == sum(int((f.inserted_number >= 0).sum()) for f in frames) > 0
-    assert drive.removed == sum(int(f.removed.sum()) for f in frames) > 0
+    inserted = sum(int((frame.inserted_number >= 0).sum()) for frame in drive.frames)
+    removed = sum(int(frame.removed.sum()) for frame in drive.frames)
+    assert drive.inserted == inserted > 0
+    assert drive.removed == removed + drive.shown.removed.sum() > 0
 
 
 def test_memory_is_bounded_however_long_one_drives(begin, monkeypatch):

@@ -138,25 +138,26 @@ def test_a_frame_names_all_but_the_ego(begin):
 
     said = json.loads(messages.frame_message(drive.world, drive.shown))
 
-    frame = drive.shown.frame
-    assert said["token"] == frame.token
+    assert said["token"] == drive.shown.token
     assert len(said["id"]) == drive.shown.present.sum() - 1
     assert (
         int(drive.world.start.history.track_id[drive.world.start.history.ego])
         not in said["id"]
     )
     np.testing.assert_allclose(
-        np.reshape(said["path"][0], (5, 3)), frame.path[0, 1], atol=6e-4
+        np.reshape(said["path"][0], (5, 3)), drive.shown.path[1], atol=6e-4
     )
 
 
 def test_a_frame_without_other_agents_is_empty(begin):
     drive = begin()
-    numbers = np.full_like(drive.shown.frame.agent_number, NOBODY)
-    numbers[0, 0] = drive.shown.frame.agent_number[0, 0]
-    frame = dataclasses.replace(drive.shown.frame, agent_number=numbers)
+    begun = drive.shown.begun
+    numbers = np.full_like(begun.moved.agent_number, NOBODY)
+    numbers[0, 0] = begun.moved.agent_number[0, 0]
+    moved = dataclasses.replace(begun.moved, agent_number=numbers)
 
-    alone = dataclasses.replace(drive.shown, frame=frame)
+    begun = dataclasses.replace(begun, moved=moved)
+    alone = dataclasses.replace(drive.shown, begun=begun)
     said = json.loads(messages.frame_message(drive.world, alone))
 
     assert said["id"] == said["path"] == said["size"] == []

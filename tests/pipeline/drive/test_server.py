@@ -1,115 +1,18 @@
 """The server as others see it: real sockets, real requests.
 
-Together they take more than ten seconds; the rules themselves are in ``test_access.py``.
+Together they take more than ten seconds.
 """
 
 import asyncio
 import json
 import socket
-from contextlib import asynccontextmanager, suppress
 
 import pytest
-from tornado.httpclient import AsyncHTTPClient, HTTPRequest
-from tornado.websocket import websocket_connect
 
 from pipeline.drive.assets import PAGE
-from pipeline.drive.server import DriveServer
+from tests.pipeline.drive.visitor import GAS, closed, hear
 
 pytestmark = pytest.mark.slow
-UPGRADE = {
-    "Connection": "Upgrade",
-    "Upgrade": "websocket",
-    "Sec-WebSocket-Version": "13",
-    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
-}
-GAS = {"type": "control", "throttle": 1, "brake": 0, "steer": 0}
-
-
-class Visitor:
-    """A client of a running server.
-
-    Attributes:
-        server: The server.
-        url: Of its page.
-        log: What it has logged.
-    """
-
-    def __init__(self, server, url, log):
-        self.server, self.url, self.log, self.lines = server, url, log, []
-
-    async def get(self, path="", url=None, **more):
-        """Status and body, whatever the status."""
-        client = AsyncHTTPClient(force_instance=True)
-        request = HTTPRequest((url or self.url) + path, follow_redirects=False, **more)
-        try:
-            return await client.fetch(request, raise_error=False)
-        finally:
-            client.close()
-
-    async def line(self, url=None, origin=None, **headers):
-        """A websocket of the page's own origin, unless another is named."""
-        url = (url or self.url).replace("http", "ws") + "line"
-        own = f"http://127.0.0.1:{self.server.access.port}"
-        named = {"Origin": own if origin is None else origin, **headers}
-        headers = {name: value for name, value in named.items() if value}
-        line = await websocket_connect(HTTPRequest(url, headers=headers))
-        self.lines.append((line, line.protocol.stream))
-        return line
-
-    async def refused_line(self, url=None, origin=None, **headers):
-        """Status of a request for a websocket that is refused."""
-        own = f"http://127.0.0.1:{self.server.access.port}"
-        named = {"Origin": own if origin is None else origin, **UPGRADE, **headers}
-        named = {name: value for name, value in named.items() if value}
-        return (await self.get("line", url, headers=named)).code
-
-
-async def hear(line, kind):
-    """The next message of a type."""
-    while True:
-        text = await asyncio.wait_for(line.read_message(), 20)
-        assert text is not None, f"closed: {line.close_code} {line.close_reason}"
-        message = json.loads(text)
-        if message["type"] == kind:
-            return message
-
-
-async def closed(line):
-    """Wait until a line is closed by the server; returns the code."""
-    while await asyncio.wait_for(line.read_message(), 20) is not None:
-        pass
-    return line.close_code
-
-
-@pytest.fixture
-def visit(opened, tmp_path):
-    """``visit(talk)``: run ``talk(visitor)`` against a server that runs meanwhile."""
-    garage, number = opened
-
-    @asynccontextmanager
-    async def running():
-        log, ready = [], asyncio.get_running_loop().create_future()
-        server = DriveServer(garage, number, 0, log.append)
-        task = asyncio.create_task(server.run(0, ready.set_result))
-        await asyncio.wait([task, ready], return_when=asyncio.FIRST_COMPLETED)
-        visitor = Visitor(server, await ready, log)
-        yield visitor
-        for line, stream in visitor.lines:
-            line.close()
-            await asyncio.sleep(0.05)  # The server sees it.
-            stream.close()
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
-
-    def run(talk):
-        async def whole():
-            async with running() as visitor:
-                return await talk(visitor)
-
-        return asyncio.run(whole())
-
-    return run
 
 
 def test_the_page_and_its_files_are_served_with_a_strict_policy(visit):
@@ -128,51 +31,6 @@ def test_the_page_and_its_files_are_served_with_a_strict_policy(visit):
     visit(talk)
 
 
-def test_what_is_not_the_page_is_refused_and_logged(visit):
-    async def talk(visitor):
-        port = visitor.server.access.port
-        root = f"http://127.0.0.1:{port}/"
-        asked = [
-            visitor.get(url=root),
-            visitor.get(url=root + "wrong-token/"),
-            visitor.get(url=root + "drive.js"),
-            visitor.get(headers={"Host": f"evil.example:{port}"}),
-            visitor.get("drive.js", headers={"Host": "evil.example"}),
-            visitor.get(headers={"Origin": "http://evil.example"}),
-            visitor.get(method="POST", body=""),
-            visitor.get(method="DELETE"),
-            visitor.get(method="OPTIONS"),
-        ]
-        for number, request in enumerate(asked, 1):
-            answer = await request
-            assert (answer.code, answer.body) == (403, b"refused\n")
-            assert len(visitor.log) == number
-            assert visitor.log[-1].startswith("refused: 127.0.0.1: ")
-        assert visitor.server.access.token not in "".join(visitor.log)
-
-    visit(talk)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "server.py",
-        "../server.py",
-        "..%2fserver.py",
-        "/etc/passwd",
-        "page.html",
-        "x/drive.js",
-    ],
-)
-def test_no_other_file_is_served(visit, name):
-    async def talk(visitor):
-        answer = await visitor.get(name)
-        assert answer.code in (403, 404)
-        assert "refused: 127.0.0.1" in visitor.log[0]
-
-    visit(talk)
-
-
 def test_it_listens_at_the_loopback_address_only(visit):
     async def talk(visitor):
         port = visitor.server.access.port
@@ -185,21 +43,6 @@ def test_it_listens_at_the_loopback_address_only(visit):
             listening = [row.split()[1] for row in table if row.split()[3] == "0A"]
         here = [place for place in listening if place.endswith(f":{port:04X}")]
         assert here == [f"0100007F:{port:04X}"]
-
-    visit(talk)
-
-
-def test_a_line_from_elsewhere_is_refused_and_logged(visit):
-    async def talk(visitor):
-        port = visitor.server.access.port
-        root = f"http://127.0.0.1:{port}/"
-        assert await visitor.refused_line(url=root + "wrong-token/") == 403
-        assert await visitor.refused_line(origin="http://evil.example") == 403
-        assert await visitor.refused_line(origin="null") == 403
-        assert await visitor.refused_line(origin="") == 403
-        assert await visitor.refused_line(Host=f"evil.example:{port}") == 403
-        assert len(visitor.log) == 5
-        await visitor.line()
 
     visit(talk)
 
@@ -236,46 +79,6 @@ def test_one_page_drives_at_a_time(visit):
         await asyncio.sleep(0.2)
         third = await visitor.line()
         await hear(third, "scene")
-
-    visit(talk)
-
-
-@pytest.mark.parametrize(
-    "garbage",
-    ["", "{}", '{"type":"press","button":"exit"}', b"\x00\xff", "x" * 200],
-    ids=["empty", "no type", "no such button", "bytes", "no json"],
-)
-def test_garbage_is_refused_logged_and_the_page_let_go(visit, garbage):
-    async def talk(visitor):
-        line = await visitor.line()
-        await hear(line, "scene")
-        line.write_message(garbage, binary=isinstance(garbage, bytes))
-        assert await closed(line) == 1008
-        assert len(visitor.log) == 1
-        assert visitor.log[0].startswith("refused: 127.0.0.1: ")
-        again = await visitor.line()  # The seat is free.
-        await hear(again, "scene")
-
-    visit(talk)
-
-
-def test_a_message_that_is_too_long_closes_the_line(visit):
-    async def talk(visitor):
-        line = await visitor.line()
-        await hear(line, "scene")
-        line.write_message("x" * 100_000)
-        assert await closed(line) == 1009
-
-    visit(talk)
-
-
-def test_a_flood_is_refused(visit):
-    async def talk(visitor):
-        line = await visitor.line()
-        for _ in range(1000):
-            line.write_message(json.dumps(GAS))
-        assert await closed(line) == 1008
-        assert "too many messages" in visitor.log[0]
 
     visit(talk)
 

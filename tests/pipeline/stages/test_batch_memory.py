@@ -65,8 +65,10 @@ def starts(crossing, parked):
     return lambda simulator: [one for scene in scenes for one in begin(simulator, scene)]
 
 
-def simulated(simulator, starts, size=None, tell=lambda done: None):
-    groups = simulate_all(simulator, starts(simulator), "weights", tell, size)
+def simulated(simulator, starts, size=None, tell=lambda done: None, mix_scenes=True):
+    """Rollouts in batches of several scenes, as on the devices whose memory is small."""
+    begun = starts(simulator)
+    groups = simulate_all(simulator, begun, "weights", tell, size, mix_scenes=mix_scenes)
     return [rollout for group in groups for rollout in group]
 
 
@@ -97,6 +99,16 @@ def test_a_batch_of_an_odd_number_is_halved_too(simulator, starts):
 
     assert len(simulated(limited, starts)) == 8
     assert limited.stepper.begun == [7, 4, 4]
+
+
+def test_on_a_cpu_a_batch_holds_one_scene_unless_it_is_told_to_mix(simulator, starts):
+    apart, mixed = simulator(batch_rollouts=3), simulator(batch_rollouts=3)
+
+    simulated(apart, starts, mix_scenes=None)
+    simulated(mixed, starts)
+
+    assert apart.stepper.begun == [3, 1, 3, 1]  # Four rollouts each of two scenes.
+    assert mixed.stepper.begun == [3, 3, 2]
 
 
 def test_the_run_record_says_which_batches_did_fit(simulator, starts):

@@ -219,6 +219,22 @@ def test_a_unit_is_the_same_bytes_each_time(inputs, tmp_path):
     assert one == two
 
 
+def test_rollouts_are_the_same_bits_however_scenes_are_cut_into_units(inputs, tmp_path):
+    settings = dataclasses.replace(SETTINGS, seconds=1.0, batch_rollouts=8)
+
+    def played(scenes_per_unit):
+        cut = dataclasses.replace(settings, scenes_per_unit=scenes_per_unit)
+        folder = tmp_path / f"{scenes_per_unit} a unit"
+        folder.mkdir()
+        units = stage.STAGE.plan(inputs, cut)
+        return [one for unit in units for one in play(unit, folder / unit.name, cut)[1]]
+
+    for one, other in zip(played(1), played(5), strict=True):
+        for field in dataclasses.fields(one):
+            value, expected = getattr(one, field.name), getattr(other, field.name)
+            np.testing.assert_array_equal(value, expected, err_msg=field.name)
+
+
 def test_the_weights_fingerprint_is_in_every_rollout(inputs, tmp_path):
     unit = stage.STAGE.plan(inputs, SETTINGS)[0]
 
