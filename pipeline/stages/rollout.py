@@ -121,6 +121,7 @@ def simulate(
         "add_bias": settings.add_bias,
         "remove_bias": settings.remove_bias,
         "device": settings.device,
+        "rules": settings.rules_in_words,
     }
     return {**_report(rows, refused), **told, "simulates": simulator.simulates, "run": run}
 
@@ -155,6 +156,7 @@ def finish(
         "rollouts": count,
         "device": device_of_units(units),
         "simulates": "; ".join(simulates),
+        "rules": "; ".join(sorted({done.report["rules"] for done in units})),
         **means,
         **biases,
         "refused": refused,
@@ -182,7 +184,7 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=8,
+    version=9,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=simulate,
