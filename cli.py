@@ -114,6 +114,8 @@ def run(
 
     Example: infgen run report --root R --preset towns-benchmark --arms infgen,smart
 
+    Example: infgen run report --preset towns-benchmark --arms infgen,infgen-safe
+
     A preset trains, simulates and scores several methods alike and compares them.
     """
     if comparing.preset is not None:
@@ -166,8 +168,10 @@ _stage_verb(
 )
 _stage_verb(
     "rollout",
-    "Simulate futures of the held-out scenes; settings are rollout.* of stages.yaml.",
+    "Simulate futures of the held-out scenes; settings are rollout.* of stages.yaml. "
+    "rollout.rules=safe rejects choices that lead to collisions or off the road.",
     "--profile small --dask local:8 -s rollout.mode=wosac -s rollout.count=32",
+    "--profile small -s rollout.rules=safe",
 )
 _stage_verb("reference", "Measure the logs of the scored split.")
 _stage_verb("score", "Score the rollouts against the logs.")

@@ -182,7 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--page", help="page to write that plays the drive")
     options = parser.parse_args(arguments)
     scene = infgen.open_scenes(options.scenes)[options.scene or 0]
-    session = infgen.load(options.weights).session(scene, seed=options.seed)
+    session = infgen.load(options.weights, rules="safe").session(scene, seed=options.seed)
     print("   s      x m      y m   m/s   gap m  others")
     for moment in drive(session, scene, options.seconds):
         x_m, y_m, _ = moment.ego_pose

@@ -1,5 +1,6 @@
 """A whole comparison, from records to tables, of the smallest networks there can be."""
 
+import csv
 import json
 import os
 import re
@@ -27,6 +28,7 @@ PRESETS = """
         published: SMART-7M
         profile: smart
         rollout_sets: {long: {score: {presence_radius_m: 75}}}
+      infgen-safe: {rules_of: infgen, rollout: {rules: safe}}
 
   odd:
     profile: small,benchmark,tiny
@@ -234,6 +236,27 @@ def test_fewer_arms_and_seeds_are_fewer_rows(desk, capsys):
     assert "comparison.html" in out
     table = (desk[0] / "R/presets/pair/tables/runs.csv").read_text()
     assert len(table.splitlines()) == 1 + 1
+
+
+def test_what_rules_change_is_a_table_of_its_own_if_it_is_asked_for(desk, capsys):
+    store = desk[0] / "R/store"
+    trained = len(list((store / "train").glob("*/manifest.json")))
+    capsys.readouterr()
+
+    assert call(*PAIR, "--arms", "infgen,infgen-safe", "--seeds", "1") == 0
+
+    shown = desk[0] / "R/presets/pair"
+    assert len(list((store / "train").glob("*/manifest.json"))) == trained
+    with (shown / "tables/rules.csv").open() as file:
+        logs, off, on = csv.DictReader(file)
+    assert (logs["method"], logs["rules"]) == ("the logs of these scenes", "")
+    assert (off["method"], off["rules"]) == ("InfGen", "none")
+    assert (on["method"], on["rules"]) == ("InfGen", "safe")
+    runs = json.loads((shown / "comparison.json").read_text())["runs"]
+    rules = {(run["arm"], run["rules"], run["biased"]) for run in runs}
+    assert rules == {("infgen", "none", False), ("infgen-safe", "safe", False)}
+    page = (shown / "comparison.html").read_text()
+    assert "no rules (rollout.rules=none), no biases" in page
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,9 @@ class DrivingBatch:
     ) -> None:
         """Prepare; nothing is simulated before ``reset``."""
         self.settings = settings
+        if settings.rules is not None:
+            own = simulator.settings.with_rules(settings.rules)
+            simulator = replace(simulator, settings=own)
         self._simulator, self._chooser = simulator, SceneChooser(simulator, scenes)
         self._world: World | None = None
         self._random: list[np.random.Generator] = []

@@ -14,8 +14,11 @@ _FACADE = "infgen"
 
 @lru_cache(maxsize=1)
 def packaged_simulator() -> Simulator:
-    """Return the weights that come with the package, loaded once per process."""
-    return cast(Simulator, import_module(_FACADE).load("towns").simulator)
+    """Return the weights that come with the package, loaded once per process.
+
+    They are simulated with rules: what a learner is punished for, others are not to cause.
+    """
+    return cast(Simulator, import_module(_FACADE).load("towns", rules="safe").simulator)
 
 
 @lru_cache(maxsize=1)

@@ -6,6 +6,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from infgen.clock import CLOCK
+from infgen.rollout.settings import RuleName
 from infgen.settings import RULES, AtLeastOne, NonNegative, Positive
 
 Hertz = Literal[10, 2]
@@ -24,6 +25,9 @@ class EnvironmentSettings:
     hz: Hertz = 10
     """Steps per second. The network simulates token steps of 0.5 s: at 10 Hz an action is
     taken at each of their five steps, at 2 Hz once."""
+    rules: RuleName | None = None
+    """Rules over the choices of the network that drives all others: `none` or `safe`, as in
+    `rollout.rules`. If not set, those of `simulator`; of the package's simulator `safe`."""
     max_seconds: Positive = 300.0
     """An episode is truncated after so long."""
     off_road_m: NonNegative = 0.0

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float64, Int16, Int64
 
-from infgen.rollout.insertion_mask import Circles, InsertionMask
 from infgen.rollout.population import (
     EGO_ROW,
     InsertedAgents,
@@ -13,6 +12,7 @@ from infgen.rollout.population import (
     place_inserted,
 )
 from infgen.rollout.random_streams import WORDS, Purpose, Streams
+from infgen.rollout.rules.insertion_mask import Circles, InsertionMask
 from infgen.rollout.simulator import Simulator
 from infgen.tokens.grid import encode_cell, to_grid
 from infgen.tokens.scene_tokens import NO_CELL
@@ -44,7 +44,7 @@ class InsertionRequest:
         """Number of positions sampled for one insertion before it is given up."""
         if self.insertion_mask is None:
             return 1
-        return self.simulator.settings.max_insertion_attempts
+        return self.simulator.rules.max_insertion_attempts
 
 
 @dataclass(slots=True)
@@ -121,12 +121,13 @@ class InsertionState:
         self, rollouts: Int64[np.ndarray, " asked"]
     ) -> Float64[np.ndarray, " asked"]:
         """Return what is added to the logit of ADD, with density control."""
-        settings, wanted = self.request.simulator.settings, self.request.wanted
-        bias = np.full(len(rollouts), settings.add_bias)
+        simulator, wanted = self.request.simulator, self.request.wanted
+        bias = np.full(len(rollouts), simulator.settings.add_bias)
         if wanted is not None:
             there = self.num_others[rollouts]
             # Insertions are sampled one by one: their number is proportional to the odds.
-            bias += settings.density_control * np.log((wanted[rollouts] + 1) / (there + 1))
+            odds = (wanted[rollouts] + 1) / (there + 1)
+            bias += simulator.rules.density_control * np.log(odds)
         return bias
 
     def add(

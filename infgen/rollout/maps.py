@@ -18,9 +18,9 @@ from infgen.clock import CLOCK
 from infgen.model.batching.batch import MapTokens, collate_maps, to_device
 from infgen.model.neighbours import MapFeatures
 from infgen.model.signal_features import StopLines
-from infgen.rollout.insertion_mask import InsertionMask, make_insertion_mask
 from infgen.rollout.recording import RolloutStart
 from infgen.rollout.rules.density import DensityControl, Segments, segments_of
+from infgen.rollout.rules.insertion_mask import InsertionMask, make_insertion_mask
 from infgen.rollout.rules.off_road import RoadEdgeTiles
 from infgen.rollout.rules.rejection import MotionCheck
 from infgen.rollout.rules.stalls import StallRule
@@ -89,7 +89,7 @@ class RolloutMaps:
     def motion_check(self, scene: Scenes) -> MotionCheck:
         """Return the check of motion tokens."""
         tiles: list[RoadEdgeTiles] = []
-        if self._simulator.settings.reject_off_road:
+        if self._simulator.rules.reject_off_road:
             for scene_id, start in self._held.items():
                 if scene_id not in self._tiles:
                     self._tiles[scene_id] = RoadEdgeTiles(start.scene)
@@ -108,17 +108,17 @@ class RolloutMaps:
 
     def _make_mask(self) -> InsertionMask | None:
         simulator = self._simulator
-        if not simulator.settings.insertion_mask:
+        if not simulator.rules.insertion_mask:
             return None
         return make_insertion_mask(
             [start.history for start in self._held.values()],
             (simulator.vocabulary, simulator.roads),
             np.zeros(0, dtype=np.int64),
-            simulator.settings.insertion_lane_distance_m,
+            simulator.rules.insertion_lane_distance_m,
         )
 
     def _make_stalls(self, roads: MapTokens) -> StallRule | None:
-        tokens = math.ceil(self._simulator.settings.max_stall_s / CLOCK.token_s)
+        tokens = math.ceil(self._simulator.rules.max_stall_s / CLOCK.token_s)
         if not tokens:
             return None
         # It runs on the host, so it keeps the maps that were given.

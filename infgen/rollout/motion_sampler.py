@@ -92,7 +92,7 @@ class MotionSampler:
         if not stalled.any():
             return motion_token
         # No other sample of this token step has this number.
-        attempt = self.simulator.settings.max_motion_samples
+        attempt = self.simulator.rules.max_motion_samples
         return self._resample(
             before, said, (token, attempt), motion_token, stalled, stalled
         )
@@ -114,7 +114,7 @@ class MotionSampler:
             motion_token: Motion tokens so far.
             driven: Rows that are never sampled again.
         """
-        tries, again = self.simulator.settings.max_motion_samples, ~driven
+        tries, again = self.simulator.rules.max_motion_samples, ~driven
         check, slowest, changed = self.check, motion_token.copy(), again
         for attempt in range(1, tries):
             # Where no token satisfies both checks, only collisions are checked.

@@ -393,6 +393,6 @@ def _make_density_control(
     simulator: Simulator, starts: Sequence[RolloutStart], now: Population
 ) -> DensityControl | None:
     """Return the density control, or None if it is off."""
-    if not (simulator.inserts and simulator.settings.density_control):
+    if not (simulator.inserts and simulator.rules.density_control):
         return None
     return DensityControl.of(starts, now, simulator.grid.radius_m)

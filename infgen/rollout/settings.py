@@ -1,12 +1,14 @@
 """Settings of stage ``rollout``: what is simulated and how choices are sampled."""
 
 from dataclasses import dataclass as plain_dataclass
-from typing import Annotated, Literal
+from dataclasses import fields, replace
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from infgen.clock import CLOCK
+from infgen.rollout.rules.rule_set import RULE_SETS, RuleSet
 from infgen.settings import (
     NOT_IN_KEY,
     RULES,
@@ -50,6 +52,9 @@ MODES = {
 }
 """``long``: agents are inserted and removed. ``motion-only``: none are (the paper's table
 3). ``wosac``: Waymo's protocol, which fixes all four."""
+RuleName = Literal["none", "safe"]
+RULE_NAMES = tuple(field.name for field in fields(RuleSet))
+"""Settings of single rules, in the order of the table in ``docs/rules.md``."""
 
 
 @dataclass(frozen=True, slots=True, config=RULES)
@@ -57,7 +62,8 @@ class RolloutSettings:
     """How scenes are simulated (SPEC 6).
 
     `seconds`, `all_agents`, `insert` and `remove` overrule what the mode says. Where the
-    mode fixes one of them, another value is an error.
+    mode fixes one of them, another value is an error. In the same way the settings of
+    single rules overrule what `rules=safe` says, and `rules=none` fixes all of them.
     """
 
     split: str = "validation"
@@ -114,19 +120,42 @@ class RolloutSettings:
     each and keep their probability, so that an agent that seldom sets off still does."""
     position_top_p: Nucleus = 1.0
     """The same for position tokens."""
-    max_motion_samples: AtLeastOne = 1
+    rules: RuleName = "none"
+    """Rules over the network's choices. `none`: what it samples is simulated. `safe`:
+    agents avoid collisions, stay on the road, do not stall, keep their number, and are
+    inserted clear of others. The settings from `max_motion_samples` to
+    `max_insertion_attempts` change single rules of `safe`."""
+    max_motion_samples: AtLeastOne | None = None
     """A motion token is rejected and sampled again, up to so often, if the agent would hit
-    one ahead of it within 1.5 s, all agents going on alike; 1 to accept the first, as in
-    the paper."""
-    reject_off_road: Bool = False
+    one ahead of it within 1.5 s, all agents going on alike; 1 to accept the first. As
+    `rules` says if not set: `none` 1, `safe` 32."""
+    reject_off_road: Bool | None = None
     """Whether motion tokens of vehicles that would leave the road before they could stop,
     or get farther off it, are rejected too, for half of these samples. A vehicle that is
     more than a metre off the road is exempt. If all samples are rejected, the slowest is
-    taken."""
-    max_stall_s: NonNegative = 0.0
+    taken. As `rules` says if not set: `none` false, `safe` true."""
+    max_stall_s: NonNegative | None = None
     """A vehicle that has stood in a lane for so long sets off, unless a signal ahead is not
-    green or it would hit an agent; 0 for no limit, as in the paper. A network that sees a
-    few seconds of the past takes a vehicle that stood all of them for parked."""
+    green or it would hit an agent; 0 for no limit. A network that sees a few seconds of the
+    past takes a vehicle that stood all of them for parked. As `rules` says if not set:
+    `none` 0, `safe` 20."""
+    density_control: NonNegative | None = None
+    """How firmly the number of agents around the ego is held at what it was at the end of
+    the history: the odds of one more insertion are multiplied by that number over the
+    present one, to this power; 0 for not at all. A network that sees a few seconds of the
+    past forgets how dense traffic was. Where a map ends fewer are aimed at. As `rules` says
+    if not set: `none` 0, `safe` 1."""
+    insertion_mask: Bool | None = None
+    """Whether agents are inserted only clear of other boxes, now and one token step later,
+    and vehicles only near lanes. As `rules` says if not set: `none` false, `safe` true."""
+    insertion_lane_distance_m: NonNegative | None = None
+    """Largest distance from a lane's centre at which a vehicle is inserted. Most insertions
+    of the logs are parked cars that come into view: of all, 47 % are within 5 m, 69 %
+    within 10 m, 78 % within 15 m; of those that drive, 96, 97 and 97 %. As `rules` says if
+    not set: `none` no limit, `safe` 25."""
+    max_insertion_attempts: AtLeastOne | None = None
+    """Position tokens that are sampled for one agent before its insertion is given up,
+    where `insertion_mask` rejects some. As `rules` says if not set: `none` 1, `safe` 16."""
     motion_temperature: Temperature = 1.0
     """Motion logits are divided by it: below 1 the likely tokens become likelier (for the
     most likely one alone, set `rollout.motion_top_k=1`)."""
@@ -139,21 +168,6 @@ class RolloutSettings:
     `calibrate` finds."""
     remove_bias: Float = 0.0
     """The same for the removal of an agent."""
-    density_control: NonNegative = 0.0
-    """How firmly the number of agents around the ego is held at what it was at the end of
-    the history: the odds of one more insertion are multiplied by that number over the
-    present one, to this power; 0 for not at all, as in the paper. A network that sees a few
-    seconds of the past forgets how dense traffic was. Where a map ends fewer are aimed
-    at."""
-    insertion_mask: Bool = True
-    """Whether agents are inserted only clear of other boxes, now and one token step later,
-    and vehicles only near lanes. In the paper they are inserted anywhere."""
-    insertion_lane_distance_m: NonNegative = 15.0
-    """Largest distance from a lane's centre at which a vehicle is inserted. Most insertions
-    of the logs are parked cars that come into view: of all, 47 % are within 5 m, 69 %
-    within 10 m, 78 % within 15 m; of those that drive, 96, 97 and 97 %."""
-    max_insertion_attempts: AtLeastOne = 4
-    """Position tokens that are sampled for one agent before its insertion is given up."""
     max_insertions: Count = 16
     """Insertions per token step."""
     max_agents: AtLeastOne = 128
@@ -179,15 +193,57 @@ class RolloutSettings:
             raise ValueError(
                 "signals=log shows the future, which mode=wosac forbids; set signals=now"
             )
-        for name in ("reject_off_road", "max_stall_s"):
-            if getattr(self, name) and self.max_motion_samples < 2:
-                raise ValueError(
-                    f"{name} needs motion tokens that are sampled again, but "
-                    f"max_motion_samples is {self.max_motion_samples}; set "
-                    "max_motion_samples=32"
-                )
+        self._check_rules()
         CLOCK.tokens_in(self.duration_s)
         return self
+
+    def _check_rules(self) -> None:
+        """Refuse a rule where there are none, and rules that need another one."""
+        for name in RULE_NAMES if self.rules == "none" else ():
+            given = getattr(self, name)
+            if given is not None and given != getattr(RULE_SETS["none"], name):
+                raise ValueError(
+                    f"{name} is {given}, but rules=none has no rules; set rules=safe, or "
+                    f"leave {name} out"
+                )
+        rule_set = self.rule_set
+        for name in ("reject_off_road", "max_stall_s"):
+            if getattr(rule_set, name) and rule_set.max_motion_samples < 2:
+                raise ValueError(
+                    f"{name} is {getattr(rule_set, name)} and needs motion tokens that are "
+                    f"sampled again, but max_motion_samples is "
+                    f"{rule_set.max_motion_samples}; set max_motion_samples=32, or switch "
+                    f"{name} off too"
+                )
+
+    def with_rules(self, rules: RuleName) -> "RolloutSettings":
+        """Return them with all rules of a set, or unchanged if they are of that set.
+
+        Raises:
+            ValueError: if there is no such set.
+        """
+        if rules == self.rules:
+            return self
+        as_the_set_says: dict[str, Any] = dict.fromkeys(RULE_NAMES)
+        return replace(self, rules=rules, **as_the_set_says)
+
+    @property
+    def rule_set(self) -> RuleSet:
+        """The value of every rule."""
+        given = {name: getattr(self, name) for name in RULE_NAMES}
+        own = {name: value for name, value in given.items() if value is not None}
+        return replace(RULE_SETS[self.rules], **own)
+
+    @property
+    def rules_in_words(self) -> str:
+        """The set of rules and what differs from it, such as ``safe, max_stall_s=30``."""
+        usual, rule_set = RULE_SETS[self.rules], self.rule_set
+        changed = (
+            f"{name}={_word(getattr(rule_set, name))}"
+            for name in RULE_NAMES
+            if getattr(rule_set, name) != getattr(usual, name)
+        )
+        return ", ".join([self.rules, *changed])
 
     @property
     def duration_s(self) -> float:
@@ -208,3 +264,8 @@ class RolloutSettings:
     def removes(self) -> bool:
         """Whether agents are removed."""
         return MODES[self.mode].remove if self.remove is None else self.remove
+
+
+def _word(value: float | bool) -> str:
+    """Write a value as ``-s`` on the command line takes it."""
+    return str(value).lower() if isinstance(value, bool) else f"{value:g}"

@@ -11,6 +11,7 @@ from infgen.model.relations import Rows
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import TokenStep
 from infgen.rollout.population import Population
+from infgen.rollout.rules.rule_set import RuleSet
 from infgen.rollout.settings import RolloutSettings
 from infgen.tokens.grid import Grid, make_grid
 from infgen.tokens.settings import TokenSettings
@@ -41,6 +42,11 @@ class Simulator:
     def grid(self) -> Grid:
         """Cells and headings that inserted agents are placed in."""
         return make_grid(self.tokens)
+
+    @property
+    def rules(self) -> RuleSet:
+        """The value of every rule over the network's choices."""
+        return self.settings.rule_set
 
     @property
     def inserts(self) -> bool:

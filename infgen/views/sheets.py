@@ -31,6 +31,11 @@ class Measured:
             return words(self.mean)
         return f"{words(self.mean)} ± {words((self.high - self.low) / 2)}"
 
+    def scaled(self, factor: float) -> "Measured":
+        """Return it in another unit."""
+        ends = self.mean, self.low, self.high
+        return Measured(*[None if end is None else end * factor for end in ends])
+
     def to_json(self) -> dict[str, float | None]:
         """Everything, by name."""
         return {"mean": self.mean, "low": self.low, "high": self.high}

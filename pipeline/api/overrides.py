@@ -2,6 +2,8 @@
 
 from typing import Literal, TypedDict
 
+from infgen.rollout.settings import RuleName
+
 
 class RolloutOverrides(TypedDict, total=False):
     """Any of ``RolloutSettings``, which says what each means (`infgen settings` too).
@@ -28,18 +30,19 @@ class RolloutOverrides(TypedDict, total=False):
     position_top_k: int
     motion_top_p: float
     position_top_p: float
-    max_motion_samples: int
-    reject_off_road: bool
-    max_stall_s: float
+    rules: RuleName
+    max_motion_samples: int | None
+    reject_off_road: bool | None
+    max_stall_s: float | None
+    density_control: float | None
+    insertion_mask: bool | None
+    insertion_lane_distance_m: float | None
+    max_insertion_attempts: int | None
     motion_temperature: float
     position_temperature: float
     heading_temperature: float
     add_bias: float
     remove_bias: float
-    density_control: float
-    insertion_mask: bool
-    insertion_lane_distance_m: float
-    max_insertion_attempts: int
     max_insertions: int
     max_agents: int
     seed: int

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from infgen.config import RolloutSettings
+from infgen.rollout.settings import RuleName
 from infgen.scene import Scene
 from pipeline.api.overrides import RolloutOverrides
 from pipeline.api.threads import one_thread
@@ -39,6 +40,7 @@ class TrafficSimulator:
         seconds: float | int | None = None,
         count: int | None = None,
         seed: int | None = None,
+        rules: RuleName | None = None,
     ) -> "SceneRollouts":
         """Simulate what may happen after the history of a scene.
 
@@ -51,13 +53,16 @@ class TrafficSimulator:
             seconds: Length after the history; that of the settings if None.
             count: Number of rollouts; that of the settings if None.
             seed: Seed of all random streams; that of the settings if None.
+            rules: ``"none"``: what the network samples is simulated; ``"safe"``: rules over
+                its choices keep agents from colliding, leaving the road and stalling, and
+                keep their number; those of the settings if None.
 
         Raises:
             ValueError: if the scene cannot be simulated, with the reason.
         """
         from pipeline.api.rollouts import SceneRollouts  # noqa: PLC0415  # Loads torch.
 
-        simulator = self._with(seconds=seconds, count=count, seed=seed)
+        simulator = self._with(seconds=seconds, count=count, seed=seed, rules=rules)
         with one_thread():
             starts = begin(simulator, scene)
             groups = simulate_all(simulator, starts, self.weights, lambda _: None)
@@ -65,7 +70,12 @@ class TrafficSimulator:
         return SceneRollouts(scene, rollouts, simulator.settings)
 
     def session(
-        self, scene: Scene, *, count: int = 1, seed: int | None = None
+        self,
+        scene: Scene,
+        *,
+        count: int = 1,
+        seed: int | None = None,
+        rules: RuleName | None = None,
     ) -> "PlannerSession":
         """Begin a rollout of a scene whose ego is driven from outside.
 
@@ -73,13 +83,14 @@ class TrafficSimulator:
             scene: A log; what it holds after ``scene.now`` is not looked at.
             count: Number of rollouts that run side by side, each with an ego of its own.
             seed: Seed of all random streams; that of the settings if None.
+            rules: Rules over the choices of the network, as in ``rollout``.
 
         Raises:
             ValueError: if the scene cannot be simulated, with the reason.
         """
         from pipeline.api.session import PlannerSession  # noqa: PLC0415  # Loads torch.
 
-        simulator = self._with(count=count, seed=seed)
+        simulator = self._with(count=count, seed=seed, rules=rules)
         return PlannerSession(simulator, begin(simulator, scene), self.weights)
 
     @property
@@ -116,7 +127,8 @@ def load(
 
     The settings are those of the last rollouts of these weights in their root, with the
     biases that stage ``calibrate`` found; for the weights of the package those of profile
-    ``pretrained``; for a folder that is in no root the defaults.
+    ``pretrained``; for a folder that is in no root the defaults. ``rules="safe"`` keeps
+    agents from colliding.
 
     Args:
         weights: ``"towns"``: the weights of the package, trained on synthetic towns; the

@@ -7,6 +7,7 @@ from typing import Any
 from infgen.config import RolloutSettings
 from infgen.errors import ConfigError
 from infgen.pretrained import builtin_weights
+from infgen.rollout.rules.rule_set import RULE_SETS
 from infgen.settings import build
 from pipeline.engine.layout import Root
 from pipeline.engine.manifest import read_manifest
@@ -64,11 +65,13 @@ def find_weights(weights: str | Path, root: Path | None) -> FoundWeights:
 
 
 def override(settings: RolloutSettings, values: dict[str, Any]) -> RolloutSettings:
-    """Lay values over settings.
+    """Lay values over settings; with other rules come all rules of that set.
 
     Raises:
         ConfigError: for a setting that does not exist or cannot have its value.
     """
+    if values.get("rules") in RULE_SETS:
+        settings = settings.with_rules(values["rules"])
     return build(RolloutSettings, {**asdict(settings), **values}, "rollout")
 
 

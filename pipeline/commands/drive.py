@@ -18,6 +18,7 @@ from infgen.errors import ConfigError
 from infgen.pretrained import builtin_weights
 from pipeline.engine import signals
 from pipeline.engine.layout import Root
+from pipeline.settings.overlay import Overlay, SettingValue, merge_overlays
 from pipeline.settings.request import Request
 from pipeline.settings.stages_file import StagesFile
 from pipeline.stages.calibration import read_found
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 
 PRETRAINED = "pretrained"
 """Profile with the settings that go with the weights of the package."""
+_SAFE = SettingValue("safe", "infgen drive: rollout")
+DEFAULTS = Overlay((), {"rollout": {"rules": _SAFE}})
+"""Settings of a drive, unless a profile or a word of the command has others."""
 MOST_SCENES = 200
 """Scenes that the page lets choose from."""
 
@@ -127,7 +131,8 @@ def _settings(wanted: Wanted, weights: Path) -> RolloutSettings:
     own = weights == builtin_weights()
     profile = wanted.profile or (PRETRAINED if own else wanted.request.profile)
     chosen = wanted.file.choose(profile, wanted.request.overrides)
-    settings: RolloutSettings = chosen.build("rollout", RolloutSettings)
+    over = merge_overlays([DEFAULTS, chosen])
+    settings: RolloutSettings = over.build("rollout", RolloutSettings)
     calibrated = wanted.root.latest_folder("calibrate")
     if calibrated is not None and weights == wanted.root.latest_folder("train"):
         settings = read_found(calibrated).over(settings)

@@ -273,6 +273,9 @@ def drive(*, request_options: RequestOptions, driving: DriveOptions) -> None:
 
     Example: infgen drive 637f20 --root R --weights builtin --no-browser --port 8080
 
+    Example: infgen drive -s rollout.rules=none
+
+    Rules keep the others from colliding (rollout.rules=safe) unless -s says none.
     Prints the address of the page and goes on until Ctrl-C. Drives that are saved there can
     be read by `infgen view`, `infgen export`, and `infgen score` (rollout.recordings).
     """

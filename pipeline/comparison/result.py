@@ -62,7 +62,16 @@ class ComparisonResult:
 
     @property
     def arms(self) -> list[Arm]:
-        """Arms that anything was scored of."""
+        """Arms that anything was scored of, but for those that show what rules change."""
+        return [arm for arm in self._scored_arms if arm.rules_of is None]
+
+    @property
+    def rules_arms(self) -> list[Arm]:
+        """Arms that show what rules change, if anything was scored of them."""
+        return [arm for arm in self._scored_arms if arm.rules_of is not None]
+
+    @property
+    def _scored_arms(self) -> list[Arm]:
         have = {one.arm for one in self.scored}
         return [arm for arm in self.preset.arms.values() if arm.name in have]
 
@@ -85,6 +94,11 @@ class ComparisonResult:
                     arm.label if len(rollout_sets) == 1 else f"{arm.label}, {rollout_set}"
                 )
                 yield label, self.numbers[arm.name, rollout_set]
+
+    def first(self, arm: Arm, mode: str) -> Mapping[str, Measured]:
+        """Return the numbers of an arm's first rollout set of a mode; none without any."""
+        rollout_sets = self.runs(arm, mode)
+        return self.numbers[arm.name, next(iter(rollout_sets))] if rollout_sets else {}
 
     def ratio(self, ours: Arm, theirs: Arm, mode: str, name: str) -> Measured:
         """Give one number of an arm as a multiple of another arm's."""

@@ -23,6 +23,8 @@ from pipeline.stages.score.write import read_tally
 
 REFERENCE = "reference"
 OFFICIAL = "wosac"
+BIASES = ("add_bias", "remove_bias")
+"""Figures of a stage ``rollout``: what was added to the odds of insertions and removals."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +39,8 @@ class Scored:
         rollouts: Rollouts that were scored.
         official: Scenes that the official metric could score.
         metric: Its version.
+        rules: Rules over the network's choices, in words; ``none`` without any.
+        biased: Whether biases were added to the odds of insertions or removals.
         numbers: Every number with its interval over scenes, by name.
         tally: Means of each scene and curves over the windows.
         settings: How rollouts were scored.
@@ -50,6 +54,8 @@ class Scored:
     rollouts: int
     official: int
     metric: str
+    rules: str
+    biased: bool
     numbers: Mapping[str, Measured]
     tally: Tally
     settings: ScoreSettings
@@ -79,6 +85,8 @@ class Scored:
             "scenes": self.scenes,
             "rollouts": self.rollouts,
             "official_scenes": self.official,
+            "rules": self.rules,
+            "biased": self.biased,
             "settings": list(self.ran.arm_run.settings.words),
             "numbers": {name: one.to_json() for name, one in self.numbers.items()},
         }
@@ -94,6 +102,7 @@ def read_scored(ran: ExecutedRun) -> Scored:
     summary = read_json(plan.root.folder(SCORE, plan[SCORE].key) / "summary.json")
     rollout: RolloutSettings = plan[ROLLOUT].settings
     weights = read_manifest(plan.root.folder(TRAIN, plan[TRAIN].key))["report"]["weights"]
+    simulated = read_manifest(plan.root.folder(ROLLOUT, plan[ROLLOUT].key))["report"]
     settings = plan[SCORE].settings
     return Scored(
         ran=ran,
@@ -103,6 +112,8 @@ def read_scored(ran: ExecutedRun) -> Scored:
         rollouts=summary["rollouts"],
         official=summary[OFFICIAL]["scenes"],
         metric=summary[OFFICIAL]["version"],
+        rules=rollout.rules_in_words,
+        biased=any(simulated.get(name, 0.0) != 0 for name in BIASES),
         numbers=dict(_numbers(summary)),
         tally=_tally(plan),
         settings=settings["score"],

@@ -1,6 +1,6 @@
 """The tables of a comparison: the paper's, with our rows beside the published ones."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from infgen.clock import CLOCK
@@ -9,6 +9,7 @@ from infgen.views.sheets import Measured, Sheet, SheetCell
 from pipeline.comparison.claims import PROTOCOLS, claims
 from pipeline.comparison.proper import proper
 from pipeline.comparison.result import LONG, MOTION_ONLY, OFFICIAL_PLAY, ComparisonResult
+from pipeline.comparison.rules import rules, rules_in_tables
 from pipeline.comparison.statistics import truth
 from pipeline.engine.layout import KEY_DIGITS
 from pipeline.settings.presets import Arm
@@ -41,6 +42,7 @@ def tables(found: ComparisonResult) -> list[Sheet]:
         proper(found),
         ablations(found),
         against_logs(found),
+        rules(found),
         runs(found),
     ]
     return [sheet for sheet in drawn if sheet.rows]
@@ -49,7 +51,7 @@ def tables(found: ComparisonResult) -> list[Sheet]:
 def caveats(found: ComparisonResult) -> list[str]:
     """What must be known of all the tables."""
     told = found.interval[0].upper() + found.interval[1:]
-    return [f"{told} (half of it behind ±).", CAVEAT]
+    return [f"{told} (half of it behind ±).", *rules_in_tables(found), CAVEAT]
 
 
 def standing_alone(found: ComparisonResult, sheet: Sheet) -> Sheet:
@@ -158,11 +160,11 @@ def against_logs(found: ComparisonResult) -> Sheet:
         cells: list[SheetCell] = [label]
         for name in rates:
             one = numbers.get(name, Measured(None))
-            cells += [_scaled(one, CLOCK.token_s), _percent_off(one.mean, logged[name])]
+            cells += [one.scaled(CLOCK.token_s), _percent_off(one.mean, logged[name])]
         rows.append([*cells, *[numbers.get(name) for name in shares]])
     logs: list[SheetCell] = ["the logs of these scenes"]
     for name in rates:
-        logs += [_scaled(Measured(logged[name]), CLOCK.token_s).mean, None]
+        logs += [Measured(logged[name]).scaled(CLOCK.token_s).mean, None]
     return Sheet(
         name="against-the-logs",
         title="Compared with the logs: entries, exits and agent counts",
@@ -182,13 +184,17 @@ def runs(found: ComparisonResult) -> Sheet:
         one = scored.get(id(ran))
         weights = one.weights[:KEY_DIGITS] if one else None
         counts = (one.scenes, one.rollouts) if one else (None, None)
+        on = one.rules if one else None
         score = ran.keys.get("score", "")[:KEY_DIGITS] or None
         why = "" if ran.is_whole else ran.why
-        rows.append([ran.arm_run.words, *counts, weights, score, why])
+        rows.append([ran.arm_run.words, *counts, on, weights, score, why])
     return Sheet(
         name=RUNS,
         title="Runs",
-        columns=["run", "scenes", "rollouts", "weights", "key of the scores", "missing"],
+        columns=[
+            *("run", "scenes", "rollouts", "rules", "weights"),
+            *("key of the scores", "missing"),
+        ],
         rows=rows,
         note="`infgen show KEY` shows how anything was made; all keys and numbers are in "
         "comparison.json.",
@@ -226,11 +232,6 @@ def _published(found: ComparisonResult) -> list[Published]:
     """Rows of the paper that our methods stand beside; all, where none does."""
     names = {arm.published for arm in found.arms}
     return [each for each in PAPER if each.method in names] or list(PAPER)
-
-
-def _scaled(one: Measured, factor: float) -> Measured:
-    ends: Mapping[str, float | None] = one.to_json()
-    return Measured(*[None if end is None else end * factor for end in ends.values()])
 
 
 def _percent_off(value: float | None, true: float | None) -> float | None:

@@ -37,6 +37,8 @@ _MODULES = (
     "pipeline.comparison.claims",
     "pipeline.comparison.result",
     "pipeline.comparison.figures",
+    "pipeline.comparison.proper",
+    "pipeline.comparison.rules",
     "pipeline.comparison.statistics",
     "pipeline.comparison.scores",
     "pipeline.comparison.tables",
@@ -78,7 +80,8 @@ def write_comparison(
 def _about(preset: Preset, ran: Sequence[ExecutedRun]) -> dict[str, Any]:
     """What the manifest says; the key follows from it."""
     arms = [
-        [arm.name, arm.label, arm.published, arm.ablates] for arm in preset.arms.values()
+        [arm.name, arm.label, arm.published, arm.ablates, arm.rules_of]
+        for arm in preset.arms.values()
     ]
     decides = {
         "schema": SCHEMA,

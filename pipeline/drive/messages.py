@@ -107,6 +107,7 @@ def scene_message(world: World, scenes: Sequence[str], number: int) -> str:
         number=number,
         seed=world.start.seed,
         simulates=world.simulator.simulates,
+        rules=world.simulator.settings.rules_in_words,
     )
 
 

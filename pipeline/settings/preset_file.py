@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from infgen.errors import ConfigError
@@ -18,6 +18,8 @@ COUNT_ERRORS = ("own", "split", "truth")
 """See ``infgen.metrics.long_term.table``: own log, mean of the split, same step."""
 _PRESET = ("profile", "seeds", "count_error", "towns", "rollout_sets", "arms")
 _ARM = ("profile", "published", "label", "starts_from", "ablates", "rollout_sets")
+_RULES_ARM = ("label", "rules_of", "rollout")
+"""Keys of an arm that simulates the weights of another one with other rules."""
 _METHODS = tuple(each.method for each in PAPER)
 
 
@@ -80,6 +82,8 @@ class _Context:
 def _arm(arms: LinedMapping, name: str, context: _Context) -> Arm:
     entry = inner(arms, name)
     _check_name(arms, name, "arm")
+    if "rules_of" in entry:
+        return _rules_arm(arms, name, context)
     known(entry, (*_ARM, *context.sections), name)
     published = _word(entry, "published", (*_METHODS, *ABLATIONS))
     settings = merge_overlays([context.settings, _settings(entry, context.sections)])
@@ -95,7 +99,35 @@ def _arm(arms: LinedMapping, name: str, context: _Context) -> Arm:
         },
         starts_from=_word(entry, "starts_from", tuple(arms)),
         ablates=_word(entry, "ablates", tuple(arms)),
+        rules_of=None,
         published=published,
+        where=arms.where(name),
+    )
+
+
+def _rules_arm(arms: LinedMapping, name: str, context: _Context) -> Arm:
+    """Read an arm that has the weights of another one, and other settings of rollouts."""
+    entry = inner(arms, name)
+    known(entry, _RULES_ARM, name)
+    of = _word(entry, "rules_of", tuple(arms))
+    if of is None or "rules_of" in inner(arms, of):
+        raise ConfigError(
+            f"{entry.where('rules_of')}: rules_of is {of!r}; expected an arm with weights "
+            "of its own"
+        )
+    base, own = _arm(arms, of, context), _settings(entry, context.sections)
+    return replace(
+        base,
+        name=name,
+        label=_word(entry, "label", ()) or base.label,
+        settings=merge_overlays([base.settings, own]),
+        rollout_sets={
+            rollout_set: merge_overlays([settings, own])
+            for rollout_set, settings in base.rollout_sets.items()
+        },
+        ablates=None,
+        rules_of=of,
+        published=None,
         where=arms.where(name),
     )
 

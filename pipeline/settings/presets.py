@@ -19,6 +19,7 @@
             rollout_sets: {long: {score: {presence_radius_m: 75}}, wosac: {}}
           catk: {profile: "smart,closed-loop", starts_from: smart, rollout_sets: [long]}
           no-cell: {profile: no-position-token, ablates: infgen, rollout_sets: [long]}
+          infgen-safe: {rules_of: infgen, rollout: {rules: safe}}  # made if it is named
 
 Settings may be given in the preset, in an arm, in a rollout set, and in a rollout set of an
 arm. Each takes precedence over those before it, and all of them over the profiles.
@@ -48,6 +49,8 @@ class Arm:
         rollout_sets: Settings of each of its rollout sets over all profiles, by name.
         starts_from: Arm whose weights its training starts from.
         ablates: Arm that it is an ablation of; it is then listed in the table of ablations.
+        rules_of: Arm whose weights and rollout sets it has, with other settings of
+            rollouts. It is made only if it is named, and listed in the table of rules only.
         published: Row of the paper that it is compared with.
         where: Its place in the file.
     """
@@ -59,6 +62,7 @@ class Arm:
     rollout_sets: Mapping[str, Overlay]
     starts_from: str | None
     ablates: str | None
+    rules_of: str | None
     published: str | None
     where: str
 
@@ -84,7 +88,7 @@ class Preset:
     arms: Mapping[str, Arm]
 
     def chosen(self, names: Sequence[str]) -> list[Arm]:
-        """Pick arms by name, all without names.
+        """Pick arms by name; without names all but those that show what rules change.
 
         Raises:
             ConfigError: for an arm that does not exist.
@@ -93,7 +97,11 @@ class Preset:
             if name not in self.arms:
                 there = did_you_mean(name, list(self.arms))
                 raise ConfigError(f"--arms {name}: no arm {name!r} in {self.name}{there}")
-        return [arm for name, arm in self.arms.items() if not names or name in names]
+        return [
+            arm
+            for name, arm in self.arms.items()
+            if (name in names if names else arm.rules_of is None)
+        ]
 
     def initial_arms(self, arms: Sequence[Arm]) -> list[Arm]:
         """Return arms that these start from and that are not among them, in order."""

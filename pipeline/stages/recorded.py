@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from infgen.rollout.rollout import Rollout
 
 MAX_NAMED = 5
+UNKNOWN = "unknown"
+"""Rules of recordings that were saved before they were named."""
 
 
 def find_recorded(root: Path, settings: RolloutSettings) -> list[Source]:
@@ -75,6 +77,7 @@ def collect_recorded(unit: Unit, target: Path, progress: Progress) -> Report:
         "add_bias": played["add_bias"],
         "remove_bias": played["remove_bias"],
         "device": played["device"],
+        "rules": abouts[0][DRIVE].get("rules", UNKNOWN),
         "simulates": f"{abouts[0][DRIVE]['simulates']}; recorded drives",
     }
 

@@ -122,6 +122,7 @@ def simulate(
         "add_bias": settings.add_bias,
         "remove_bias": settings.remove_bias,
         "device": settings.device,
+        "rules": settings.rules_in_words,
     }
     return {**_report(rows, refused), **told, "simulates": simulator.simulates, "run": run}
 
@@ -156,6 +157,7 @@ def finish(
         "rollouts": count,
         "device": device_of_units(units),
         "simulates": "; ".join(simulates),
+        "rules": "; ".join(sorted({done.report["rules"] for done in units})),
         **means,
         **biases,
         "refused": refused,

@@ -46,7 +46,11 @@ def write_recording(target: Path, rollout: Rollout, scene: Scene, about: About) 
     """
     from infgen.settings import key_values  # noqa: PLC0415
 
-    drive = {"source": about.source, "simulates": about.simulates}
+    drive = {
+        "source": about.source,
+        "simulates": about.simulates,
+        "rules": about.settings.rules_in_words,
+    }
     write_saved(target, scene, [rollout], key_values(about.settings), {DRIVE: drive})
 
 

@@ -10,6 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import infgen.environment as package
+from infgen.environment.defaults import packaged_simulator
 from infgen.environment.reward import default_reward
 from infgen.environment.scenes import SceneChoiceError
 from infgen.environment.single import DriveEnv
@@ -54,6 +55,25 @@ def same(one, other):
         np.array_equal(a["agents"], b["agents"]) and reward == again and info == later
         for (a, reward, info), (b, again, later) in zip(one, other, strict=True)
     )
+
+
+def test_rules_are_those_of_the_simulator_unless_the_environment_names_others(
+    crossing, simulator
+):
+    def course(rollout, **settings):
+        playing = simulator(**LIVELY, add_bias=3.0, **rollout)
+        env = DriveEnv(playing, [crossing()], hz=2, **settings)
+        return played(env, 0, steps=3)
+
+    safe, none = {"rules": "safe"}, {}
+
+    assert same(course(safe), course(none, rules="safe"))
+    assert same(course(none), course(safe, rules="none"))
+    assert not same(course(safe), course(none))
+
+
+def test_in_the_streets_of_the_package_others_have_rules():
+    assert packaged_simulator().settings.rules_in_words == "safe"
 
 
 def test_the_seed_decides_everything(crossing, drive_env):

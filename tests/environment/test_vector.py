@@ -10,7 +10,7 @@ from infgen.environment.vector import DriveVectorEnv
 
 LIVELY = {
     **{"insert": True, "remove": True, "max_agents": 24, "max_insertions": 2},
-    **{"max_motion_samples": 3, "max_stall_s": 1.0, "density_control": 1.0},
+    **{"rules": "safe", "max_motion_samples": 3, "max_stall_s": 1.0},
 }
 
 

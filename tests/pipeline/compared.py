@@ -24,13 +24,24 @@ def arm(name, **changes) -> Arm:
         "rollout_sets": {"long": NOTHING, "motion-only": NOTHING, "wosac": NOTHING},
         "starts_from": None,
         "ablates": None,
+        "rules_of": None,
         "published": None,
         "where": "stages.yaml:1",
     }
     return Arm(name=name, **{**given, **changes})
 
 
-def scored(method, seed, means, *, mode="long", numbers=None, curves=None) -> Scored:
+def scored(
+    method,
+    seed,
+    means,
+    *,
+    mode="long",
+    numbers=None,
+    curves=None,
+    rules="none",
+    biased=False,
+) -> Scored:
     """A scored run: means of each scene by name, numbers, and curves over the windows."""
     method = arm(method) if isinstance(method, str) else method
     sums = {
@@ -45,6 +56,8 @@ def scored(method, seed, means, *, mode="long", numbers=None, curves=None) -> Sc
         rollouts=len(means),
         official=1,
         metric="wosac-2025",
+        rules=rules,
+        biased=biased,
         numbers={
             name: Measured(*_spread(value)) for name, value in (numbers or {}).items()
         },

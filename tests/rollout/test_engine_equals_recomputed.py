@@ -11,13 +11,14 @@ from infgen.sources.towns import builtin_records
 from infgen.sources.womd import iter_scenes
 from infgen.tokens.scene_tokens import Presence
 from tests.rollout.heard import Gaps, Listening, play, recompute
+from tests.rollout.single_rules import only
 
 CLOSE = 1e-4
 NEAR = {"atol": CLOSE, "rtol": 0.0}
 BUSY = {
+    **only(insertion_mask=True, max_insertion_attempts=2),
     "max_agents": 20,
     "max_insertions": 2,
-    "max_insertion_attempts": 2,
     "motion_top_k": 0,
     "add_bias": -0.7,
     "remove_bias": -2.2,

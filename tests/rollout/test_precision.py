@@ -148,9 +148,8 @@ def test_rollouts_in_bf16_run_with_insertion_and_all_rules(network, session):
     stepper = make_stepper(network, "bf16")
     running = session(
         stepper,
+        rules="safe",
         max_motion_samples=4,
-        reject_off_road=True,
-        density_control=1.0,
         add_bias=6.0,
     )
 

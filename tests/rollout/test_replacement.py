@@ -8,10 +8,11 @@ import pytest
 from infgen.rollout.begun_step import logged_step
 from infgen.rollout.recording import NOBODY
 from infgen.rollout.session import Session
+from tests.rollout.single_rules import only
 
 LIVELY = {
-    **{"max_insertions": 2, "max_agents": 24, "motion_top_k": 0, "density_control": 1.0},
-    **{"max_motion_samples": 3, "reject_off_road": True, "max_stall_s": 1.0},
+    **{"rules": "safe", "max_motion_samples": 3, "max_stall_s": 1.0},
+    **{"max_insertions": 2, "max_agents": 24, "motion_top_k": 0},
 }
 
 
@@ -112,7 +113,8 @@ def test_until_its_history_ends_a_replaced_rollout_goes_as_logged(
 def test_a_scene_with_more_agents_than_there_are_rows_gets_more_rows(
     crossing, parked, start, simulator
 ):
-    playing = simulator(insert=False, max_agents=4, max_stall_s=1.0, max_motion_samples=2)
+    rules = only(max_stall_s=1.0, max_motion_samples=2)
+    playing = simulator(insert=False, max_agents=4, **rules)
     session = Session(playing, [start(crossing(), at) for at in range(2)])
     assert session.num_rows == 4
     crowded = start(parked(8))

@@ -10,6 +10,7 @@ from infgen.rollout.rules.off_road import RoadEdgeTiles, find_off_road
 from infgen.rollout.session import Session
 from infgen.rollout.simulate import simulate
 from infgen.tokens.scene_tokens import Presence
+from tests.rollout.single_rules import only
 
 ALONE = {"insert": False, "remove": False, "max_agents": 6}
 
@@ -181,7 +182,7 @@ def test_the_number_of_agents_is_held_to_what_it_was_at_now(
     begin = [start(parked(6), at) for at in range(6)]
     counts = {}
     for firmly in (0.0, 40.0):
-        playing = simulator(insertion_mask=False, density_control=firmly, max_agents=40)
+        playing = simulator(**only(density_control=firmly), max_agents=40)
         force(playing, add=add, leave=leave)
         session = Session(playing, begin)
         for _ in range(6):
@@ -209,7 +210,7 @@ def test_who_would_run_into_somebody_draws_again(parked, start, simulator):
     still = {"insert": False, "remove": False, "motion_top_k": 0}
 
     careless = new_hits(simulator(**still), begin)
-    careful = new_hits(simulator(**still, max_motion_samples=20), begin)
+    careful = new_hits(simulator(**still, **only(max_motion_samples=20)), begin)
 
     assert careless > 20
     assert careful < careless / 5
@@ -220,7 +221,7 @@ def test_where_nobody_would_run_into_anybody_nothing_changes(drive, start, simul
     alone = {"insert": False, "remove": False}
 
     careless, careful = (
-        Session(simulator(**alone, max_motion_samples=tries), begin).step()
+        Session(simulator(**alone, **only(max_motion_samples=tries)), begin).step()
         for tries in (1, 20)
     )
 
@@ -247,10 +248,14 @@ def off_the_road(playing, begin, tokens=8):
 
 def test_who_would_leave_the_road_draws_again_if_asked(drive, start, simulator):
     begin = [start(drive(), at) for at in range(24)]
-    still = {"insert": False, "remove": False, "motion_top_k": 0, "max_motion_samples": 20}
+    still = {"insert": False, "remove": False, "motion_top_k": 0}
 
-    careless = off_the_road(simulator(**still), begin)
-    careful = off_the_road(simulator(**still, reject_off_road=True), begin)
+    careless, careful = (
+        off_the_road(
+            simulator(**still, **only(max_motion_samples=20, reject_off_road=stays)), begin
+        )
+        for stays in (False, True)
+    )
 
     assert careless > 20
     assert careful < careless / 5
@@ -259,10 +264,14 @@ def test_who_would_leave_the_road_draws_again_if_asked(drive, start, simulator):
 def test_who_has_to_steer_does_not_stop_for_it(drive, start, simulator):
     """Nobody else stands than would have anyway, though many draw again."""
     begin = [start(drive(), at) for at in range(200)]
-    still = {"insert": False, "remove": False, "motion_top_k": 0, "max_motion_samples": 20}
+    still = {"insert": False, "remove": False, "motion_top_k": 0}
 
     plain, kept = (
-        Session(simulator(**still, reject_off_road=stays), begin).step().path
+        Session(
+            simulator(**still, **only(max_motion_samples=20, reject_off_road=stays)), begin
+        )
+        .step()
+        .path
         for stays in (False, True)
     )
 
@@ -280,14 +289,14 @@ def test_who_can_stay_on_the_road_only_by_running_into_others_leaves_it(
 
     careless = new_hits(simulator(**still), begin)
     careful = new_hits(
-        simulator(**still, max_motion_samples=40, reject_off_road=True), begin
+        simulator(**still, **only(max_motion_samples=40, reject_off_road=True)), begin
     )
 
     assert careful < careless / 5
 
 
 def test_who_is_driven_is_never_drawn_for(parked, start, simulator):
-    careful = {"max_motion_samples": 5, "reject_off_road": True}
+    careful = only(max_motion_samples=5, reject_off_road=True)
     driven = Session(simulator(**careful, insert=False, remove=False), start(parked(1)))
 
     frame = driven.step(pose(8.0, -2.0))
@@ -297,7 +306,7 @@ def test_who_is_driven_is_never_drawn_for(parked, start, simulator):
 
 def test_drawing_again_does_not_depend_on_other_rollouts(parked, start, simulator):
     playing = simulator(
-        **{"max_motion_samples": 5, "reject_off_road": True, "max_stall_s": 1.0},
+        **only(max_motion_samples=5, reject_off_road=True, max_stall_s=1.0),
         **{"insert": False, "remove": False, "motion_top_k": 0},
     )
     begin = [start(parked(5), at) for at in range(4)]
@@ -313,7 +322,7 @@ def test_drawing_again_does_not_depend_on_other_rollouts(parked, start, simulato
 def test_who_is_too_fast_for_every_way_takes_the_slowest(drive, start, simulator):
     """The network knows 10 to 19 m to the right only, and all lead off the road soon."""
     begin = [start(drive(), at) for at in range(24)]
-    still = {"insert": False, "remove": False, "motion_top_k": 0, "max_motion_samples": 40}
+    still = {"insert": False, "remove": False, "motion_top_k": 0}
 
     def ways_m(playing):
         step, motion_token = playing.stepper.motion_step, torch.arange(61)
@@ -329,8 +338,10 @@ def test_who_is_too_fast_for_every_way_takes_the_slowest(drive, start, simulator
         before = session.population.pose[:, 0, :2]
         return np.linalg.norm(session.step().path[:, 0, -1, :2] - before, axis=-1)
 
-    careless = ways_m(simulator(**still))
-    careful = ways_m(simulator(**still, reject_off_road=True))
+    careless, careful = (
+        ways_m(simulator(**still, **only(max_motion_samples=40, reject_off_road=stays)))
+        for stays in (False, True)
+    )
 
     assert careless.mean() > 13
     assert np.median(careful) < 12

@@ -5,6 +5,8 @@ from infgen.errors import ConfigError
 from infgen.rollout.settings import MODES
 from infgen.settings import build
 
+SAFE = {"rules": "safe"}
+
 
 @pytest.mark.parametrize(
     ("mode", "duration_s", "all_agents", "inserts"),
@@ -70,12 +72,11 @@ def test_setting_what_the_mode_fixes_to_the_same_is_allowed():
         ({"heading_temperature": float("nan")}, "expected a finite number"),
         ({"position_top_p": 1.5}, "less than or equal to 1"),
         ({"motion_top_p": 0.0}, "greater than 0"),
-        ({"max_insertion_attempts": 0}, "greater than or equal to 1"),
+        ({"max_insertion_attempts": 0, **SAFE}, "greater than or equal to 1"),
         ({"removal_radius_m": -1.0}, "greater than or equal to 0"),
-        ({"reject_off_road": True}, "set max_motion_samples=32"),
-        ({"max_stall_s": 20.0}, "set max_motion_samples=32"),
-        ({"max_stall_s": -1.0, "max_motion_samples": 2}, "greater than or equal to 0"),
-        ({"density_control": -0.5}, "greater than or equal to 0"),
+        ({"max_stall_s": -1.0, **SAFE}, "greater than or equal to 0"),
+        ({"density_control": -0.5, **SAFE}, "greater than or equal to 0"),
+        ({"rules": "Safe"}, "expected 'none' or 'safe'"),
     ],
 )
 def test_impossible_values_are_refused(given, said):

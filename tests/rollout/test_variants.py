@@ -15,6 +15,7 @@ from infgen.rollout.session import Session
 from infgen.rollout.simulate import simulate
 from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence
+from tests.rollout.single_rules import only
 
 VARIANTS = {
     "full": {},
@@ -69,9 +70,9 @@ def test_every_variant_plays_and_keeps_the_rules(
 ):
     playing = simulator(
         VARIANTS[variant],
+        **only(insertion_mask=True, max_insertion_attempts=2),
         max_agents=9,
         max_insertions=2,
-        max_insertion_attempts=2,
         removal_radius_m=80.0,
     )
     add = 1.0 if playing.stepper.insertion_and_removal else None
@@ -101,7 +102,7 @@ def test_the_rules_hold_whatever_comes_and_goes(
 ):
     playing = simulator(
         max_agents=rows,
-        insertion_mask=mask,
+        **only(insertion_mask=mask),
         max_insertions=3,
         motion_top_k=0,
         position_top_k=0,
@@ -196,8 +197,9 @@ def keep_speed(playing):
 
 def test_newcomers_are_kept_off_others_and_near_lanes(parked, start, simulator, force):
     playing = simulator(
-        insertion_lane_distance_m=6.0,
-        max_insertion_attempts=5,
+        **only(
+            insertion_mask=True, insertion_lane_distance_m=6.0, max_insertion_attempts=5
+        ),
         position_top_k=0,
         max_agents=40,
         max_insertions=5,
@@ -241,10 +243,17 @@ def test_with_a_mask_that_refuses_nobody_rollouts_are_as_without(
 
     few = {"seconds": 2.0, "max_insertions": 2}
     (masked,) = play(
-        simulator(insertion_lane_distance_m=1e6, max_insertion_attempts=1, **few),
+        simulator(
+            **few,
+            **only(
+                insertion_mask=True,
+                insertion_lane_distance_m=1e6,
+                max_insertion_attempts=1,
+            ),
+        ),
         [start(scene)],
     )
-    (free,) = play(simulator(insertion_mask=False, **few), [start(scene)])
+    (free,) = play(simulator(**few), [start(scene)])
 
     same = min(len(masked.id), len(free.id))
     first = int(np.argmax(masked.entry_step[:same] != free.entry_step[:same]) or same)

@@ -69,14 +69,25 @@ from pipeline.storage.weights import load_network  # noqa: E402
 from pipeline.storage.zarr_store import write_records  # noqa: E402
 
 CPU = torch.device("cpu")
+MASK: dict[str, Any] = {
+    "rules": "safe",
+    "max_motion_samples": 1,
+    "reject_off_road": False,
+    "max_stall_s": 0.0,
+    "density_control": 0.0,
+    "insertion_lane_distance_m": 15.0,
+    "max_insertion_attempts": 4,
+}
+"""The insertion mask alone."""
 RULES = {
+    **MASK,
     "max_motion_samples": 8,
     "reject_off_road": True,
     "max_stall_s": 2.0,
     "density_control": 1.0,
 }
 OPTIONS: dict[str, dict[str, Any]] = {
-    "plain": {},
+    "mask": MASK,
     "rules": RULES,
     "pretrained": {
         **RULES,
@@ -89,12 +100,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "remove_bias": 0.1556,
     },
     "crowded": {
+        **MASK,
         "max_agents": 24,
         "max_insertions": 3,
         "add_bias": 1.5,
         "removal_radius_m": 50.0,
     },
-    "unmasked": {"insertion_mask": False, "add_bias": 1.0},
+    "none": {"add_bias": 1.0},
 }
 Found = dict[str, Any]
 

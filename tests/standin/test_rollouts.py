@@ -8,8 +8,8 @@ captured as a graph, and so is one launch and one wait.
 import pytest
 
 MOST = {
-    ("motion-only", "plain"): (717, 1),
-    ("long", "plain"): (3224, 3),
+    ("motion-only", "mask"): (717, 1),
+    ("long", "mask"): (3224, 3),
     ("long", "rules"): (3366, 10),
 }
 
@@ -31,9 +31,9 @@ def test_rollouts_are_those_of_the_cpu_and_cost_no_more_than_they_did(case, mode
     [
         ("long", "pretrained", "7"),  # In the eighth a sample is at its very boundary.
         ("long", "crowded", "8"),
-        ("long", "unmasked", "4"),
+        ("long", "none", "4"),
         ("motion-only", "rules", "4"),
-        ("wosac", "plain", "4"),
+        ("wosac", "mask", "4"),
     ],
 )
 def test_longer_rollouts_of_all_options_are_those_of_the_cpu(case, mode, options, steps):

@@ -201,11 +201,11 @@ class DeviceInsertion:
 
     def _add_bias(self, running: _Running, wanted: Tensor | None) -> Tensor | float:
         """Return what is added to the logit of ADD, with density control."""
-        settings, asked = self._simulator.settings, running.entries.rollout
+        simulator, asked = self._simulator, running.entries.rollout
         if wanted is None:
-            return settings.add_bias
+            return simulator.settings.add_bias
         odds = (wanted[asked] + 1) / (running.num_others[asked] + 1)
-        return settings.add_bias + settings.density_control * odds.log()
+        return simulator.settings.add_bias + simulator.rules.density_control * odds.log()
 
     def _propose(
         self, running: _Running, query: PositionOutputs, numbers: Tensor

@@ -1,4 +1,4 @@
-"""The insertion mask of ``infgen.rollout.insertion_mask`` on a device."""
+"""The insertion mask of ``infgen.rollout.rules.insertion_mask`` on a device."""
 
 import numpy as np
 import torch
@@ -7,7 +7,7 @@ from torch import Tensor
 
 from infgen.model.token_step import TokenStep
 from infgen.rollout.device.geometry import boxes_overlap, to_world
-from infgen.rollout.insertion_mask import FAR_M, InsertionMask
+from infgen.rollout.rules.insertion_mask import FAR_M, InsertionMask
 from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence
 

@@ -1,1 +1,1 @@
-"""Optional rules over the choices of the network: collision, off-road, stalls, density."""
+"""Optional rules over the network's choices; ``rule_set`` says which are on."""

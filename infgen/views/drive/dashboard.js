@@ -43,6 +43,7 @@ export class Dashboard {
     seed.value = message.seed;
     this.write("scene", id);
     this.write("simulates", message.simulates);
+    this.write("rules", message.rules);
   }
 
   note(text, bad = false) {

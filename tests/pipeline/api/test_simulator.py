@@ -93,9 +93,26 @@ def test_the_weights_of_the_package_have_the_settings_of_their_profile():
     sim = infgen.load("towns")
 
     assert sim.folder == builtin_weights().resolve()
-    assert (sim.settings.max_motion_samples, sim.settings.add_bias) == (32, 0.185)
+    assert (sim.settings.motion_top_p, sim.settings.rules) == (0.9, "none")
     assert infgen.load(builtin_weights()).settings == sim.settings
     assert infgen.load(motion_top_p=0.8).settings == replace(sim.settings, motion_top_p=0.8)
+
+
+def test_rules_are_those_of_the_settings_unless_a_call_names_others(scene, weights):
+    sim = infgen.load(weights, seconds=1.0, count=1)
+    safe = infgen.load(weights, seconds=1.0, count=1, rules="safe", max_stall_s=30.0)
+
+    assert sim.rollout(scene).settings.rules_in_words == "none"
+    assert sim.rollout(scene, rules="safe").settings == replace(sim.settings, rules="safe")
+    assert safe.rollout(scene).settings.rules_in_words == "safe, max_stall_s=30"
+    assert safe.rollout(scene, rules="none").settings == sim.settings
+    session = sim.session(scene, rules="safe")
+    session.step()
+    assert session.rollouts().settings == replace(sim.settings, rules="safe")
+    with pytest.raises(ConfigError, match=r"rules is 'all'; expected 'none' or 'safe'"):
+        infgen.load(weights, rules="all")
+    with pytest.raises(ConfigError, match=r"max_stall_s is 30.0, but rules=none has no"):
+        infgen.load(weights, max_stall_s=30.0)
 
 
 def test_what_does_not_exist_is_told_with_the_way_out(tmp_path):

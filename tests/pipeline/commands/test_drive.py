@@ -49,7 +49,7 @@ def test_without_a_root_the_package_has_all_that_is_needed(tmp_path):
     assert garage.scenes.ids[number] == SCENE
     assert garage.scenes.sources[SCENE] == "training.tfrecord-00000-of-00002.gz"
     settings = garage.simulator.settings
-    assert (settings.count, settings.reject_off_road, settings.add_bias) == (1, True, 0.185)
+    assert (settings.count, settings.rules, settings.add_bias) == (1, "safe", 0.185)
     assert garage.folder.name == "drives"
 
 
@@ -62,6 +62,15 @@ def test_settings_are_those_of_the_words(tmp_path):
 
     assert garage.simulator.settings.max_agents == 40
     assert garage.folder == tmp_path / "kept"
+
+
+def test_rules_are_those_of_the_words_if_they_name_some(tmp_path):
+    def rules(*overrides):
+        garage, _ = open_garage(wanted(tmp_path / "root", overrides=overrides))
+        return garage.simulator.settings.rules_in_words
+
+    assert rules("rollout.rules=none") == "none"
+    assert rules("rollout.max_stall_s=30") == "safe, max_stall_s=30"
 
 
 def test_a_scene_that_does_not_exist_is_told_with_some_that_do(tmp_path):

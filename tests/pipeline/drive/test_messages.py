@@ -124,6 +124,7 @@ def test_a_scene_is_shown_with_its_history_as_the_player_packs_it(begin):
 
     (showing,) = film.showings
     assert (said["scenes"], said["number"], said["seed"]) == (["a", "b"], 1, 0)
+    assert said["rules"] == drive.world.simulator.settings.rules_in_words
     np.testing.assert_array_equal(showing.id, start.history.track_id)
     assert showing.role[showing.ego] == Role.EGO
     assert showing.num_steps == start.scene.now + 1

@@ -2,6 +2,7 @@
 
 import pytest
 
+from infgen.config import CalibrateSettings, RolloutSettings
 from infgen.errors import ConfigError
 from infgen.views.published import ABLATIONS, PAPER
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
@@ -77,6 +78,65 @@ def test_later_sections_of_a_preset_take_precedence(load):
         "rollout.count=2",
     }
     assert "rollout.count=3" in words(arms["plain"].rollout_sets["long"])
+
+
+@pytest.mark.parametrize("name", ["towns-benchmark", "womd-mini"])
+def test_rollouts_of_the_packaged_presets_have_no_rules_and_no_biases(name):
+    file = load_stages(DEFAULT_FILE, {})
+    preset = file.preset(name)
+
+    for arm in preset.arms.values():
+        for over in arm.rollout_sets.values():
+            chosen = file.choose(",".join([*preset.profile, *arm.profile]), between=[over])
+            rollout = chosen.build("rollout", RolloutSettings)
+            assert rollout.rules_in_words == ("safe" if arm.rules_of else "none")
+            assert (rollout.add_bias, rollout.remove_bias) == (0, 0)
+            assert chosen.build("calibrate", CalibrateSettings).method == "none"
+    named = {arm.rules_of for arm in preset.arms.values()} - {None}
+    assert named == {"infgen", "smart", "catk"}
+
+
+RULED = (
+    GOOD
+    + """\
+      ruled: {rules_of: plain, rollout: {count: 5, seed: 1}}
+"""
+)
+
+
+def test_an_arm_that_shows_what_rules_change_has_the_weights_of_another(load):
+    mini = load(RULED).preset("mini")
+    plain, ruled = mini.arms["plain"], mini.arms["ruled"]
+
+    assert (ruled.rules_of, ruled.label, ruled.published) == ("plain", "Plain", None)
+    assert ruled.profile == plain.profile
+    assert list(ruled.rollout_sets) == list(plain.rollout_sets)
+    for name, own in ruled.rollout_sets.items():
+        added = {"rollout.count=5", "rollout.seed=1"}
+        assert added <= words(own)
+        kept = {word for word in words(plain.rollout_sets[name]) if "count" not in word}
+        assert words(own) == kept | added
+
+
+def test_an_arm_that_shows_what_rules_change_is_made_only_if_it_is_named(load):
+    mini = load(RULED).preset("mini")
+
+    assert "ruled" not in [arm.name for arm in mini.chosen([])]
+    assert [arm.name for arm in mini.chosen(["ruled"])] == ["ruled"]
+
+
+@pytest.mark.parametrize(
+    ("new", "message"),
+    [
+        ("rules_of: plan", "stages.yaml:27: no rules_of 'plan'; did you mean 'plain'"),
+        ("rules_of: ruled", "stages.yaml:27: rules_of is 'ruled'; expected an arm with"),
+        ("rules_of: null", "stages.yaml:27: rules_of is None; expected an arm with"),
+        ("rules_of: plain, train: {steps: 1}", "stages.yaml:27: ruled: no entry 'train'"),
+    ],
+)
+def test_what_is_wrong_with_such_an_arm_is_named_with_its_line(load, new, message):
+    with pytest.raises(ConfigError, match=message):
+        load(RULED.replace("rules_of: plain", new, 1)).preset("mini")
 
 
 def test_arms_are_picked_by_name_and_bring_those_that_they_start_from(load):
@@ -158,10 +218,10 @@ def test_the_packaged_presets_compare_all_methods_of_the_paper_and_all_ablations
 
     for name in ("towns-benchmark", "womd-mini"):
         preset = file.preset(name)
-        published = {arm.published for arm in preset.arms.values()}
-        assert published == {each.method for each in PAPER} | set(ABLATIONS)
+        arms = preset.chosen([])
+        assert {a.published for a in arms} == {e.method for e in PAPER} | set(ABLATIONS)
         assert preset.seeds == 3
-        methods = [arm for arm in preset.arms.values() if arm.ablates is None]
+        methods = [arm for arm in arms if arm.ablates is None]
         for arm in methods:
             assert set(arm.rollout_sets) == {"long", "motion-only", "wosac"}
             radius = "score.presence_radius_m=75" in arm.rollout_sets["long"].words

@@ -118,7 +118,7 @@ def test_the_report_names_the_type_of_device_and_the_run_record_the_device(
     report, _ = play(unit, tmp_path / "out", settings)
 
     threads = torch.get_num_threads()
-    assert report["device"] == "cpu"
+    assert (report["device"], report["rules"]) == ("cpu", "none")
     assert report["run"]["device"] == f"CPU, {threads} thread{'s'[: threads - 1]}, bf16"
 
 
@@ -147,7 +147,7 @@ def test_of_limited_scenes_those_far_apart_are_played(inputs, tmp_path):
     [
         (
             {"mode": "motion-only"},
-            {"add_bias": 1.0, "remove_bias": 1.0, "max_insertion_attempts": 9},
+            {"add_bias": 1.0, "remove_bias": 1.0, "position_top_p": 0.5},
         ),
         ({"insert": False}, {"add_bias": 1.0, "max_insertions": 3, "position_top_k": 5}),
         ({"remove": False}, {"remove_bias": 1.0, "removal_radius_m": 70.0}),

@@ -63,7 +63,7 @@ def test_a_recording_is_read_back(tmp_path, scenes):
     assert is_recording(folder)
     assert not is_recording(tmp_path)
     about = read_about(folder)
-    assert about["drive"]["source"] == SOURCE
+    assert (about["drive"]["source"], about["drive"]["rules"]) == (SOURCE, "none")
     assert about["settings"]["rollout"]["add_bias"] == 0.25
     assert "scenes/index.parquet" in about["files"]
 
@@ -134,6 +134,7 @@ def test_the_stage_takes_recordings_and_numbers_those_of_a_scene(
     index = pl.read_parquet(target / "index.parquet")
     assert index["scenario_id"].to_list() == [each[0] for each in found]
     assert (report["rollouts"], report["add_bias"]) == (3, 0.25)
+    assert report["rules"] == "none"
 
 
 def test_recordings_of_other_records_are_refused(recordings):

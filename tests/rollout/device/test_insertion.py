@@ -10,13 +10,15 @@ from infgen.rollout.device.insertion import DeviceInsertion, _kept
 from infgen.rollout.insertion import insert_agents
 from infgen.rollout.session import Session
 from infgen.tokens.scene_tokens import Presence
+from tests.rollout.single_rules import only
 
+MASK = {"insertion_mask": True, "insertion_lane_distance_m": 4.0}
 FEW = {"max_agents": 12, "max_insertions": 5, "position_top_k": 0}
 VARIANTS = {
-    "plain": ({}, {"insertion_mask": False}),
-    "masked": ({}, {"max_insertion_attempts": 6}),
-    "near lanes": ({}, {"insertion_lane_distance_m": 4.0, "max_insertion_attempts": 9}),
-    "density control": ({}, {"density_control": 2.0}),
+    "plain": ({}, {}),
+    "masked": ({}, only(insertion_mask=True, max_insertion_attempts=6)),
+    "near lanes": ({}, only(**MASK, max_insertion_attempts=9)),
+    "density control": ({}, only(**MASK, density_control=2.0)),
     "regressed positions": ({"position_token": False}, {}),
     "regressed headings": ({"heading_token": False}, {"position_top_p": 0.9}),
     "features": ({"cell_feature_width": 8, "ego_embedding": True}, {}),

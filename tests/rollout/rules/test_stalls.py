@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from infgen.config import RolloutSettings
 from infgen.model.signal_features import StopLines
 from infgen.rollout.recording import NOBODY
 from infgen.rollout.rules.stalls import AWAY_M, IN_LANE_M, WAITS_M, StallRule
@@ -16,6 +15,7 @@ from infgen.tokens.signals import REMEMBERED
 from tests.model.test_signal_features import roads
 from tests.rollout.rules.test_collision import everyone
 from tests.rollout.rules.test_off_road import street
+from tests.rollout.single_rules import only
 
 CAR, WALKER, RIDER = AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST
 LONG = 4
@@ -145,16 +145,14 @@ def never_sets_off(simulator, metre_moves, **settings):
 
 def test_in_rollouts_who_has_stood_too_long_sets_off(drive, start, simulator, metre_moves):
     begin = [start(drive(), at) for at in range(8)]
-    settings = {"max_motion_samples": 8}
 
-    for_good = never_sets_off(simulator, metre_moves, **settings)
-    patient = never_sets_off(simulator, metre_moves, max_stall_s=1.5, **settings)
-    careful = never_sets_off(simulator, metre_moves, max_stall_s=9.0, **settings)
+    for_good, patient, careful = (
+        never_sets_off(
+            simulator, metre_moves, **only(max_motion_samples=8, max_stall_s=stall_s)
+        )
+        for stall_s in (0.0, 1.5, 9.0)
+    )
 
     assert stood(for_good, begin, 8) == 8
     assert stood(patient, begin, 8) < 4
     assert stood(careful, begin, 8) == 8
-
-
-def test_by_default_everybody_may_stand_for_ever():
-    assert RolloutSettings().max_stall_s == 0

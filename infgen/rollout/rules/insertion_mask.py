@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from infgen.geometry import boxes_overlap, to_world
-from infgen.rollout.lane_squares import Lanes, LaneSquares, lane_gap_m
 from infgen.rollout.population import EGO_ROW, InsertedAgents, Population, insertion_pose
+from infgen.rollout.rules.lane_squares import Lanes, LaneSquares, lane_gap_m
 from infgen.scene import AgentType
 from infgen.tokens.map import PolylineType
 from infgen.tokens.scene_tokens import Presence, SceneTokens

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from infgen.geometry import boxes_overlap
-from infgen.rollout.insertion_mask import make_insertion_mask
 from infgen.rollout.population import InsertedAgents, place_logged_agents
+from infgen.rollout.rules.insertion_mask import make_insertion_mask
 from infgen.scene import AgentType
 from infgen.tokens.map import PolylineType
 from infgen.tokens.scene_tokens import FIRST_MOTION_TOKEN

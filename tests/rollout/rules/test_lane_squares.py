@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from infgen.rollout.lane_squares import LaneSquares, lane_gap_m
+from infgen.rollout.rules.lane_squares import LaneSquares, lane_gap_m
 
 
 @pytest.mark.parametrize("reach_m", [0.0, 4.0, 25.0, 1e6])
