@@ -245,7 +245,7 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "closed-loop": (FEATURES, {"closed_loop_top_k": 4}),
     "closed-loop-population": (
         {**FEATURES, "density_features": True, "standing_features": True},
-        {"closed_loop_top_k": 4, "closed_loop_population": True},
+        {"motion_noise_neighbours": 5, "closed_loop_population": True},
     ),
     "accumulated": ({}, {"gradient_accumulation": 2}),
     "smart": ({"insertion_and_removal": False}, {}),

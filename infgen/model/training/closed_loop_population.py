@@ -19,8 +19,8 @@ To remove all surplus and to insert all missing agents at once, the obvious targ
 teach several times the flow of the log: it cannot be seen who is surplus, so all agents
 would have to be removed at the rate at which surplus ones are found among them.
 
-Agents with a logged counterpart move as in ``closed_loop``; surplus ones move as the
-network samples, and teach no motion.
+Agents with a logged counterpart move as in ``closed_loop``, or as the batch has it; surplus
+ones move as the network samples, and teach no motion.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -61,9 +61,11 @@ SURPLUS_ROWS = 16
 """Surplus agents that the network may insert into one scene; it inserts no more then."""
 CORRECTION_TOKENS = 6
 """The excess is corrected in about so many token steps (3 s)."""
+SURPLUS_TOP_K = 32
+"""Surplus agents sample from so many most likely motion tokens if ``top`` is 0."""
 FRESH_TOKENS = 2
-"""Whoever came into view at most so many token steps ago is fresh: where it is now is still
-about where agents come into view."""
+"""Whoever came into view at most so many token steps ago is fresh: it is still about where
+agents come into view."""
 ALL_STEPS = 31
 """Validity pattern of an agent that is seen at all steps of a token step."""
 ABSENT, PRESENT, INSERTED, REMOVED = (int(each) for each in Presence)
@@ -75,20 +77,21 @@ def close_population_loop(network: Network, batch: Batch, top: int, seed: int) -
 
     Args:
         network: The network, with insertion; its mode (training or not) is kept.
-        batch: Scenes as logged, without noise, on the network's device.
-        top: Most likely motion tokens that each is chosen from.
+        batch: Scenes on the network's device: as logged, or with noise if ``top`` is 0.
+        top: Most likely motion tokens that those of agents with a logged counterpart are
+            chosen from; 0 to move these as the batch has it.
         seed: Of everything that is sampled.
 
     Returns:
         The batch to learn from; it has more rows of agents.
 
     Raises:
-        ValueError: if there is nothing to choose from, or nobody is ever inserted.
+        ValueError: if the network never inserts an agent.
     """
-    if top < 1 or network.cells is None:
+    if network.cells is None:
         raise ValueError(
-            f"closed loop of insertion with {top} motion tokens to choose from and "
-            f"insertion {'off' if network.cells is None else 'on'}; expected 1 or more, on"
+            "closed loop of insertion and removal with a network that has neither "
+            "(model.insertion_and_removal is false); set closed_loop_population=false"
         )
     learning = network.training
     try:
@@ -112,7 +115,7 @@ class _Simulation:
         stepper: ... evaluated step by step.
         memory: Its past.
         ends: Where motion tokens end.
-        top: Most likely motion tokens that are chosen from.
+        top: Most likely motion tokens that are chosen from; 0 to follow the batch.
         uniforms: Random numbers.
         logged: Agents of the log, followed by free rows for surplus ones.
         asked: Token steps with insertion queries [scene, token].
@@ -148,7 +151,6 @@ class _Simulation:
         born = visible.long().argmax(dim=1)  # The first one that is true.
         fresh_until = torch.where(born > 0, born + FRESH_TOKENS, -1)
         slots = network.settings.max_insertions + 1
-        nobody = torch.full((scenes, tokens, slots), NOBODY, device=device)
         return cls(
             network=network,
             stepper=stepper,
@@ -160,11 +162,7 @@ class _Simulation:
             asked=batch.entries.asked,
             played=map_tensors(logged, Tensor.clone),
             off=torch.zeros_like(visible),
-            turns=InsertionTurns(
-                torch.zeros((scenes, tokens), dtype=torch.int64, device=device),
-                torch.zeros_like(nobody, dtype=torch.bool),
-                nobody,
-            ),
+            turns=InsertionTurns.none(scenes, tokens, slots, device),
             fresh_until=torch.where(visible.any(dim=1), fresh_until, -1),
             used=torch.full((scenes,), rows - SURPLUS_ROWS, device=device),
         )
@@ -186,7 +184,9 @@ class _Simulation:
         played.presence[:, token].masked_fill_(surplus, PRESENT)
         self._label_removals(token, matched, surplus, said.remove_logit)
         who, logits = matched & seen & observed, said.motion_logits
-        move_near_log(played, logged, self.off, token, who, logits, self.top, self.ends)
+        if self.top:
+            near = who, logits, self.top, self.ends
+            move_near_log(played, logged, self.off, token, *near)
         self._move_freely(token, surplus, logits)
         self._remove(token, alive & seen & (observed | surplus), said.remove_logit)
         self._encode_cells(token)
@@ -245,7 +245,8 @@ class _Simulation:
         """Move agents without a counterpart in the log as the network samples."""
         played, uniform = self.played, self.uniforms.draw(*who.shape)
         scene, row = who.nonzero(as_tuple=True)
-        chosen = choose_among(logits[scene, row], uniform[scene, row], self.top)
+        top = self.top or SURPLUS_TOP_K
+        chosen = choose_among(logits[scene, row], uniform[scene, row], top)
         path = self.ends.pose[played.agent_type[scene, row], chosen]
         before = played.pose[scene, token - 1, row]
         played.motion_token[scene, token, row] = chosen

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Agents, Batch, Details, Insertions
 from infgen.model.batching.insertion_targets import describe
+from infgen.model.batching.padding import NOBODY
 from infgen.model.network import EGO
 from infgen.tokens.grid import Grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence
@@ -25,6 +26,15 @@ class InsertionTurns:
     count: Tensor
     add: Tensor
     agent: Tensor
+
+    @classmethod
+    def none(
+        cls, scenes: int, tokens: int, slots: int, device: torch.device
+    ) -> "InsertionTurns":
+        """Return no insertions, and none to learn."""
+        agent = torch.full((scenes, tokens, slots), NOBODY, device=device)
+        add = torch.zeros_like(agent, dtype=torch.bool)
+        return cls(torch.zeros_like(agent[..., 0]), add, agent)
 
 
 def targets(

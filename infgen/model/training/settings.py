@@ -111,8 +111,9 @@ class TrainSettings:
     likely motion tokens that is nearest to the log (CatK, SPEC 7.1); 0 for scenes as
     logged."""
     closed_loop_population: Bool = False
-    """Whether agents are inserted and removed by the network itself there, and it learns to
-    insert those that the log has and it lacks, and to remove those that only it has."""
+    """Scenes are simulated with the insertions and removals of the network before they are
+    learned from, and it learns to correct their number. Agents that the log has too move as
+    `closed_loop_top_k` says, or as logged."""
     loader_workers: Annotated[Count | None, NOT_IN_KEY] = None
     """Processes that prepare batches, 0 for a thread; by default two on a GPU, whose
     launches keep this process busy, and a thread on a CPU."""
@@ -139,11 +140,6 @@ class TrainSettings:
                     f"closed_loop_top_k and {noise} both lead agents off their logged "
                     "paths; set one of them to 0"
                 )
-        if self.closed_loop_population and not self.closed_loop_top_k:
-            raise ValueError(
-                "closed_loop_population needs scenes that are simulated, but "
-                "closed_loop_top_k is 0; set closed_loop_top_k=32"
-            )
         if self.gradient_accumulation > self.batch_scenes:
             raise ValueError(
                 f"gradient_accumulation is {self.gradient_accumulation}, more than the "

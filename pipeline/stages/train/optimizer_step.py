@@ -141,12 +141,12 @@ class OptimizerStep:
         """Move a part to its device; simulate it for closed-loop fine-tuning."""
         here = prepared(part, self._sums.device)
         top, network = self._settings.closed_loop_top_k, self._training.network
+        if self._settings.closed_loop_population:
+            simulated = close_population_loop(network, here.batch, top, seed)
+            return IndexedBatch(simulated, None)  # Others are there than in the log.
         if not top:
             return here
-        if not self._settings.closed_loop_population:
-            return replace(here, batch=close_loop(network, here.batch, top))
-        # Other agents are there than the index of the log has.
-        return IndexedBatch(close_population_loop(network, here.batch, top, seed), None)
+        return replace(here, batch=close_loop(network, here.batch, top))
 
     def _add(self, indexed: IndexedBatch, weight: Tensor, number: int) -> list[str]:
         """Add the gradient and the sums of one part; return the names of its terms."""

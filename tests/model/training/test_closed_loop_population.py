@@ -240,7 +240,7 @@ def test_in_simulation_the_network_saw_what_it_learns_from(restless, played):
 def test_what_was_simulated_can_be_learned_from(variant, new_network, logged):
     network = new_network(variant)
     if network.cells is None:
-        with pytest.raises(ValueError, match="insertion off"):
+        with pytest.raises(ValueError, match="that has neither"):
             close_population_loop(network, logged, 3, 0)
         return
     settings = TrainSettings(label_smoothing=0.0)
@@ -256,14 +256,17 @@ def test_what_was_simulated_can_be_learned_from(variant, new_network, logged):
         assert max(float(g.abs().max()) for g in gradients) > 0
 
 
-def test_there_must_be_something_to_choose_from(network, logged):
-    with pytest.raises(ValueError, match="0 motion tokens"):
-        close_population_loop(network, logged, 0, 0)
+def test_agents_of_the_log_move_as_the_batch_has_it_if_nothing_is_chosen(restless, logged):
+    played = close_population_loop(restless, logged, 0, 3)
 
-
-def test_settings_without_simulated_scenes_are_refused():
-    with pytest.raises(ValueError, match="closed_loop_top_k=32"):
-        TrainSettings(closed_loop_population=True)
+    rows = logged.agents.presence.shape[2]
+    same = played.agents.observed[..., :rows] & logged.agents.observed
+    assert same.any()
+    assert (played.agents.observed[..., :rows] & ~same).any()
+    for name in ("pose", "motion_token"):
+        one, two = getattr(played.agents, name)[:, :, :rows], getattr(logged.agents, name)
+        moved = same & (played.agents.label[..., :rows] >= 0)
+        assert torch.equal(one[moved], two[moved]), name
 
 
 def test_choices_have_their_probabilities():
