@@ -7,7 +7,7 @@ imports it from there.
 from infgen.metrics.settings import ReferenceSettings as ReferenceSettings
 from infgen.metrics.settings import ScoreSettings as ScoreSettings
 from infgen.model.settings import ModelSettings as ModelSettings
-from infgen.model.training.settings import TrainSettings as TrainSettings
+from infgen.model.training_settings import TrainSettings as TrainSettings
 from infgen.rollout.calibration_settings import CalibrateSettings as CalibrateSettings
 from infgen.rollout.settings import RolloutSettings as RolloutSettings
 from infgen.sources.settings import IngestSettings as IngestSettings

@@ -35,7 +35,7 @@ from infgen.model.batching.padding import Arrays, pad
 from infgen.model.batching.perturbation import Perturbation, perturb_map
 from infgen.model.batching.tensors import map_tensors
 from infgen.model.settings import ModelSettings
-from infgen.model.training.settings import TrainSettings
+from infgen.model.training_settings import TrainSettings
 from infgen.tokens.grid import make_grid
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 from infgen.tokens.settings import TokenSettings

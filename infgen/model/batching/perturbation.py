@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int8, Int16, Int64
 
-from infgen.model.training.settings import TrainSettings
+from infgen.model.training_settings import TrainSettings
 from infgen.tokens.motion_tokens import (
     MatchTable,
     advance,

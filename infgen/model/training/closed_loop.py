@@ -17,16 +17,16 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Agents, Batch, Details, Insertions
 from infgen.model.batching.insertion_targets import describe
-from infgen.model.nearest_tokens import (
+from infgen.model.network import EGO, Network
+from infgen.model.stepping import Stepper
+from infgen.model.token_step import TokenStep
+from infgen.model.training.nearest_tokens import (
     MotionTokenEnds,
     nearest,
     nearest_of,
     to_local,
     to_world,
 )
-from infgen.model.network import EGO, Network
-from infgen.model.stepping import Stepper
-from infgen.model.token_step import TokenStep
 from infgen.tokens.grid import Grid, encode_cell, to_grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence
 

@@ -33,7 +33,6 @@ from infgen.model.batching.batch import UNKNOWN, Agents, Batch
 from infgen.model.batching.padding import NOBODY
 from infgen.model.batching.tensors import map_tensors
 from infgen.model.long_memory import count_around
-from infgen.model.nearest_tokens import MotionTokenEnds, to_world
 from infgen.model.network import EGO, Network
 from infgen.model.relations import Rows
 from infgen.model.step_memory import Insertions as StepInsertions
@@ -41,6 +40,7 @@ from infgen.model.step_memory import StepMemory
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import TokenStep
 from infgen.model.training.closed_loop import move_near_log, token_step_at
+from infgen.model.training.nearest_tokens import MotionTokenEnds, to_world
 from infgen.model.training.own_choices import (
     InsertedAgent,
     UniformNumbers,

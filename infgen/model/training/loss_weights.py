@@ -9,7 +9,7 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Batch
 from infgen.model.training.losses import motion_mask, pattern_mask, stay_mask
-from infgen.model.training.settings import TrainSettings
+from infgen.model.training_settings import TrainSettings
 from infgen.tokens.scene_tokens import Presence
 
 TERMS = (

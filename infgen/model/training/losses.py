@@ -23,7 +23,7 @@ from infgen.model.logits import (
 from infgen.model.neighbours import grid_place
 from infgen.model.network import EGO
 from infgen.model.relations import Rows, wrap_angle
-from infgen.model.training.settings import TrainSettings
+from infgen.model.training_settings import TrainSettings
 from infgen.tokens.scene_tokens import Presence
 
 

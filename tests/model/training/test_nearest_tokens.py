@@ -7,7 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from infgen import geometry
-from infgen.model.nearest_tokens import (
+from infgen.model.training.nearest_tokens import (
     MotionTokenEnds,
     nearest,
     nearest_of,
