@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable, Sequence
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -225,18 +226,24 @@ def show_official(found: "Official", *, per_scene: bool) -> None:
     """Print the official scores' means, each scene if asked, and what was refused."""
     if found.scores:
         title = f"{found.metric}, mean over {len(found.scores)} scenes"
-        rows = [(name, f"{value:.5f}") for name, value in found.mean().items()]
+        rows = [(name, _official(value)) for name, value in found.mean().items()]
         show_table(title, ("score", "mean"), rows)
     scenes = list(found.scores.values()) if per_scene else []
     for first in range(0, len(scenes), SCENES_PER_TABLE):
         some = scenes[first : first + SCENES_PER_TABLE]
         numbers = [one.numbers() for one in some]
         columns = ("score", *(one.scenario_id for one in some))
-        cells = [(name, *(f"{n[name]:.5f}" for n in numbers)) for name in numbers[0]]
+        cells = [(name, *(_official(n[name]) for n in numbers)) for name in numbers[0]]
         title = f"scenes {first + 1} to {first + len(some)} of {len(scenes)}"
         show_table(title, columns, cells)
     for name, reason in found.refused:
         _warn(f"refused: {name}: {reason}")
+
+
+def _official(value: float) -> str:
+    from infgen.views.tables import NOT_MEASURED  # noqa: PLC0415
+
+    return NOT_MEASURED if isnan(value) else f"{value:.5f}"
 
 
 def _warn(line: str) -> None:
