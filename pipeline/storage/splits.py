@@ -13,7 +13,9 @@ from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import FinishedUnit
 from pipeline.storage.duplicates import unique_rows
 
-_GROUP = re.compile(r"([^.]+)\.(?!tfrecord)[a-z0-9]+-\d{5}-of-\d{5}(?:-|$)")
+_GROUP = re.compile(r"([^.]+)\.(?!tfrecord)([a-z0-9]+)-\d{5}-of-\d{5}(?:-|$)")
+TFRECORD = "tfrecord"
+"""Source of what is no group of scene files."""
 
 
 def group_name(split: str, source: str, number: int, count: int) -> str:
@@ -38,6 +40,12 @@ def split_of(name: str) -> str:
     half = len(words) // 2
     doubled = len(words) % 2 == 0 and words[:half] == words[half:]
     return "_".join(words[:half]) if doubled else folder
+
+
+def source_of(name: str) -> str:
+    """Return the source of a file: that of a group of scene files, or ``tfrecord``."""
+    match = _GROUP.match(name)
+    return match[2] if match else TFRECORD
 
 
 def in_split(name: str, split: str) -> bool:

@@ -1,4 +1,4 @@
-"""What a source does not record is not measured; it does not count as "nothing happened"."""
+"""What a source does not record is not measured: it is no proof that nothing happened."""
 
 import math
 from dataclasses import replace
@@ -115,8 +115,7 @@ def with_others(scene, rows):
 def without(given, ids):
     kept = ~np.isin(given.object_id, ids)
     cut = {
-        name: getattr(given, name)[:, kept]
-        for name in ("x_m", "y_m", "z_m", "heading_rad")
+        name: getattr(given, name)[:, kept] for name in ("x_m", "y_m", "z_m", "heading_rad")
     }
     return replace(given, object_id=given.object_id[kept], **cut)
 

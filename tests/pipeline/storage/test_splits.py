@@ -4,7 +4,14 @@ import pytest
 
 from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import FinishedUnit
-from pipeline.storage.splits import files_of_split, in_split, split_of, spread_evenly
+from pipeline.storage.splits import (
+    files_of_split,
+    group_name,
+    in_split,
+    source_of,
+    split_of,
+    spread_evenly,
+)
 
 
 @pytest.mark.parametrize(
@@ -24,6 +31,12 @@ from pipeline.storage.splits import files_of_split, in_split, split_of, spread_e
 )
 def test_the_split_is_in_the_name(name, split):
     assert split_of(name) == split
+
+
+def test_the_source_is_in_the_name():
+    assert source_of(group_name("training", "argoverse2", 3, 16)) == "argoverse2"
+    assert source_of("training.tfrecord-00000-of-01000") == "tfrecord"
+    assert source_of("validation.tfrecord") == "tfrecord"
 
 
 def test_a_file_is_of_its_own_split_only():
