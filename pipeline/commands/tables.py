@@ -29,7 +29,7 @@ SCENES_PER_TABLE = 5
 SCORES = "table.json"
 """In the report's folder: ``{"columns": [...], "rows": [[...]]}``."""
 _AT_ONCE = ("claims", "against-the-logs")
-"""Tables of a comparison that are printed; all are in its folder."""
+"""Tables of a comparison that are printed, of each split; all are in its folder."""
 
 
 def show_statuses(found: Sequence[StageStatus]) -> None:
@@ -151,9 +151,9 @@ def show_runs(ran: "Sequence[ExecutedRun]", shown: Path | None, log: Path) -> No
     if shown is None:
         return
     told = read_json(shown / SHOWN)
-    for name in _AT_ONCE:
-        if name in told:
-            show_table(told[name]["title"], told[name]["columns"], told[name]["rows"])
+    for name, table in told.items():
+        if name.startswith(_AT_ONCE):
+            show_table(table["title"], table["columns"], table["rows"])
     console().print(f"comparison: {shown / PAGE}", soft_wrap=True)
 
 

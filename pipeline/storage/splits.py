@@ -5,6 +5,7 @@ Groups of scene files are named alike: ``training.argoverse2-00000-of-00004``.
 
 import re
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from itertools import accumulate, pairwise
 
 import numpy as np
@@ -49,8 +50,15 @@ def source_of(name: str) -> str:
 
 
 def in_split(name: str, split: str) -> bool:
-    """Whether a file belongs to a split."""
-    return split_of(name) == split
+    """Whether a file belongs to a split, or to the part of it that one source has.
+
+    Args:
+        name: Of the file, or of a group of scene files.
+        split: ``validation``; ``validation.argoverse2`` for one source's part; or a
+            pattern of either, as ``*_20s``.
+    """
+    whole = split_of(name)
+    return any(fnmatchcase(each, split) for each in (whole, f"{whole}.{source_of(name)}"))
 
 
 def files_of_split(

@@ -46,6 +46,18 @@ def test_a_file_is_of_its_own_split_only():
     assert not in_split(name, "training")
 
 
+def test_a_split_of_one_source_and_a_pattern_are_parts_of_all():
+    group, record = "validation.argoverse2-00000-of-00004", "validation.tfrecord-0"
+
+    assert in_split(group, "validation")
+    assert in_split(group, "validation.argoverse2")
+    assert not in_split(record, "validation.argoverse2")
+    assert in_split(record, "validation.tfrecord")
+    for name in ("training_20s.tfrecord-00000-of-01000", "long_20s.tfrecord"):
+        assert in_split(name, "*_20s")
+    assert not in_split(record, "*_20s")
+
+
 ALL = [list(range(9)), [0], [0, 1, 2, 3]]
 
 
