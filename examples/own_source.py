@@ -65,6 +65,7 @@ def read(files: SceneFiles, now: int | None) -> ReadScene:
             state=np.zeros(0, np.int8),
             stop_xyz_m=np.zeros((0, 3), np.float32),
         ),
+        lights_recorded=False,  # Else a scene without lights would count as one.
     )
     return ReadScene(scene, "own-logs", annotation_hz=10.0)
 

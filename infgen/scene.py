@@ -236,6 +236,8 @@ class Scene:
         ego: Row of the recording car (WOMD's ``sdc_track_index``).
         predict_row: Rows of the tracks to predict, and ``predict_difficulty`` of each.
         interest_id: Track ids of the objects of interest.
+        lights_recorded: Whether the log says where traffic lights are. If not, that it has
+            no signals says nothing, and scores that need them are not measured.
     """
 
     scenario_id: str
@@ -249,6 +251,7 @@ class Scene:
     tracks: Tracks
     road_map: RoadMap
     signals: Signals
+    lights_recorded: bool = True
 
     def __post_init__(self) -> None:
         """Refuse a scene with rows or steps out of range.

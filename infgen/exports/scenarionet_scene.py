@@ -23,7 +23,7 @@ from infgen.exports.scenarionet import (
     object_metadata,
 )
 from infgen.scene import FeatureType, Scene, Signals
-from infgen.sources.scenarionet import ORIGIN
+from infgen.sources.scenarionet import LIGHTS_RECORDED, ORIGIN
 from infgen.sources.scenarionet.pickles import pickled
 from infgen.sources.scenarionet.signals import RANK, STOP_POINTS
 
@@ -91,6 +91,7 @@ def _metadata(scene: Scene, split: str) -> dict[str, Any]:
             for row, level in wanted
         },
         ORIGIN: scene.origin_xyz_m,
+        **({} if scene.lights_recorded else {LIGHTS_RECORDED: False}),
     }
 
 

@@ -1,8 +1,9 @@
 """Settings of stage ``train``: how the network learns."""
 
+import re
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from infgen.settings import (
@@ -19,6 +20,17 @@ from infgen.settings import (
     Text,
 )
 
+_SHARE = r"[a-z0-9]+:\d+(\.\d+)?"
+
+
+def _shares(value: str) -> str:
+    if value and not re.fullmatch(rf"{_SHARE}(, ?{_SHARE})*", value):
+        raise ValueError("expected sources and shares, as tfrecord:2,argoverse2:1")
+    return value
+
+
+SourceShares = Annotated[str, AfterValidator(_shares)]
+
 
 @dataclass(frozen=True, slots=True, config=RULES)
 class TrainSettings:
@@ -31,6 +43,9 @@ class TrainSettings:
     """Split to learn from (start of the file name)."""
     validation_split: str = "validation"
     """Split of the validation loss."""
+    source_share: SourceShares = ""
+    """Shares of sources among the scenes of training, as `tfrecord:2,argoverse2:1`; empty
+    for every scene as often as any other."""
     steps: Count = 100_000
     """Optimizer steps."""
     batch_scenes: AtLeastOne = 16

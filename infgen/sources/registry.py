@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from infgen.sources import argoverse2, scenarionet
+from infgen.sources.remote_files import fetched
 from infgen.sources.scene_files import (
     Label,
     ReadScene,
@@ -28,11 +29,11 @@ RECORDS = ".tfrecord"
 
 
 class FoundScene(NamedTuple):
-    """A scene on disk, not yet read.
+    """A scene on disk or at a URL, not yet read.
 
     Attributes:
         source: Name of its source.
-        files: Its files.
+        files: Its files; those at URLs are copied here whenever it is read.
     """
 
     source: str
@@ -41,7 +42,8 @@ class FoundScene(NamedTuple):
     @property
     def label(self) -> Label:
         """Split and id."""
-        return SOURCES[self.source].label(self.files)
+        with fetched(self.files) as files:
+            return SOURCES[self.source].label(files)
 
     def read(self, now: int | None = None) -> ReadScene:
         """Read it.
@@ -50,7 +52,8 @@ class FoundScene(NamedTuple):
             RecordError: naming why it is no scene that can be used.
             OSError: if a file cannot be read.
         """
-        return SOURCES[self.source].read(self.files, now)
+        with fetched(self.files) as files:
+            return SOURCES[self.source].read(files, now)
 
 
 def find_below(folder: str) -> Iterator[FoundScene]:

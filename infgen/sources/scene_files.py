@@ -37,7 +37,8 @@ class SceneFiles:
 
     Attributes:
         name: Of the scene in messages and tables: its folder or file, and the one above.
-        paths: Local files, in the order in which the source lists them.
+        paths: Local files (URLs where they are found, not read), in the order in which the
+            source lists them.
     """
 
     name: str

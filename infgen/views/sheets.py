@@ -7,7 +7,7 @@ interval has columns of its own.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from infgen.views.tables import Cell, Table, words
+from infgen.views.tables import NOT_MEASURED, Cell, Table, words
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,9 @@ class Measured:
     @property
     def words(self) -> str:
         """It as people read it."""
-        if self.mean is None or self.low is None or self.high is None:
+        if self.mean is None:
+            return NOT_MEASURED
+        if self.low is None or self.high is None:
             return words(self.mean)
         return f"{words(self.mean)} ± {words((self.high - self.low) / 2)}"
 

@@ -95,6 +95,10 @@ def is_text(cell: Cell) -> bool:
     return isinstance(cell, str) and any(sign.isalpha() for sign in cell)
 
 
+NOT_MEASURED = "not measured"
+"""What people read in place of a score that needs what the data set lacks."""
+
+
 def words(cell: Cell) -> str:
     """Write a cell for people."""
     if cell is None:

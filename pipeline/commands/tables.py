@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable, Sequence
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,7 +29,7 @@ SCENES_PER_TABLE = 5
 SCORES = "table.json"
 """In the report's folder: ``{"columns": [...], "rows": [[...]]}``."""
 _AT_ONCE = ("claims", "against-the-logs")
-"""Tables of a comparison that are printed; all are in its folder."""
+"""Tables of a comparison that are printed, of each split; all are in its folder."""
 
 
 def show_statuses(found: Sequence[StageStatus]) -> None:
@@ -150,9 +151,9 @@ def show_runs(ran: "Sequence[ExecutedRun]", shown: Path | None, log: Path) -> No
     if shown is None:
         return
     told = read_json(shown / SHOWN)
-    for name in _AT_ONCE:
-        if name in told:
-            show_table(told[name]["title"], told[name]["columns"], told[name]["rows"])
+    for name, table in told.items():
+        if name.startswith(_AT_ONCE):
+            show_table(table["title"], table["columns"], table["rows"])
     console().print(f"comparison: {shown / PAGE}", soft_wrap=True)
 
 
@@ -225,18 +226,24 @@ def show_official(found: "Official", *, per_scene: bool) -> None:
     """Print the official scores' means, each scene if asked, and what was refused."""
     if found.scores:
         title = f"{found.metric}, mean over {len(found.scores)} scenes"
-        rows = [(name, f"{value:.5f}") for name, value in found.mean().items()]
+        rows = [(name, _official(value)) for name, value in found.mean().items()]
         show_table(title, ("score", "mean"), rows)
     scenes = list(found.scores.values()) if per_scene else []
     for first in range(0, len(scenes), SCENES_PER_TABLE):
         some = scenes[first : first + SCENES_PER_TABLE]
         numbers = [one.numbers() for one in some]
         columns = ("score", *(one.scenario_id for one in some))
-        cells = [(name, *(f"{n[name]:.5f}" for n in numbers)) for name in numbers[0]]
+        cells = [(name, *(_official(n[name]) for n in numbers)) for name in numbers[0]]
         title = f"scenes {first + 1} to {first + len(some)} of {len(scenes)}"
         show_table(title, columns, cells)
     for name, reason in found.refused:
         _warn(f"refused: {name}: {reason}")
+
+
+def _official(value: float) -> str:
+    from infgen.views.tables import NOT_MEASURED  # noqa: PLC0415
+
+    return NOT_MEASURED if isnan(value) else f"{value:.5f}"
 
 
 def _warn(line: str) -> None:

@@ -24,14 +24,22 @@ _TRAFFIC = (
 
 def charts(found: ComparisonResult) -> list[Chart]:
     """Draw the count errors, the traffic, and each bucket's score, window by window."""
+    return [
+        chart
+        for split, part in found.by_split.items()
+        for chart in _charts(part, f" ({split})" if split else "")
+    ]
+
+
+def _charts(found: ComparisonResult, where: str) -> list[Chart]:
     ace = f"ace/{found.preset.count_error}_near"
-    drawn = [_chart(found, ace, "Agent count error (ACE)", "agents", logs=False)]
+    drawn = [_chart(found, ace, f"Agent count error (ACE){where}", "agents", logs=False)]
     drawn += [
-        _chart(found, name, title, unit, factor=factor)
+        _chart(found, name, f"{title}{where}", unit, factor=factor)
         for name, title, unit, factor in _TRAFFIC
     ]
     drawn += [
-        _chart(found, f"{protocol}/{name}", f"{label} ({protocol})", "likelihood")
+        _chart(found, f"{protocol}/{name}", f"{label} ({protocol}){where}", "likelihood")
         for protocol in PROTOCOLS
         for name, label in {"composite": "composite", **BUCKETS}.items()
     ]
@@ -43,12 +51,14 @@ def curve_sheet(found: ComparisonResult) -> Sheet:
     names = [f"ace/{found.preset.count_error}_near", *[name for name, *_ in _TRAFFIC]]
     names += [f"{each}/{name}" for each in PROTOCOLS for name in ("composite", *BUCKETS)]
     rows: list[list[str | float | None]] = []
-    for name in names:
-        lines = _lines(found, name)
-        logged = _logged(found, name)
-        for line in [*lines, *([] if logged is None else [logged])]:
-            for x, y in zip(line.x.tolist(), line.y.tolist(), strict=True):
-                rows.append([line.name, name, x, None if np.isnan(y) else y])
+    for split, part in found.by_split.items():
+        where = f", {split}" if split else ""
+        for name in names:
+            logged = _logged(part, name)
+            for line in [*_lines(part, name), *([] if logged is None else [logged])]:
+                for x, y in zip(line.x.tolist(), line.y.tolist(), strict=True):
+                    value = None if np.isnan(y) else y
+                    rows.append([f"{line.name}{where}", name, x, value])
     columns = ["method", "metric", "middle of the window, s", "mean"]
     return Sheet("curves", "Curves", columns, rows)
 

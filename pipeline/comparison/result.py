@@ -1,7 +1,7 @@
 """All that a comparison found, in the words of its tables."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -27,12 +27,19 @@ class ComparisonResult:
         ran: All its runs.
         scored: Those that are whole, and played something.
         logs: Scores of the logs whose scenes were simulated.
+        parts: The same of each split, where rollout sets are of several.
     """
 
     preset: Preset
     ran: Sequence[ExecutedRun]
     scored: Sequence[Scored]
     logs: Tally
+    parts: Mapping[str, "ComparisonResult"] = field(default_factory=dict)
+
+    @property
+    def by_split(self) -> Mapping[str, "ComparisonResult"]:
+        """What is compared with each other, by split; by an empty word if it is all."""
+        return self.parts or {"": self}
 
     @cached_property
     def numbers(self) -> Numbers:
@@ -157,6 +164,20 @@ def compare(preset: Preset, ran: Sequence[ExecutedRun]) -> ComparisonResult:
     scored = [
         read_scored(each) for each in ran if each.is_whole and each.arm_run.rollout_set
     ]
+    splits = dict.fromkeys(one.measures.split for one in scored)
+    parts = {
+        split: _part(preset, ran, [one for one in scored if one.measures.split == split])
+        for split in splits
+    }
+    if len(parts) == 1:
+        return next(iter(parts.values()))
+    return replace(_part(preset, ran, []), scored=scored, parts=parts)
+
+
+def _part(
+    preset: Preset, ran: Sequence[ExecutedRun], scored: Sequence[Scored]
+) -> ComparisonResult:
+    """Gather runs whose scenes are of one split, and the logs of these scenes."""
     scenes = dict.fromkeys(scene for one in scored for scene in one.tally.means)
     logs = read_logs(scored[0].ran, list(scenes)) if scored else Tally()
     return ComparisonResult(preset, ran, scored, logs)

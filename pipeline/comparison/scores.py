@@ -1,5 +1,6 @@
 """Scores that runs of a comparison left on disk, and those of the logs they continue."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -162,7 +163,7 @@ def _tally(plan: Plan) -> Tally:
         tally.merge(read_tally(unit.path, unit.report["rollouts"]))
         for one in read_json(unit.path / WOSAC):
             scores = one.get("scores", {})
-            found = {f"{OFFICIAL}/{name}": value for name, value in scores.items()}
+            found = {f"{OFFICIAL}/{name}": _or_nan(v) for name, v in scores.items()}
             tally.means[one["scenario_id"]].update(found)
         proper = read_proper(unit.path)
         for scenario_id in proper.parts:
@@ -183,6 +184,10 @@ def _numbers(summary: Mapping[str, Any]) -> Iterator[tuple[str, Measured]]:
         yield f"{PROPER}/{name}", _measured(entry)
     for name, entry in summary[OFFICIAL]["scores"].items():
         yield f"{OFFICIAL}/{name}", _measured(entry)
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def _measured(entry: Mapping[str, float | None]) -> Measured:

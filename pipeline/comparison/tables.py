@@ -14,6 +14,7 @@ from pipeline.comparison.statistics import truth
 from pipeline.engine.layout import KEY_DIGITS
 from pipeline.settings.presets import Arm
 from pipeline.stages.report.tables import BUCKETS, COMPOSITES, PLACEMENT
+from pipeline.storage.scenes import file_name
 
 COMPOSITE, WITHOUT_PLACEMENT = COMPOSITES
 RUNS = "runs"
@@ -33,8 +34,17 @@ _COUNT_ERRORS = {
 
 
 def tables(found: ComparisonResult) -> list[Sheet]:
-    """All tables that there are numbers for."""
+    """All tables that there are numbers for, split by split."""
     drawn = [
+        _of_split(sheet, split)
+        for split, part in found.by_split.items()
+        for sheet in _compared(part)
+    ]
+    return [sheet for sheet in [*drawn, runs(found)] if sheet.rows]
+
+
+def _compared(found: ComparisonResult) -> list[Sheet]:
+    return [
         claims(found),
         short_term(found),
         long_term(found),
@@ -43,9 +53,15 @@ def tables(found: ComparisonResult) -> list[Sheet]:
         ablations(found),
         against_logs(found),
         rules(found),
-        runs(found),
     ]
-    return [sheet for sheet in drawn if sheet.rows]
+
+
+def _of_split(sheet: Sheet, split: str) -> Sheet:
+    """Name the split of a table, where there are several."""
+    if not split:
+        return sheet
+    name, title = f"{sheet.name}-{file_name(split)}", f"{sheet.title} ({split})"
+    return replace(sheet, name=name, title=title)
 
 
 def caveats(found: ComparisonResult) -> list[str]:

@@ -230,7 +230,7 @@ def _duplicates(index: "pl.DataFrame") -> "pl.DataFrame":
 
 STAGE = Stage(
     name="ingest",
-    version=2,
+    version=3,
     settings={"ingest": IngestSettings},
     plan=plan,
     work=work,

@@ -3,12 +3,12 @@
 Both come as ``Ingested``, one after the other, so that one scene is in memory at a time.
 """
 
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from infgen.scene import Scene
+from infgen.sources.remote_files import file_bytes
 from infgen.sources.tfrecord import BadRecord, Record, RecordError, iter_records
 from infgen.sources.womd import scene_or_bad_record
 from pipeline.storage.sources.scene_groups import scene_of
@@ -68,7 +68,7 @@ def _from_tfrecord(name: str, url: str) -> Iterator[Ingested]:
 
 def _from_files(number: int, part: Mapping[str, Any], now_step: int) -> Ingested:
     scene = scene_of(part)
-    size = sum(os.stat(path).st_size for path in scene.files.paths)
+    size = sum(map(file_bytes, scene.files.paths))
     try:
         read = scene.read(now_step or None)
     except RecordError as error:

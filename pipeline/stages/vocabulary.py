@@ -4,7 +4,7 @@ A unit is one ingested file: a bounded sample of its moves and map pieces. Sampl
 chosen by hashes of what they are, so neither workers nor the order of files matter.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -13,7 +13,12 @@ import numpy as np
 
 from infgen.config import TokenSettings, VocabSettings
 from infgen.scene import Scene
-from infgen.tokens.clustering.coverage import describe_map, describe_motion, match_paths
+from infgen.tokens.clustering.coverage import (
+    describe_map,
+    describe_motion,
+    describe_source,
+    match_paths,
+)
 from infgen.tokens.clustering.map_samples import (
     NO_MAP_SAMPLES,
     MapSamples,
@@ -43,10 +48,9 @@ from pipeline.engine.stage import (
 )
 from pipeline.storage.duplicates import read_task_scenes, scenes_task
 from pipeline.storage.initial_weights import find_initial_weights
-from pipeline.storage.splits import in_split, split_of
+from pipeline.storage.splits import in_split, source_of, split_of
 
 if TYPE_CHECKING:
-    from infgen.views.tables import Table
     from pipeline.storage.columns import PackedRecords
 
 T = TypeVar("T")
@@ -199,10 +203,15 @@ def finish(
             roads, road_origin, validation_split.curves.curve_m, learn.curves.curve_m
         ),
     }
+    report["sources"] = _by_source(units, books, settings)
     # Matplotlib takes longer to load than a cached run lasts.
     from infgen.views.charts.canvas import write_pdf  # noqa: PLC0415
     from infgen.views.charts.vocabularies import vocabulary_charts  # noqa: PLC0415
     from infgen.views.page import render  # noqa: PLC0415
+    from pipeline.stages.vocabulary_tables import (  # noqa: PLC0415
+        figures_table,
+        sources_table,
+    )
     from pipeline.storage.zarr_store import write_file, write_json  # noqa: PLC0415
 
     write_json(target / "report.json", report)
@@ -211,8 +220,9 @@ def finish(
         "vocabularies.html",
         title="Vocabularies",
         report=report,
-        motion_table=_figures_table("Motion tokens", report["motion"]),
-        map_table=_figures_table("Map tokens", {"map tokens": report["roads"]}),
+        motion_table=figures_table("Motion tokens", report["motion"]),
+        map_table=figures_table("Map tokens", {"map tokens": report["roads"]}),
+        sources_table=sources_table(report["sources"]),
         motion_charts=motion_charts,
         map_chart=map_chart,
     )
@@ -221,25 +231,21 @@ def finish(
     return _headline(report)
 
 
-def _figures_table(title: str, columns: Mapping[str, Mapping[str, Any]]) -> "Table":
-    """Lay figures out: one row each, one column per vocabulary."""
-    from infgen.views.tables import Table  # noqa: PLC0415
-
-    names = next(iter(columns.values()))
-    rows = [
-        [name.replace("_", " "), *(_cell(column[name]) for column in columns.values())]
-        for name in names
-    ]
-    return Table(title, ["", *columns], rows)
-
-
-def _cell(figure: Any) -> Any:
-    """A figure for a table; several become one line with their names."""
-    if figure is None:
-        return "nothing to measure"
-    if isinstance(figure, Mapping):
-        return ", ".join(f"{name} {value:g}" for name, value in figure.items())
-    return figure
+def _by_source(
+    units: Sequence[FinishedUnit], books: "_Books", settings: VocabSettings
+) -> dict[str, dict[str, Any]]:
+    """Measure how the vocabularies fit each source: its held-out scenes if it has any."""
+    found = {}
+    for source in sorted({source_of(done.name) for done in units}):
+        own = [done for done in units if source_of(done.name) == source]
+        scenes = {side: sum(done.report[side] for done in own) for side in _SIDES}
+        side = HELD_OUT if scenes[HELD_OUT] else LEARN
+        gathered = _gather(own, side, settings)
+        matches = match_paths(gathered.paths, books.motion)
+        tokens = describe_source(matches, books.roads, gathered.curves.curve_m)
+        held_out = side == HELD_OUT
+        found[source] = {"scenes": scenes[side], "held_out": held_out, "tokens": tokens}
+    return found
 
 
 def _clustered(learn: _Gathered, settings: VocabSettings, progress: Progress) -> _Books:
@@ -372,7 +378,7 @@ def _read(path: Path, kind: type[T], schema: str) -> "PackedRecords[T]":
 
 STAGE = Stage(
     name="build-vocab",
-    version=1,
+    version=2,
     settings={"build-vocab": VocabSettings},
     plan=plan,
     work=work,
@@ -381,5 +387,6 @@ STAGE = Stage(
     modules=(
         "pipeline.storage.duplicates",
         "pipeline.stages.vocabulary",
+        "pipeline.stages.vocabulary_tables",
     ),
 )

@@ -60,6 +60,7 @@ class Column(NamedTuple):
 
 
 _SCALARS: dict[Any, np.dtype] = {
+    bool: np.dtype("uint8"),
     int: np.dtype("int64"),
     float: np.dtype("float64"),
     str: np.dtype("uint8"),

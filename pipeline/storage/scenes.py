@@ -7,7 +7,7 @@ from pathlib import Path
 from infgen.alignment import align_to_tokens
 from infgen.scene import Scene
 
-SCENES_SCHEMA = "infgen.scenes/2"
+SCENES_SCHEMA = "infgen.scenes/3"
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 
 

@@ -5,6 +5,7 @@ Groups of scene files are named alike: ``training.argoverse2-00000-of-00004``.
 
 import re
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from itertools import accumulate, pairwise
 
 import numpy as np
@@ -13,7 +14,9 @@ from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import FinishedUnit
 from pipeline.storage.duplicates import unique_rows
 
-_GROUP = re.compile(r"([^.]+)\.(?!tfrecord)[a-z0-9]+-\d{5}-of-\d{5}(?:-|$)")
+_GROUP = re.compile(r"([^.]+)\.(?!tfrecord)([a-z0-9]+)-\d{5}-of-\d{5}(?:-|$)")
+TFRECORD = "tfrecord"
+"""Source of what is no group of scene files."""
 
 
 def group_name(split: str, source: str, number: int, count: int) -> str:
@@ -40,9 +43,22 @@ def split_of(name: str) -> str:
     return "_".join(words[:half]) if doubled else folder
 
 
+def source_of(name: str) -> str:
+    """Return the source of a file: that of a group of scene files, or ``tfrecord``."""
+    match = _GROUP.match(name)
+    return match[2] if match else TFRECORD
+
+
 def in_split(name: str, split: str) -> bool:
-    """Whether a file belongs to a split."""
-    return split_of(name) == split
+    """Whether a file belongs to a split, or to the part of it that one source has.
+
+    Args:
+        name: Of the file, or of a group of scene files.
+        split: ``validation``; ``validation.argoverse2`` for one source's part; or a
+            pattern of either, as ``*_20s``.
+    """
+    whole = split_of(name)
+    return any(fnmatchcase(each, split) for each in (whole, f"{whole}.{source_of(name)}"))
 
 
 def files_of_split(

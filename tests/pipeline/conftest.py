@@ -177,6 +177,7 @@ def train_unit(shards):
     """The unit of work of stage ``train`` on these shards."""
     task = {
         "scenes": [str(shards / "training")],
+        "sources": ["tfrecord"],
         "validation_split": [str(shards / "validation")],
         "vocabularies": str(shards / "vocab"),
     }

@@ -17,7 +17,7 @@ def test_people_read_half_of_the_interval_behind_a_number(sheet):
     assert Measured(12.3456, 10.0, 14.0).words == "12.35 ± 2.0000"
     assert sheet.for_people().rows == [
         ["one", "0.5000 ± 0.1500", 3, None],
-        ["two", "0.2500", None, "-"],
+        ["two", "0.2500", None, "not measured"],
     ]
 
 

@@ -54,10 +54,14 @@ def read_outcomes(
     away_m = np.hypot(x_m - x_m[traffic.ego], y_m - y_m[traffic.ego])
     rows = np.flatnonzero(traffic.there_now & (away_m < radius_m))
     rows = rows[np.argsort(ids[rows], kind="stable")]
-    bins = binned.bins[PROTOCOLS.index(CORRECTED)][:, rows, :num_steps]
+    every = binned.bins[PROTOCOLS.index(CORRECTED)]
+    # A map feature without a map has no outcomes, not even that agents are gone.
+    measured = (every != NO_BIN).any(axis=(1, 2))[:, None, None]
+    bins = every[:, rows, :num_steps]
     first = traffic.now + 1
     seen = traffic.motion.valid[0, rows, first : first + num_steps]
-    outcome = np.where(_gone(seen) & (bins == NO_BIN), np.uint8(GONE), bins)
+    gone = _gone(seen) & (bins == NO_BIN) & measured
+    outcome = np.where(gone, np.uint8(GONE), bins)
     return Outcomes(ids[rows], outcome)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -13,7 +14,11 @@ from infgen.metrics.road import road_edge_m
 from infgen.metrics.wosac.logged import LoggedScene
 from infgen.metrics.wosac.signals import build_stop_lines, runs_red_light
 from infgen.scene import AgentType
-from infgen.spatial.road_edges import build_road_edges
+from infgen.spatial.road_edges import RoadError, build_road_edges
+
+LIGHTS = "traffic_light_violation"
+NEED_EDGES = ("distance_to_road_edge", "offroad_indication")
+"""Features that are not measured without road edges."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +37,8 @@ class Features:
         average_displacement_error: Mean distance to the log over its observed steps.
         valid: Whether the object is there at a scored step.
         vehicle: Whether the object is a vehicle.
+        not_measured: Names of features, events among them, that the log does not tell:
+            values without meaning.
     """
 
     linear_speed: Float32[np.ndarray, "rollout object step"]
@@ -45,6 +52,7 @@ class Features:
     average_displacement_error: Float32[np.ndarray, "rollout object"]
     valid: Bool[np.ndarray, "rollout object step"]
     vehicle: Bool[np.ndarray, " object"]
+    not_measured: frozenset[str] = frozenset()
 
     @property
     def collision_indication(self) -> Bool[np.ndarray, "rollout object step"]:
@@ -60,18 +68,21 @@ class Features:
 def measure(
     log: LoggedScene, motion: Motion, evaluated: np.ndarray, steps: slice
 ) -> Features:
-    """Measure evaluated objects at some steps of 91; steps around them take part.
-
-    Raises:
-        RoadError: if the map has no road edge.
-    """
+    """Measure evaluated objects at some steps of 91; steps around them take part."""
     kinematics = measure_kinematics(
         motion.x_m[:, evaluated],
         motion.y_m[:, evaluated],
         motion.z_m[:, evaluated],
         motion.heading_rad[:, evaluated],
     )
-    edges = build_road_edges(log.edges())
+    edge_m = _road_edge_m(log, motion, evaluated, steps)
+    not_measured = [
+        *(() if log.lights_recorded else (LIGHTS,)),
+        *(() if edge_m is not None else NEED_EDGES),
+    ]
+    if edge_m is None:
+        shape = motion.valid[:, evaluated, steps].shape
+        edge_m = np.full(shape, np.nan, dtype=np.float32)
     return Features(
         linear_speed=kinematics.speed_mps[..., steps],
         linear_acceleration=kinematics.accel_mps2[..., steps],
@@ -79,19 +90,34 @@ def measure(
         angular_acceleration=kinematics.yaw_accel_rad_s2[..., steps],
         distance_to_nearest_object=nearest_object_m(motion, evaluated, steps),
         time_to_collision=time_to_collision_s(motion, evaluated, steps),
-        distance_to_road_edge=road_edge_m(motion, evaluated, steps, edges),
+        distance_to_road_edge=edge_m,
         traffic_light_violation=_red_lights(log, motion, evaluated)[..., steps],
         average_displacement_error=_displacement_m(log.motion, motion, evaluated),
         valid=motion.valid[:, evaluated, steps],
         vehicle=motion.agent_type[evaluated] == AgentType.VEHICLE,
+        not_measured=frozenset(not_measured),
     )
 
 
 def concatenate(parts: Sequence[Features]) -> Features:
     """Join features of the same objects, rollout after rollout."""
-    names = [field.name for field in fields(Features) if field.name != "vehicle"]
-    joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
-    return Features(**joined, vehicle=parts[0].vehicle)
+    shared = {name: getattr(parts[0], name) for name in ("vehicle", "not_measured")}
+    names = [field.name for field in fields(Features) if field.name not in shared]
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in names
+    }
+    return Features(**joined, **shared)
+
+
+def _road_edge_m(
+    log: LoggedScene, motion: Motion, evaluated: np.ndarray, steps: slice
+) -> Float32[np.ndarray, "rollout object step"] | None:
+    """Distance to the nearest road edge; None where the map has none."""
+    try:
+        edges = build_road_edges(log.edges())
+    except RoadError:
+        return None
+    return road_edge_m(motion, evaluated, steps, edges)
 
 
 def _red_lights(

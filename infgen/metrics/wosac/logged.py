@@ -5,19 +5,33 @@ coordinates, where a float32 holds about half a millimetre, raw values of unobse
 included.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int32, Int64
 
 from infgen.metrics.motion import Motion
-from infgen.scene import FeatureType, LaneType, Scene, world_xyz_m
+from infgen.metrics.wosac.evaluated import choose_evaluated
+from infgen.scene import AgentType, FeatureType, LaneType, Scene, world_xyz_m
 
 HISTORY_STEPS = 11
 """Steps up to and with now."""
 FUTURE_STEPS = 80
 LOG_STEPS = HISTORY_STEPS + FUTURE_STEPS
 NOW = HISTORY_STEPS - 1
+
+
+_OF_AGENTS = (
+    "id",
+    "agent_type",
+    "x_m",
+    "y_m",
+    "z_m",
+    "heading_rad",
+    "size_lwh_m",
+    "valid",
+)
+"""What of a log has a row per agent."""
 
 
 class LogError(ValueError):
@@ -41,7 +55,7 @@ class LoggedScene:
         size_lwh_m: Boxes now.
         valid: Whether the agent was observed at that step.
         ego: Row of the recording car.
-        predict_row: Rows of the tracks to predict.
+        predict_row: Rows of the tracks to predict; chosen where the record names none.
         edge_offsets: First point of each road edge, and the number of points.
         edge_m: Points of all road edges.
         lane_id: Ids of the surface-street lanes.
@@ -50,6 +64,7 @@ class LoggedScene:
         signal_lane_id: Lane of each signal.
         signal_state: ``SignalState``; 0 where the log has none.
         signal_stop_m: Stop points; zero where the log has none.
+        lights_recorded: As in ``Scene``.
     """
 
     scenario_id: str
@@ -71,6 +86,7 @@ class LoggedScene:
     signal_lane_id: Int64[np.ndarray, " signal"]
     signal_state: Int8[np.ndarray, "signal 91"]
     signal_stop_m: Float32[np.ndarray, "signal 91 2"]
+    lights_recorded: bool = True
 
     @property
     def sim_rows(self) -> Int64[np.ndarray, " sim"]:
@@ -109,6 +125,25 @@ class LoggedScene:
             valid=self.valid[None, rows],
         )
 
+    @property
+    def others(self) -> Bool[np.ndarray, " agent"]:
+        """Which agents are neither vehicles, pedestrians nor cyclists."""
+        return (self.agent_type < 0) | (self.agent_type >= AgentType.OTHER)
+
+    def road_users_only(self) -> "LoggedScene":
+        """Return the log without agents of type "other"; the recording car stays."""
+        kept = ~self.others
+        kept[self.ego] = True
+        rows, place = np.flatnonzero(kept), np.cumsum(kept) - 1
+        cut = {name: getattr(self, name)[rows] for name in _OF_AGENTS}
+        predict = self.predict_row[kept[self.predict_row]]
+        return replace(
+            self,
+            ego=int(place[self.ego]),
+            predict_row=place[predict].astype(np.int32),
+            **cut,
+        )
+
     def edges(self) -> list[Float32[np.ndarray, "_ 3"]]:
         """Points of each road edge."""
         return np.split(self.edge_m, self.edge_offsets[1:-1])
@@ -128,7 +163,8 @@ def from_scene(scene: Scene) -> LoggedScene:
     if scene.now != NOW or tracks.num_steps < LOG_STEPS:
         raise LogError(
             f"scene {scene.scenario_id} has {tracks.num_steps} steps with now at "
-            f"{scene.now}; expected at least {LOG_STEPS} with now at {NOW}"
+            f"{scene.now}; expected at least {LOG_STEPS} with now at {NOW}, where "
+            f"ingest.now_step={NOW} sets it in scene files"
         )
     xyz_m = world_xyz_m(scene, tracks.xyz_m[:, :LOG_STEPS])
     edges = _features(scene, scene.road_map.rows(FeatureType.ROAD_EDGE))
@@ -137,6 +173,9 @@ def from_scene(scene: Scene) -> LoggedScene:
     lanes = lanes[np.diff(scene.road_map.point_offsets)[lanes] >= 2]
     lane_m, lane_offsets = _features(scene, lanes)
     lane_id, state, stop_m = _signals(scene)
+    predict = scene.predict_row
+    if not len(predict):
+        predict = choose_evaluated(tracks, scene.ego, slice(NOW, LOG_STEPS))
     return LoggedScene(
         scenario_id=scene.scenario_id,
         id=tracks.id,
@@ -148,7 +187,7 @@ def from_scene(scene: Scene) -> LoggedScene:
         size_lwh_m=tracks.size_lwh_m[:, NOW],
         valid=tracks.valid[:, :LOG_STEPS],
         ego=scene.ego,
-        predict_row=scene.predict_row,
+        predict_row=predict,
         edge_m=edges[0],
         edge_offsets=edges[1],
         lane_id=scene.road_map.feature_id[lanes],
@@ -157,6 +196,7 @@ def from_scene(scene: Scene) -> LoggedScene:
         signal_lane_id=lane_id,
         signal_state=state,
         signal_stop_m=stop_m,
+        lights_recorded=scene.lights_recorded,
     )
 
 

@@ -10,8 +10,10 @@ Example:
     0.7451
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -32,6 +34,7 @@ from infgen.metrics.wosac.rollouts import (
     from_rollouts,
     generated,
     played,
+    simulated_part,
 )
 from infgen.metrics.wosac.versions import (
     INTERACTIVE,
@@ -59,7 +62,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """Scores of one scene, under the official names.
+    """Scores of one scene, under the official names; NaN where one is not measured.
 
     Attributes:
         scenario_id: Id of the log.
@@ -96,6 +99,10 @@ class Scores:
 def score(log: LoggedScene, rollouts: Rollouts, version: str = "wosac-2025") -> Scores:
     """Score the rollouts of one scene.
 
+    What the log does not tell is not measured: red lights where its source records none,
+    and road edges where the map has none. A bucket is the mean of what is measured, if that
+    is at least half of its weight; without one of the buckets there is no metametric.
+
     Args:
         log: The scene, from ``from_scene``.
         rollouts: Its simulated futures (officially 32).
@@ -104,7 +111,6 @@ def score(log: LoggedScene, rollouts: Rollouts, version: str = "wosac-2025") -> 
     Raises:
         RolloutsError: if the rollouts do not fit the log; the message says how.
         LogError: if an evaluated agent is not observed now.
-        RoadError: if the map has no road edge.
         ValueError: if there is no such version.
     """
     return score_versions(log, rollouts, (version,))[0]
@@ -119,6 +125,7 @@ def score_versions(
         As ``score``.
     """
     tables = [_version(name) for name in versions]
+    log = simulated_part(log, rollouts)
     measured = {
         whole: measure_both(log, rollouts, whole_log=whole)
         for whole in sorted({table.whole_log for table in tables})
@@ -127,7 +134,7 @@ def score_versions(
 
 
 def mean_scores(scores: Sequence[Scores]) -> Scores:
-    """Average every score over scenes, the metametric included.
+    """Average every score over the scenes that have it, the metametric included.
 
     Raises:
         ValueError: if there is none, or versions are mixed.
@@ -136,7 +143,7 @@ def mean_scores(scores: Sequence[Scores]) -> Scores:
     if len(names) != 1:
         raise ValueError(f"cannot average scores of versions {sorted(names)}")
     numbers = [one.numbers() for one in scores]
-    means = {name: float(np.mean([n[name] for n in numbers])) for name in numbers[0]}
+    means = {name: _known_mean([n[name] for n in numbers]) for name in numbers[0]}
     return Scores(scenario_id="mean", version=names.pop(), **means)
 
 
@@ -147,10 +154,11 @@ def combine(
     likelihoods = {
         rule.feature: float(_likelihood(rule, logged, simulated)) for rule in version.rules
     }
-    # The official weights and scores are float32, summed in double.
-    weighted = {
-        rule.feature: float(np.float32(rule.weight)) * likelihoods[rule.feature]
-        for rule in version.rules
+    buckets = {
+        bucket: _weigh(
+            [rule for rule in version.rules if rule.bucket == bucket], likelihoods
+        )
+        for bucket in (KINEMATIC, INTERACTIVE, MAP_BASED)
     }
     # A generated scene has no log it should be near (the official value is 0).
     displacement_m = simulated.average_displacement_error
@@ -159,7 +167,7 @@ def combine(
     return Scores(
         scenario_id=scenario_id,
         version=version.name,
-        metametric=sum(weighted.values()),
+        metametric=_metametric(version, likelihoods, buckets),
         average_displacement_error=float(displacement_m.mean()),
         min_average_displacement_error=float(displacement_m.mean(axis=1).min()),
         simulated_collision_rate=_rate("collision_indication", logged, simulated),
@@ -169,8 +177,7 @@ def combine(
         ),
         **{f"{feature}_likelihood": value for feature, value in likelihoods.items()},
         **{
-            f"{bucket}_metrics": _bucket(bucket, weighted, version)
-            for bucket in (KINEMATIC, INTERACTIVE, MAP_BASED)
+            f"{name}_metrics": found.value / found.weight for name, found in buckets.items()
         },
     )
 
@@ -201,7 +208,9 @@ def happens(
 
 
 def _likelihood(rule: Rule, logged: Features, simulated: Features) -> np.float32:
-    """Likelihood of one feature: one mean over all values that count."""
+    """Likelihood of one feature: one mean over all values that count; NaN without any."""
+    if rule.feature in logged.not_measured:
+        return np.float32(np.nan)
     values, counts = log_likelihoods(rule, logged, simulated)
     return np.exp(values[counts].mean(dtype=np.float32))
 
@@ -219,14 +228,49 @@ def _counts(feature: str, logged: Features) -> Bool[np.ndarray, "object step"]:
 
 
 def _rate(feature: str, logged: Features, simulated: Features) -> float:
+    if feature in logged.not_measured:
+        return math.nan
     return float(happens(feature, logged, simulated).mean())
 
 
-def _bucket(bucket: str, weighted: Mapping[str, float], version: Version) -> float:
-    """Weighted mean of a bucket's likelihoods."""
-    rules = [rule for rule in version.rules if rule.bucket == bucket]
-    total = sum(float(np.float32(rule.weight)) for rule in rules)
-    return sum(weighted[rule.feature] for rule in rules) / total
+class _Sum(NamedTuple):
+    """Likelihoods of some features, weighted.
+
+    Attributes:
+        value: Their sum, each times its weight; NaN where too little is measured.
+        weight: Of those that are measured.
+        whole: Of all of them.
+    """
+
+    value: float
+    weight: float
+    whole: float
+
+
+def _weigh(rules: Sequence[Rule], likelihoods: Mapping[str, float]) -> _Sum:
+    """Add up a bucket's likelihoods; half of its weight must be measured."""
+    # The official weights and scores are float32, summed in double.
+    weights = {rule.feature: float(np.float32(rule.weight)) for rule in rules}
+    known = {name: w for name, w in weights.items() if not math.isnan(likelihoods[name])}
+    value = sum(weight * likelihoods[name] for name, weight in known.items())
+    weight, whole = sum(known.values()), sum(weights.values())
+    return _Sum(value if 2 * weight >= whole else math.nan, weight or math.nan, whole)
+
+
+def _metametric(
+    version: Version, likelihoods: Mapping[str, float], buckets: Mapping[str, _Sum]
+) -> float:
+    """Weighted mean of what is measured, in every bucket enough; NaN otherwise."""
+    if any(math.isnan(bucket.value) for bucket in buckets.values()):
+        return math.nan
+    # Exactly the official sum, whose weights are 1 but for rounding, where nothing lacks.
+    found = _weigh(version.rules, likelihoods)
+    return found.value * (found.whole / found.weight)
+
+
+def _known_mean(values: Sequence[float]) -> float:
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.mean(known)) if known else math.nan
 
 
 def _version(name: str) -> Version:

@@ -90,6 +90,17 @@ def from_rollouts(rollouts: Sequence[Rollout]) -> Rollouts:
     )
 
 
+def simulated_part(log: LoggedScene, rollouts: Rollouts) -> LoggedScene:
+    """Leave agents of type "other" out of a log if its rollouts simulate none of them.
+
+    Cones, barriers and riderless bicycles of other sources are no sim agents. No record of
+    WOMD has agents of this type, so that its scores are the official ones.
+    """
+    if np.isin(log.id[log.others], rollouts.object_id).any():
+        return log
+    return log.road_users_only()
+
+
 def played(log: LoggedScene, rollouts: Rollouts) -> Motion:
     """Put the logged history before the simulated steps; boxes keep their size of now.
 

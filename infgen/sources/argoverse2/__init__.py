@@ -146,6 +146,7 @@ def _scene(
             tracks=tracks.around(origin_xyz_m),
             road_map=built,
             signals=_no_signals(),
+            lights_recorded=False,
         )
     except SceneError as error:
         raise RecordError(f"not a usable log: {error}") from error

@@ -14,7 +14,12 @@ from jaxtyping import Float64
 from infgen.clock import CLOCK
 from infgen.scene import Scene, SceneError
 from infgen.sources.ids import integer_name
-from infgen.sources.scenarionet.datasets import convention_of, dataset_of, split_of
+from infgen.sources.scenarionet.datasets import (
+    Convention,
+    convention_of,
+    dataset_of,
+    split_of,
+)
 from infgen.sources.scenarionet.parts import (
     Part,
     integer_of,
@@ -45,6 +50,8 @@ NOW = 10
 """Last step of the history where a description does not say."""
 ORIGIN = "infgen_origin_xyz_m"
 """In the metadata of what we wrote: the scene's origin, if it is not that of a reader."""
+LIGHTS_RECORDED = "infgen_lights_recorded"
+"""In the metadata of what we wrote: False where the scene's source records no lights."""
 STEP_TOLERANCE_S = 0.02
 _PROTOCOLS = (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
 _SUMMARIES = ("dataset_summary", "dataset_mapping")
@@ -113,6 +120,7 @@ def decode(description: Part, now: int | None = None) -> ReadScene:
     rows, difficulty = _predictions(about, tracks)
     ids = lane_ids(features)
     lights = named_parts(description, "dynamic_map_states", "description")
+    signals = read_signals(lights, ids, num_steps, origin_xyz_m)
     try:
         scene = Scene(
             scenario_id=_scenario_id(description),
@@ -125,7 +133,8 @@ def decode(description: Part, now: int | None = None) -> ReadScene:
             interest_id=_interest(about, tracks),
             tracks=world.around(origin_xyz_m),
             road_map=read_road_map(features, ids, convention, origin_xyz_m),
-            signals=read_signals(lights, ids, num_steps, origin_xyz_m),
+            signals=signals,
+            lights_recorded=len(signals.step) > 0 or _records_lights(about, convention),
         )
     except SceneError as error:
         raise RecordError(f"not a usable description: {error}") from error
@@ -189,6 +198,11 @@ def _origin(about: Part, near: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, 
     if found.shape != (3,) or not (np.abs(found - near) < 1e6).all():
         raise RecordError(f"{ORIGIN} is no place near the ego")
     return found
+
+
+def _records_lights(about: Part, convention: Convention) -> bool:
+    """Whether a scene without lights has none; else its source does not record them."""
+    return convention.lights and about.get(LIGHTS_RECORDED) is not False
 
 
 def _predictions(about: Part, tracks: Mapping[str, Part]) -> tuple[np.ndarray, np.ndarray]:

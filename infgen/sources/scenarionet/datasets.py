@@ -27,6 +27,7 @@ class Convention:
         ego_sideways: Length and width of the ego are exchanged.
         exact: Every number is a ``Scene``'s own. Elsewhere headings may be unwrapped, and
             states that are not valid hold remains.
+        lights: Traffic lights are recorded, so that a scene without any has none.
     """
 
     annotation_hz: float = 10.0
@@ -36,11 +37,12 @@ class Convention:
     dense: bool = False
     ego_sideways: bool = False
     exact: bool = False
+    lights: bool = False
 
 
 CONVENTIONS: Mapping[str, Convention] = {
-    "waymo": Convention(dense=True),
-    "infgen": Convention(dense=True, exact=True),
+    "waymo": Convention(dense=True, lights=True),
+    "infgen": Convention(dense=True, exact=True, lights=True),
     "nuscenes": Convention(
         annotation_hz=2.0,
         heights=False,
@@ -49,7 +51,11 @@ CONVENTIONS: Mapping[str, Convention] = {
         ego_sideways=True,
     ),
     "nuplan": Convention(
-        annotation_hz=20.0, heights=False, boundary_is_edge=True, speed_limits=False
+        annotation_hz=20.0,
+        heights=False,
+        boundary_is_edge=True,
+        speed_limits=False,
+        lights=True,
     ),
 }
 """By ``metadata.dataset``; what is not listed is taken as it is, and made dense."""

@@ -115,7 +115,6 @@ def describe_map(
     space = MapSpace()
     chosen = nearest_map_tokens(held_out_m, vocabulary)
     used = np.union1d(chosen, nearest_map_tokens(familiar_m, vocabulary))
-    away_m = space.points_m(held_out_m) - space.points_m(vocabulary.curve_m[chosen])
     steps_m = np.diff(vocabulary.curve_m.astype(np.float64), axis=1)
     heading_rad = np.arctan2(steps_m[..., 1], steps_m[..., 0])
     turn_deg = np.degrees(np.unwrap(heading_rad, axis=1)[:, -1])
@@ -123,11 +122,53 @@ def describe_map(
         **_origins(origin),
         "dead": vocabulary.num_map_tokens - len(used),
         "held_out_pieces": len(held_out_m),
-        "held_out_error_m": _spread(np.linalg.norm(away_m, axis=-1).mean(axis=-1)),
+        "held_out_error_m": _spread(_map_error_m(held_out_m, vocabulary, chosen)),
         **_describe_shapes(space, vocabulary.curve_m, np.array([1, -1], dtype=np.float32)),
         "length_m": _range(np.linalg.norm(steps_m, axis=-1).sum(axis=-1)),
         **_turns(turn_deg),
     }
+
+
+def describe_source(
+    matches: Matches, vocabulary: MapVocabulary, curve_m: Float32[np.ndarray, "piece 11 2"]
+) -> dict[str, dict[str, Any] | None]:
+    """Describe how far tokens are from the scenes of one source.
+
+    Args:
+        matches: Of its motion tokens.
+        vocabulary: The map tokens.
+        curve_m: Pieces of its map lines.
+
+    Returns:
+        Number, mean and 95th percentile of errors, by agent type and for map tokens; None
+        where there are none.
+    """
+    chosen = nearest_map_tokens(curve_m, vocabulary)
+    by_type = {
+        AgentType(agent_type).name.lower(): matches.error_m[
+            matches.agent_type == agent_type
+        ]
+        for agent_type in range(NUM_AGENT_TYPES)
+    }
+    errors_m = {**by_type, "map": _map_error_m(curve_m, vocabulary, chosen)}
+    return {name: _error(values) for name, values in errors_m.items()}
+
+
+def _map_error_m(
+    curve_m: np.ndarray, vocabulary: MapVocabulary, chosen: np.ndarray
+) -> Float64[np.ndarray, " piece"]:
+    """Mean distance of middle and last point of each piece from those of its token."""
+    space = MapSpace()
+    away_m = space.points_m(curve_m) - space.points_m(vocabulary.curve_m[chosen])
+    return np.linalg.norm(away_m, axis=-1).mean(axis=-1).astype(np.float64)
+
+
+def _error(values: np.ndarray) -> dict[str, Any] | None:
+    if len(values) == 0:
+        return None
+    figures = {"mean": values.mean(), "p95": np.percentile(values, 95)}
+    rounded = {name: round(float(value), 5) for name, value in figures.items()}
+    return {"count": len(values), **rounded}
 
 
 def _origins(origin: np.ndarray) -> dict[str, int]:

@@ -145,8 +145,20 @@ def short_term_table(summary: Mapping[str, Any]) -> Table:
         columns=["method", "composite", "kinematic", "interactive", "map"],
         rows=rows,
         note=f"{official['scenes']} scenes scored, {skipped} could not be: the metric asks "
-        "for every agent in all eight seconds. " + CAVEAT,
+        "for every agent in all eight seconds. " + _left_out(official) + CAVEAT,
     )
+
+
+def _left_out(official: Mapping[str, Any]) -> str:
+    """Say what the metric could not measure, and in how many scenes."""
+    needs = {_RED_LIGHTS: "red lights", _OFF_ROAD: "road edges"}
+    counts = official["not_measured"]
+    told = [f"{what} in {counts[name]}" for name, what in needs.items() if name in counts]
+    return f"Not measured: {' and '.join(told)} of them. " if told else ""
+
+
+_RED_LIGHTS = "traffic_light_violation_likelihood"
+_OFF_ROAD = "offroad_indication_likelihood"
 
 
 def divergence_table(summary: Mapping[str, Any]) -> Table:
@@ -208,5 +220,6 @@ def _about(summary: Mapping[str, Any]) -> str:
         f"Means over {summary['scenes']} scenes ({summary['rollouts']} rollouts), windows "
         f"of {summary['window_s']:g} s every {summary['stride_s']:g} s; near means within "
         f"{summary['count_radius_m']:g} m of the ego. Reference: {summary['logs']} logs, "
-        "whose own scores are the ceiling to aim at. Published: by the paper."
+        "whose own scores are the ceiling to aim at. Published: by the paper. "
+        "A dash: not measured."
     )

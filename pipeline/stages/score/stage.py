@@ -7,6 +7,7 @@ A unit scores the rollouts of one rollout unit, window by window and by the offi
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import groupby
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -185,7 +186,9 @@ class _Scorer:
             found += rows_of(scenario_id, None, self.proper.numbers(scenario_id), "")
         for one in self.official:
             prefix = f"{self._settings.wosac_version}/"
-            found += rows_of(one["scenario_id"], None, one.get("scores", {}), prefix)
+            scores = one.get("scores", {})
+            measured = {k: value for k, value in scores.items() if value is not None}
+            found += rows_of(one["scenario_id"], None, measured, prefix)
         return found
 
 
@@ -239,7 +242,7 @@ def measure_rollout(
 def _score_wosac(
     scene: "Scene", rollouts: "Sequence[Rollout]", version: str
 ) -> dict[str, Any]:
-    """Official scores of one scene, or why there are none."""
+    """Official scores of one scene, null what is not measured, or why there are none."""
     from infgen.metrics.wosac import metric  # noqa: PLC0415
 
     found: dict[str, Any] = {"scenario_id": scene.scenario_id}
@@ -248,7 +251,9 @@ def _score_wosac(
         scores = metric.score(log, metric.from_rollouts(rollouts), version)
     except ValueError as error:
         return {**found, "skipped": str(error)}
-    return {**found, "scores": scores.numbers()}
+    numbers = scores.numbers()
+    plain = {name: None if isnan(value) else value for name, value in numbers.items()}
+    return {**found, "scores": plain}
 
 
 def _scenario_ids(folder: Path) -> list[str]:
@@ -288,7 +293,7 @@ def finish(
 
 STAGE = Stage(
     name="score",
-    version=4,
+    version=5,
     settings={"reference": ReferenceSettings, "score": ScoreSettings},
     plan=plan,
     work=work,

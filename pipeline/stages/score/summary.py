@@ -202,6 +202,13 @@ class Summary:
             "version": self.settings.wosac_version,
             "scenes": len(scored),
             "skipped": _some(skipped),
+            "not_measured": {
+                name: count
+                for name, count in zip(
+                    names, np.isnan(values).sum(axis=0).tolist(), strict=True
+                )
+                if count
+            },
             "scores": _entries(names, interval, None),
         }
 

@@ -37,7 +37,9 @@ class TokenScenes(Sequence[SceneTokens]):
 
     def __init__(self, units: Sequence[Path]) -> None:
         self._units = tuple(units)
-        self._groups = [group for unit in units for group in open_tokens(unit)]
+        by_shard = [open_tokens(unit) for unit in units]
+        self._groups = [group for groups in by_shard for group in groups]
+        self._shard_sizes = [sum(map(len, groups)) for groups in by_shard]
         self._ends = np.cumsum([0, *(len(group) for group in self._groups)])
 
     def __reduce__(self):  # type: ignore[no-untyped-def]
@@ -54,6 +56,11 @@ class TokenScenes(Sequence[SceneTokens]):
             raise IndexError(f"scene {row} of {len(self)}")
         group = int(np.searchsorted(self._ends, row, side="right")) - 1
         return self._groups[group][row - int(self._ends[group])]
+
+    @property
+    def shard_sizes(self) -> list[int]:
+        """Number of scenes of each shard."""
+        return self._shard_sizes
 
     def sizes(self, limits: Limits) -> Int64[np.ndarray, "scene 2"]:
         """Sizes of every scene within the limits: agents x tokens, and roads.

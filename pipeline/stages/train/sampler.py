@@ -6,6 +6,9 @@ size and padding is small. Scenes have two sizes, agents and roads, that have li
 with each other: a pool is cut into strips by the one, and within a strip sorted by the
 other. A batch that begins in one epoch and ends in the next is mixed; no scene is lost or
 read twice.
+
+Where sources have shares (``Mixture``), an epoch is a round of draws: of each source as
+many as its share says, the next ones of permutations of its own scenes.
 """
 
 import math
@@ -17,6 +20,19 @@ from jaxtyping import Int64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Mixture:
+    """How often scenes of each source are read.
+
+    Attributes:
+        rows: Scenes of each source, at least one.
+        counts: Of each source, how many a round has.
+    """
+
+    rows: tuple[Int64[np.ndarray, " _"], ...]
+    counts: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ScenePermutation:
     """The order in which scenes are read.
 
@@ -25,16 +41,23 @@ class ScenePermutation:
         batch: Scenes of a step.
         pool: Batches that are sorted together; 1 to leave scenes as they are drawn.
         seed: Of all permutations.
+        mixture: Shares of the sources; None for every scene once an epoch.
     """
 
     size: Int64[np.ndarray, "scene 2"]
     batch: int
     pool: int
     seed: int
+    mixture: Mixture | None = None
+
+    @property
+    def epoch_scenes(self) -> int:
+        """Scenes of an epoch."""
+        return sum(self.mixture.counts) if self.mixture else len(self.size)
 
     def scenes(self, step: int) -> list[int]:
         """Rows of the scenes of one step."""
-        count = len(self.size)
+        count = self.epoch_scenes
         places = range(step * self.batch, (step + 1) * self.batch)
         return [int(_rows_of_epoch(self, at // count)[at % count]) for at in places]
 
@@ -43,7 +66,7 @@ class ScenePermutation:
 def _rows_of_epoch(order: ScenePermutation, epoch: int) -> np.ndarray:
     """All scenes in the order of one epoch; what is cut at its ends stays as drawn."""
     random = np.random.default_rng([order.seed, epoch])
-    rows = random.permutation(len(order.size))
+    rows = random.permutation(_drawn(order, epoch))
     begins = -epoch * len(rows) % order.batch  # Ends the batch that the last epoch began.
     whole = max(0, (len(rows) - begins) // order.batch)
     if order.pool == 1 or not whole:
@@ -51,6 +74,22 @@ def _rows_of_epoch(order: ScenePermutation, epoch: int) -> np.ndarray:
     inner = slice(begins, begins + whole * order.batch)
     rows[inner] = _bucketed(order, rows[inner], random).ravel()
     return rows
+
+
+def _drawn(order: ScenePermutation, epoch: int) -> np.ndarray:
+    """All scenes of one epoch, in no order."""
+    if order.mixture is None:
+        return np.arange(len(order.size))
+    drawn = []
+    for source, (rows, count) in enumerate(
+        zip(order.mixture.rows, order.mixture.counts, strict=True)
+    ):
+        first, skip = divmod(epoch * count, len(rows))
+        passes = range(first, first + -(-(skip + count) // len(rows)))
+        own = [np.random.default_rng([order.seed, source, each]) for each in passes]
+        read = np.concatenate([rows[random.permutation(len(rows))] for random in own])
+        drawn.append(read[skip : skip + count])
+    return np.concatenate(drawn)
 
 
 def _bucketed(

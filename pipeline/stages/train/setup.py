@@ -14,7 +14,8 @@ from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 from pipeline.stages.train.loader import Recipe, TokenScenes
 from pipeline.stages.train.process_group import ProcessGroup, own_device
-from pipeline.stages.train.sampler import ScenePermutation
+from pipeline.stages.train.sampler import Mixture, ScenePermutation
+from pipeline.stages.train.source_shares import mix, read_shares
 from pipeline.storage.checkpoint import TrainingState
 from pipeline.storage.weights import copy_weights
 
@@ -35,6 +36,7 @@ class TrainingSetup:
         validation_split: For the validation loss.
         folder: Where checkpoints and the log go.
         start: Folder of the weights to begin with; None for fresh ones.
+        sources: Source of each shard of the scenes to learn from.
     """
 
     model: ModelSettings
@@ -44,6 +46,7 @@ class TrainingSetup:
     validation_split: Sequence[SceneTokens]
     folder: Path
     start: Path | None = None
+    sources: tuple[str, ...] = ()
 
     @property
     def limits(self) -> Limits:
@@ -68,11 +71,17 @@ class TrainingSetup:
                 "or more"
             )
         sizes = self.scenes.sizes(self.limits)
-        order = ScenePermutation(sizes, how.batch_scenes, how.bucket_batches, how.seed)
+        order = ScenePermutation(
+            sizes, how.batch_scenes, how.bucket_batches, how.seed, self._mixture()
+        )
         first = group.rank * how.gradient_accumulation
         own = range(first, first + how.gradient_accumulation)
         packed = group.device.type != "cpu"
         return Recipe(self.scenes, self.limits, order, parts, own, packed=packed)
+
+    def _mixture(self) -> Mixture | None:
+        shares = read_shares(self.train.source_share)
+        return mix(shares, self.sources, self.scenes.shard_sizes) if shares else None
 
 
 def begin(

@@ -31,7 +31,7 @@ from pipeline.storage.initial_weights import (
     WEIGHTS,
     find_initial_weights,
 )
-from pipeline.storage.splits import in_split
+from pipeline.storage.splits import in_split, source_of
 
 if TYPE_CHECKING:
     from infgen.model.network import Network
@@ -68,12 +68,24 @@ def reads(root: Path, settings: Mapping[str, Any]) -> list[Source]:
 
 
 def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
-    """One unit, of all shards of the two splits."""
+    """One unit, of all shards of the two splits.
+
+    Raises:
+        ConfigError: if shares are given to other sources than there are.
+    """
+    from pipeline.stages.train.source_shares import (  # noqa: PLC0415  # Numpy: 0.1 s.
+        check_shares,
+        read_shares,
+    )
+
     how: TrainSettings = settings["train"]
     shards = {
         "scenes": _shards(inputs, how.split),
         "validation_split": _shards(inputs, how.validation_split),
     }
+    sources = [source_of(done.name) for done in shards["scenes"]]
+    if shares := read_shares(how.source_share):
+        check_shares(shares, sources)
     keys = {f"{use}/{d.name}": d.key for use, dones in shards.items() for d in dones}
     keys |= {source.name: source.fingerprint for source in inputs.sources}
     folders = {use: [str(d.path) for d in dones] for use, dones in shards.items()}
@@ -82,7 +94,12 @@ def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
         Unit(
             name="weights",
             inputs={**keys, "vocabularies": inputs.content("build-vocab", *VOCABULARIES)},
-            task={**folders, **starts, "vocabularies": str(inputs.folder("build-vocab"))},
+            task={
+                **folders,
+                **starts,
+                "sources": sources,
+                "vocabularies": str(inputs.folder("build-vocab")),
+            },
         )
     ]
 
@@ -170,6 +187,7 @@ def _prepare(
         validation_split=TokenScenes([Path(path) for path in task["validation_split"]]),
         folder=target,
         start=Path(task[INITIAL_WEIGHTS]) if INITIAL_WEIGHTS in task else None,
+        sources=tuple(task["sources"]),
     )
     return setup, begin(setup, *load_vocabularies(Path(task["vocabularies"])))
 
@@ -209,6 +227,7 @@ STAGE = Stage(
         "pipeline.stages.train.recorder",
         "pipeline.stages.train.loader",
         "pipeline.stages.train.sampler",
+        "pipeline.stages.train.source_shares",
         "pipeline.stages.train.precision",
         "pipeline.stages.train.stage",
         "pipeline.stages.train.train_log",

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import google_crc32c
 
 from infgen.sources.remote import file_system
+from infgen.sources.remote_files import is_url
 from infgen.sources.tfrecord import Record, read_record
 from pipeline.engine.atomic import MANIFEST, StoreError, write_json
 from pipeline.engine.layout import Root, read_json
@@ -52,7 +53,7 @@ class FingerprintCache:
 
     def fingerprint(self, url: str) -> str:
         """Return the identity of a file; read it only if it has changed."""
-        if "://" in url:
+        if is_url(url):
             return _fingerprint_remote(url)
         stat = os.stat(url)
         mark = [stat.st_size, stat.st_mtime_ns, stat.st_ino]
@@ -69,12 +70,13 @@ class FingerprintCache:
         from infgen.sources.scene_files import Label  # noqa: PLC0415
 
         url = scene.files.paths[0]
-        self.fingerprint(url)
-        known = self._known[url]
-        if len(known) == len(Label._fields) + 4:
-            return Label(*known[4:])
+        identity = self.fingerprint(url)
+        marks = [identity] if is_url(url) else self._known[url][:4]
+        known = self._known.get(url, [])
+        if known[: len(marks)] == marks and len(known) == len(Label._fields) + len(marks):
+            return Label(*known[len(marks) :])
         found = scene.label
-        self._known[url] = [*known[:4], *found]
+        self._known[url] = [*marks, *found]
         self._changed = True
         return found
 

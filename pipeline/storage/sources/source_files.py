@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from infgen.errors import ConfigError
 from infgen.sources.remote import file_system
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 BUILTIN = "builtin"
 """Names the synthetic records of the package."""
 RECORDS_IN_FOLDER = "*.tfrecord*"
+PICKLES = (".pkl", ".pickle")
+"""Ends of names of scene files that were converted from TFRecords and may be named so."""
 
 
 class RawRecords(NamedTuple):
@@ -94,10 +96,7 @@ def _matches(pattern: str) -> RawRecords:
         from infgen.sources.towns import builtin_records  # noqa: PLC0415
 
         return RawRecords([str(path) for path in builtin_records()], [])
-    if "://" in pattern:
-        found = RawRecords(_remote(pattern), [])
-    else:
-        found = _local(absolute(pattern))
+    found = _remote(pattern) if "://" in pattern else _local(absolute(pattern))
     if not found.urls and not found.scenes:
         raise ConfigError(
             f"no records match {pattern}; expected TFRecord files of WOMD Scenario protos, "
@@ -150,13 +149,55 @@ def _in_files(paths: Iterable[str]) -> RawRecords:
     return found
 
 
-def _remote(pattern: str) -> list[str]:
+def _remote(pattern: str) -> RawRecords:
+    """Find TFRecords and scenes by URL, as local ones are found."""
     system, path = file_system(pattern)
-    if glob.has_magic(path):
-        paths = system.glob(path)
+    kinds: dict[str, str] = {}
+    if named := not glob.has_magic(path):
+        kinds[path] = _kind(system, path)
     else:
-        paths = [path] if system.isfile(path) else []
-    return [str(system.unstrip_protocol(found)) for found in paths]
+        entries = system.glob(path, detail=True)
+        kinds = {found: entry["type"] for found, entry in sorted(entries.items())}
+    urls = {found: str(system.unstrip_protocol(found)) for found in kinds}
+    found = _in_urls(urls[each] for each, kind in kinds.items() if kind == "file")
+    for folder in (each for each, kind in kinds.items() if kind == "directory"):
+        from infgen.sources.remote_scenes import find_below_url  # noqa: PLC0415
+
+        inside = system.glob(f"{folder.rstrip('/')}/{RECORDS_IN_FOLDER}") if named else ()
+        records = [str(system.unstrip_protocol(each)) for each in inside]
+        found.urls.extend(url for url in records if _names_tfrecord(url))
+        found.scenes.extend(find_below_url(urls[folder]))
+    return found
+
+
+def _kind(system: Any, path: str) -> str:
+    if system.isfile(path):
+        return "file"
+    return "directory" if system.isdir(path) else "nothing"
+
+
+def _in_urls(urls: Iterable[str]) -> RawRecords:
+    """Tell scene files from others; others are taken for TFRecords."""
+    from infgen.sources.remote_scenes import find_in_url  # noqa: PLC0415
+
+    @cache
+    def scenes_in(folder: str) -> dict[str, "FoundScene"]:
+        return {path: one for one in find_in_url(folder) for path in one.files.paths}
+
+    found = RawRecords([], [])
+    for url in urls:
+        if _names_tfrecord(url):
+            found.urls.append(url)
+        elif scene := scenes_in(url.rsplit("/", 1)[0]).get(url):
+            found.scenes.append(scene)
+        elif not url.endswith(PICKLES):
+            found.urls.append(url)
+    return found
+
+
+def _names_tfrecord(url: str) -> bool:
+    """Whether a URL is named as a TFRecord, which need not be opened to be told."""
+    return ".tfrecord" in _name(url) and not url.endswith(PICKLES)
 
 
 def _name(url: str) -> str:

@@ -49,3 +49,14 @@ def test_who_is_missing_in_a_rollout_is_gone_and_gaps_of_the_log_are_asked_of_no
     assert aligned.shape == (1, 9, 2, 3)
     assert (aligned[0, :, 0] == GONE).all()
     assert aligned[0, 0, 1].tolist() == [4, UNKNOWN, 4]
+
+
+def test_without_road_edges_no_agent_is_gone_from_the_road():
+    valid = np.ones((2, 12), bool)
+    valid[1, 5:] = False
+
+    found = read((9.0, 0.0, 0.0, 1.0), valid=valid)
+
+    assert (found.outcome[TTC, 1] == GONE).any()
+    for feature in ("distance_to_road_edge", "offroad_indication"):
+        assert (found.outcome[ROW[feature]] == UNKNOWN).all()

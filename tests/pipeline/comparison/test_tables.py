@@ -1,6 +1,7 @@
 """Tables of a comparison whose every number is known, and what is written of it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -232,3 +233,15 @@ def test_a_comparison_is_json_without_any_nan(found):
     assert told["arms"]["smart"]["long"]["ace/truth_near"]["mean"] == 4.0
     assert told["runs"][0]["weights"] == "weights of infgen 0"
     assert not np.isnan(told["runs"][0]["scenes"])
+
+
+def test_rollout_sets_of_several_splits_have_tables_of_their_own(found):
+    whole = replace(found, parts={"validation.argoverse2": found, "*_20s": found})
+
+    sheets = {sheet.name: sheet.title for sheet in tables(whole)}
+    single = len(tables(found)) - 1
+    assert len(sheets) == 2 * single + 1  # Runs are listed once.
+    assert sheets["claims-validation.argoverse2"].endswith("(validation.argoverse2)")
+    assert sheets["claims-_20s"].endswith("(*_20s)")
+    assert len(charts(whole)) == 2 * len(charts(found))
+    assert "InfGen, *_20s" in [row[0] for row in curve_sheet(whole).rows]

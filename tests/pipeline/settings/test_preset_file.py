@@ -213,6 +213,18 @@ def test_a_preset_that_does_not_exist_is_refused_with_those_that_do(load):
         load().preset("mni")
 
 
+def test_every_rollout_set_of_real_long_is_scored_against_its_own_source():
+    preset = load_stages(DEFAULT_FILE, {}).preset("real-long")
+
+    assert list(preset.arms) == ["infgen", "smart", "catk"]
+    for arm in preset.arms.values():
+        assert len(arm.rollout_sets) == 6
+        for over in arm.rollout_sets.values():
+            split = over.values["rollout"]["split"].value
+            assert over.values["reference"]["split"].value == split
+    assert preset.arms["catk"].starts_from == "smart"
+
+
 def test_the_packaged_presets_compare_all_methods_of_the_paper_and_all_ablations():
     file = load_stages(DEFAULT_FILE, {})
 

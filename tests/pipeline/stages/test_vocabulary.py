@@ -275,3 +275,28 @@ def test_vocabularies_from_a_few_real_files_write_held_out_scenes_closely(tmp_pa
         assert row["held_out_error_m"] is None or row["held_out_error_m"]["mean"] <= most_m
     assert report["roads"]["held_out_error_m"]["mean"] <= 0.05
     assert figures["real"]["vehicle"] > 500
+
+
+def test_the_error_of_tokens_is_told_source_by_source(tmp_path, traffic):
+    files = {
+        "training.tfrecord-0": traffic(4),
+        "training.argoverse2-00000-of-00001": traffic(3, first=4),
+        "validation.tfrecord-0": traffic(2, first=7),
+    }
+    target, _ = build(ingested(tmp_path / "ingest", files), tmp_path)
+
+    report = json.loads((target / "report.json").read_text())
+    assert list(report["sources"]) == ["argoverse2", "tfrecord"]
+    own, other = report["sources"].values()
+    assert (own["scenes"], own["held_out"]) == (3, False)  # None of them was held out.
+    assert (other["scenes"], other["held_out"]) == (2, True)
+    for found in (own, other):
+        assert set(found["tokens"]) == {"vehicle", "pedestrian", "cyclist", "map"}
+        for error in found["tokens"].values():
+            assert 0 <= error["mean"] <= error["p95"] < 1
+    whole = report["motion"]["vehicle"]["held_out_error_m"]
+    assert other["tokens"]["vehicle"]["mean"] == whole["mean"]
+    assert other["tokens"]["map"]["mean"] == report["roads"]["held_out_error_m"]["mean"]
+    page = (target / "report.html").read_text()
+    assert "Token error by source" in page
+    assert "2 held out" in page

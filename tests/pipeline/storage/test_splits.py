@@ -4,7 +4,14 @@ import pytest
 
 from pipeline.engine.plan import PlanError
 from pipeline.engine.stage import FinishedUnit
-from pipeline.storage.splits import files_of_split, in_split, split_of, spread_evenly
+from pipeline.storage.splits import (
+    files_of_split,
+    group_name,
+    in_split,
+    source_of,
+    split_of,
+    spread_evenly,
+)
 
 
 @pytest.mark.parametrize(
@@ -26,11 +33,29 @@ def test_the_split_is_in_the_name(name, split):
     assert split_of(name) == split
 
 
+def test_the_source_is_in_the_name():
+    assert source_of(group_name("training", "argoverse2", 3, 16)) == "argoverse2"
+    assert source_of("training.tfrecord-00000-of-01000") == "tfrecord"
+    assert source_of("validation.tfrecord") == "tfrecord"
+
+
 def test_a_file_is_of_its_own_split_only():
     name = "training_20s.tfrecord-00000-of-01000"
 
     assert in_split(name, "training_20s")
     assert not in_split(name, "training")
+
+
+def test_a_split_of_one_source_and_a_pattern_are_parts_of_all():
+    group, record = "validation.argoverse2-00000-of-00004", "validation.tfrecord-0"
+
+    assert in_split(group, "validation")
+    assert in_split(group, "validation.argoverse2")
+    assert not in_split(record, "validation.argoverse2")
+    assert in_split(record, "validation.tfrecord")
+    for name in ("training_20s.tfrecord-00000-of-01000", "long_20s.tfrecord"):
+        assert in_split(name, "*_20s")
+    assert not in_split(record, "*_20s")
 
 
 ALL = [list(range(9)), [0], [0, 1, 2, 3]]

@@ -258,6 +258,31 @@ def test_the_official_metric_is_scored_where_all_agents_stay(result):
     assert (scores["metric"] == "wosac-2025/metametric").sum() == 3
 
 
+def test_what_a_source_does_not_record_is_null_and_counted(tmp_path, scenes):
+    dark = [scenes[0], *(replace(scene, lights_recorded=False) for scene in scenes[1:])]
+    inputs = Inputs(
+        [ingested(tmp_path / "l", dark)],
+        [played(tmp_path / "p", [as_rollout(scene) for scene in dark])],
+    )
+
+    summary, scores, report = run(tmp_path / "score", inputs)
+
+    told = summary["wosac"]
+    name = "traffic_light_violation_likelihood"
+    assert told["not_measured"] == {name: 2, "simulated_traffic_light_violation_rate": 2}
+    assert told["scores"][name]["mean"] is not None
+    assert report["wosac_metametric"] is not None
+    measured = scores.filter(pl.col("metric") == f"wosac-2025/{name}")
+    assert measured["scenario_id"].to_list() == ["crossing"]
+
+    only = Inputs(
+        [ingested(tmp_path / "l2", dark[1:])],
+        [played(tmp_path / "p2", [as_rollout(scene) for scene in dark[1:]])],
+    )
+    summary, _, _ = run(tmp_path / "score2", only)
+    assert summary["wosac"]["scores"][name]["mean"] is None
+
+
 def test_rollouts_that_lose_an_agent_are_skipped_officially_with_the_reason(
     tmp_path, scenes
 ):
