@@ -288,7 +288,7 @@ def finish(
 
 STAGE = Stage(
     name="score",
-    version=4,
+    version=5,
     settings={"reference": ReferenceSettings, "score": ScoreSettings},
     plan=plan,
     work=work,
