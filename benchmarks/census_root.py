@@ -79,7 +79,7 @@ class Census:
 
 
 def scenario_id(split: str, file: int, record: int) -> str:
-    """Id of a scene: its place; as long as any other, and none holds the start of another."""
+    """Id of a scene, from its place; none holds the start of another."""
     return f"{split[0]}{file:07x}{record:0{ROW_DIGITS}x}"
 
 
