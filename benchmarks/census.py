@@ -13,6 +13,7 @@ import argparse
 import json
 import math
 import shutil
+import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -65,17 +66,23 @@ class Root:
 
     def command(self, name: str, *words: str) -> None:
         """Measure a command line of infgen."""
-        self.rows[name] = measure(["-m", "cli", *words], self.folder)
+        self._note(name, measure(["-m", "cli", *words], self.folder))
 
     def step(self, name: str, step: str, stage: str = "") -> None:
         """Measure a step."""
         used = self._step(step, stage)
-        self.rows[name] = used
+        self._note(name, used)
         self.found[name] = json.loads(used.text.splitlines()[-1])
 
     def make(self, step: str, stage: str = "") -> None:
         """Do a step that is not measured."""
         self.made_s += self._step(step, stage).wall_s
+
+    def _note(self, name: str, used: Usage) -> None:
+        """Keep a row, and show it: the others may take long."""
+        self.rows[name] = used
+        row = f"{used.wall_s:.1f} s, {used.cpu_s:.1f} CPU s, {used.peak_mib:.0f} MiB"
+        print(f"{self.scenes:,} scenes: {name}: {row}", file=sys.stderr, flush=True)
 
     def _step(self, step: str, stage: str) -> Usage:
         words = [str(STEPS), step, str(self.folder), json.dumps(self.census), stage]
