@@ -66,7 +66,7 @@ class MeasuredWorkers:
         marks: list[float] = []
         begun = self._now()
 
-        def mark(done: float, total: float, note: str = "") -> None:
+        def mark(done: float | int, total: float | int, note: str = "") -> None:
             marks.append(self._now() - begun)
 
         outcome = attempt(task, mark)

@@ -1,4 +1,4 @@
-"""``benchmarks/census.py`` on a root of a few scenes: every step and command of it."""
+"""``benchmarks/census.py`` and ``ingest_files.py`` on a few scenes: every step of them."""
 
 import importlib
 import json
@@ -75,3 +75,16 @@ def test_a_command_grows_where_a_further_scene_costs_more_than_before(
     census = importlib.import_module("census")
 
     assert census.grows(points) is grows
+
+
+@pytest.mark.slow
+def test_files_of_tiny_scenes_are_ingested_and_counted():
+    script = str(BENCHMARKS / "ingest_files.py")
+    words = [sys.executable, script, "--files", "2"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+
+    assert done.returncode == 0, done.stderr[-3000:]
+    figures = json.loads(done.stdout.splitlines()[-1])
+    assert (figures["files"], figures["scenes_per_file"]) == (2, 60)
+    assert figures["files_per_unit"] <= 6
+    assert figures["cpu_s_per_unit"] > 0
