@@ -14,9 +14,11 @@ from infgen import __version__
 from infgen.errors import ConfigError
 from pipeline.commands import tables, tools
 from pipeline.commands.doctor import examine
+from pipeline.commands.estimates import estimate_arms
 from pipeline.commands.options import (
     WORK,
     ComparisonOptions,
+    EstimateOptions,
     Json,
     RequestOptions,
     RootFolder,
@@ -179,14 +181,29 @@ _stage_verb("report", "Write tables and figures to one page.")
 
 
 @app.command()
-@gathers(request_options=RequestOptions)
+@gathers(
+    request_options=RequestOptions, comparing=ComparisonOptions, estimating=EstimateOptions
+)
 def plan(
-    json_: Json = False, strict_code: StrictCode = False, *, request_options: RequestOptions
+    json_: Json = False,
+    strict_code: StrictCode = False,
+    *,
+    request_options: RequestOptions,
+    comparing: ComparisonOptions,
+    estimating: EstimateOptions,
 ) -> None:
     """Say what a run of all stages would make, and why (run -n).
 
     Example: infgen plan --root R -s tokenize.max_gap_s=2
+
+    Example: infgen plan --root R --preset paper --dask local:8 --budget 24h
+
+    Of a preset it says how long all arms will take, by a probe of a minute or two.
     """
+    if comparing.preset is not None:
+        estimate_arms(request_options, comparing, estimating, as_json=json_)
+        return
+    estimating.refuse_without_preset()
     found = find_statuses(request_options.request(), strict_code=strict_code)
     print_statuses(found, as_json=json_)
 

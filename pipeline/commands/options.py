@@ -251,6 +251,37 @@ class ComparisonOptions:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class EstimateOptions:
+    """For how many workers, and how long, the work of a preset is planned."""
+
+    dask: Annotated[
+        str,
+        typer.Option(
+            metavar="WHERE", help="Of a preset: workers, as `infgen run` has them."
+        ),
+    ] = "none"
+    budget: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="Of a preset: say how many steps and scenes fit into 24h, 90m or 2d.",
+        ),
+    ] = None
+
+    def refuse_without_preset(self) -> None:
+        """Refuse a budget where nothing is estimated.
+
+        Raises:
+            ConfigError: naming it.
+        """
+        if self.budget is not None:
+            raise ConfigError(
+                f"--budget {self.budget} is said of a preset, but none is named; expected "
+                "--preset NAME beside it, or no --budget"
+            )
+
+
 def split_names(word: str) -> list[str]:
     """Split at commas, unless the whole is the name of a file."""
     return [word] if Path(word).exists() else [part for part in word.split(",") if part]

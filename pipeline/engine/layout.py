@@ -10,6 +10,7 @@
     refs/<profile>.json          the last request under a profile, and its keys
     logs/<time>-<pid>.jsonl      one line per event of a run
     cache/fingerprints.json      identities of source files
+    cache/probe-<host>.json      what one unit of work takes on a machine
 
 Folders carry the first 16 hexadecimal digits of their key.
 """

@@ -117,7 +117,7 @@ def finish(
 
 STAGE = Stage(
     name="reference",
-    version=3,
+    version=4,
     settings={"tokenize": TokenSettings, "reference": ReferenceSettings},
     plan=plan,
     work=work,

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+import google_crc32c
 import numpy as np
 
 from pipeline.engine.atomic import StoreError, publish, write_file, write_json
@@ -113,10 +114,24 @@ def read_group(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     Raises:
         StoreError: if a chunk is missing, cut short or damaged.
     """
+    keys = open_group_file(path)
+    about = _json(path, keys, METADATA)
+    metadata = _metadata(path, keys)
+    if all(_is_plain(meta) for meta in metadata.values()):
+        columns = {
+            name: _checked(path, keys.get(_chunk(name)), name, meta)
+            for name, meta in metadata.items()
+        }
+        return columns, about.get("attributes", {})
+    return _read_with_zarr(path, keys)
+
+
+def _read_with_zarr(
+    path: Path, keys: Mapping[str, StoredKey]
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read a group that is compressed."""
     import zarr  # noqa: PLC0415
 
-    keys = open_group_file(path)
-    _json(path, keys, METADATA)
     columns = {}
     with _as_zarr_reads(path) as store:
         try:
@@ -157,16 +172,23 @@ def open_group(path: Path) -> tuple[dict[str, DiskColumn], dict[str, Any]]:
     keys = open_group_file(path)
     about = _json(path, keys, METADATA)
     columns = {}
-    for key in sorted(keys):
-        name, _, rest = key.rpartition(f"/{METADATA}")
-        if rest or not name:
-            continue
-        meta = _json(path, keys, key)
-        if [codec["name"] for codec in meta["codecs"]] != ["bytes", "crc32c"]:
+    for name, meta in _metadata(path, keys).items():
+        if not _is_plain(meta):
             raise StoreError(f"{path}: {name} is compressed and cannot be read in parts")
-        dtype, length = np.dtype(meta["data_type"]), int(meta["shape"][0])
-        columns[name] = _disk_column(path, keys.get(_chunk(name)), name, dtype, length)
+        columns[name] = _disk_column(path, keys.get(_chunk(name)), name, meta)
     return columns, about.get("attributes", {})
+
+
+def _metadata(path: Path, keys: Mapping[str, StoredKey]) -> dict[str, dict[str, Any]]:
+    """Read what a group says of its arrays, by name."""
+    ending = f"/{METADATA}"
+    names = sorted(key.removesuffix(ending) for key in keys if key.endswith(ending))
+    return {name: _json(path, keys, f"{name}{ending}") for name in names}
+
+
+def _is_plain(meta: Mapping[str, Any]) -> bool:
+    """Whether a chunk is the bytes of its array and their checksum."""
+    return [codec["name"] for codec in meta["codecs"]] == ["bytes", "crc32c"]
 
 
 def write_records(
@@ -199,8 +221,9 @@ def read_records(
 
 
 def _disk_column(
-    path: Path, chunk: StoredKey | None, name: str, dtype: np.dtype, length: int
+    path: Path, chunk: StoredKey | None, name: str, meta: Mapping[str, Any]
 ) -> DiskColumn:
+    dtype, length = np.dtype(meta["data_type"]), int(meta["shape"][0])
     expected = length * dtype.itemsize + CHECKSUM_BYTES
     found = None if chunk is None else chunk.length
     if chunk is None or (length and found != expected):
@@ -208,6 +231,20 @@ def _disk_column(
             return DiskColumn(StoredKey(path, 0, 0), dtype, 0)
         raise StoreError(f"{path}: {_chunk(name)} holds {found} bytes, expected {expected}")
     return DiskColumn(chunk, dtype, length)
+
+
+def _checked(
+    path: Path, chunk: StoredKey | None, name: str, meta: Mapping[str, Any]
+) -> np.ndarray:
+    """Read a whole plain column, and compare its checksum."""
+    column = _disk_column(path, chunk, name, meta)
+    if chunk is None or not len(column):
+        return np.empty(0, column.dtype)
+    data = chunk.read()
+    values, checksum = data[:-CHECKSUM_BYTES], data[-CHECKSUM_BYTES:]
+    if google_crc32c.value(values) != int.from_bytes(checksum, "little"):
+        raise StoreError(f"{path}: {_chunk(name)} is damaged: its checksum does not match")
+    return np.frombuffer(bytearray(values), column.dtype)
 
 
 def _chunk(name: str) -> str:

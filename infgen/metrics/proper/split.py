@@ -52,8 +52,9 @@ def flatten(
     for row, parts in zip(table, scenes, strict=True):
         start = 0
         for name, size in sizes.items():
-            values = np.asarray(parts[name], dtype=np.float64)
-            row[start : start + size] = np.pad(values, (0, size - len(values)))
+            values = parts[name]
+            row[start : start + len(values)] = values
+            row[start + len(values) : start + size] = 0.0
             start += size
     return table
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from infgen.metrics.long_term.protocols import FEATURES, PROTOCOLS, Feature
-from infgen.metrics.long_term.reference import Counts, add_up
+from infgen.metrics.long_term.reference import Counts
 from infgen.views.charts.canvas import Chart
 from infgen.views.charts.lines import Series, line_chart
 from infgen.views.tables import Cell, Table
@@ -35,8 +35,7 @@ UNITS = {
 
 def read_both(inputs: "Inputs") -> tuple[Counts, Counts]:
     """Read the counts of all logs, and of all rollouts."""
-    played = add_up(read_counts(done.path) for done in inputs.units("score"))
-    return read_counts(inputs.folder("reference")), played
+    return read_counts(inputs.folder("reference")), read_counts(inputs.folder("score"))
 
 
 def charts(logs: Counts, played: Counts) -> list[Chart]:

@@ -98,9 +98,11 @@ def times(inputs: "Inputs", stages: Sequence[str]) -> list[Table]:
     """Where and when every stage was made, and how long it took."""
     rows: list[Sequence[Cell]] = []
     machines: dict[str, dict[str, Any]] = {}
+    devices: Counter[tuple[str, str]] = Counter()
     for name in stages:
         gathered = _run(inputs.folder(name))
         units = [_run(done.path) for done in inputs.units(name)]
+        devices.update((name, device) for run in units for device in _device(run))
         for run in (gathered, *units):
             for machine, about in _machine(run):
                 machines.setdefault(machine, {**about, "stages": {}})["stages"][name] = None
@@ -111,20 +113,21 @@ def times(inputs: "Inputs", stages: Sequence[str]) -> list[Table]:
         rows.append([name, min(begun, default=None), _sum(seconds), longest, last])
     columns = ["stage", "begun", "seconds of all units", "longest unit", "gathering"]
     return [
-        _devices(inputs, stages),
+        _devices(devices),
         Table("Seconds", columns, rows, note="Units may have been made side by side."),
         Table("Machines", _MACHINE, [_row(*each) for each in machines.items()]),
     ]
 
 
-def _devices(inputs: "Inputs", stages: Sequence[str]) -> Table:
+def _device(run: Mapping[str, Any]) -> Iterator[str]:
+    """On which device a unit's network computed, if it says so."""
+    device = run.get("report", {}).get("device")
+    if device is not None:
+        yield str(device)
+
+
+def _devices(found: Mapping[tuple[str, str], int]) -> Table:
     """On which devices the network computed, in training and in rollouts."""
-    found: Counter[tuple[str, str]] = Counter()
-    for name in stages:
-        for done in inputs.units(name):
-            device = _run(done.path).get("report", {}).get("device")
-            if device is not None:
-                found[name, str(device)] += 1
     rows: list[Sequence[Cell]] = [
         [stage, device, units] for (stage, device), units in found.items()
     ]

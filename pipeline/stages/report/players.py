@@ -37,7 +37,8 @@ def write_players(
     from infgen.views.scene.view_model import make_view_model  # noqa: PLC0415
     from pipeline.storage.scenes import file_name  # noqa: PLC0415
 
-    places = dict(_places(inputs)) if most and lowest else {}
+    shown = [scenario_id for scenario_id, *_ in lowest] if most else []
+    places = dict(_places(inputs, shown)) if shown else {}
     pages: list[str] = []
     for scenario_id, index, _ in lowest:
         if len(pages) == most or scenario_id not in places:
@@ -50,18 +51,23 @@ def write_players(
     return [*pages, *[""] * (len(lowest) - len(pages))]
 
 
-def _places(inputs: Inputs) -> Iterator[tuple[str, Place]]:
-    """Where the rollouts of each scene are, and its log."""
+def _places(inputs: Inputs, scenes: Sequence[str]) -> Iterator[tuple[str, Place]]:
+    """Where the rollouts of some scenes are, and their logs: from the index of all."""
     import polars as pl  # noqa: PLC0415
 
     logs = {done.name: done for done in inputs.units("ingest")}
-    for done in inputs.units("rollout"):
-        log = logs.get(done.name.rsplit("-", 1)[0])
-        if log is None:
-            continue
-        index = pl.read_parquet(done.path / "index.parquet", columns=["scenario_id"])
-        for scenario_id in index["scenario_id"].unique(maintain_order=True):
-            yield scenario_id, Place(done, log)
+    rollouts = {done.name: done for done in inputs.units("rollout")}
+    found = (
+        pl.scan_parquet(inputs.folder("rollout") / "index.parquet")
+        .filter(pl.col("scenario_id").is_in(scenes))
+        .select("scenario_id", "unit")
+        .unique(maintain_order=True)
+        .collect()
+    )
+    for scenario_id, unit in found.iter_rows():
+        log = logs.get(unit.rsplit("-", 1)[0])
+        if log is not None:
+            yield scenario_id, Place(rollouts[unit], log)
 
 
 def _read(place: Place, scenario_id: str, index: int) -> "tuple[Scene, Rollout]":

@@ -32,7 +32,8 @@ from infgen.metrics.windows import cut_windows
 from infgen.rollout.rollout import Rollout
 from infgen.scene import Scene
 from infgen.spatial.road_edges import RoadEdges
-from pipeline.stages.score.write import SUM_SCHEMA
+from pipeline.stages.score.summary import add_sums
+from pipeline.stages.score.write import SUM_SCHEMA, read_sums
 
 PARTS, SUMS = "proper.parquet", "proper_sums.parquet"
 CURVES = "proper_curves.parquet"
@@ -132,20 +133,13 @@ class ProperTally:
         for name, values in scores.curves.items():
             known = ~np.isnan(values)
             sums = np.stack([np.where(known, values, 0.0), known.astype(np.float64)])
-            self._add_sums(name, sums)
+            self.sums[name] = add_sums(self.sums.get(name, sums[:, :0]), sums)
 
     def merge(self, other: "ProperTally") -> None:
         """Take what another unit has tallied."""
         self.parts |= other.parts
         for name, sums in other.sums.items():
-            self._add_sums(name, sums)
-
-    def _add_sums(self, name: str, sums: np.ndarray) -> None:
-        known = self.sums.get(name, np.zeros((2, 0)))
-        width = max(known.shape[1], sums.shape[1])
-        self.sums[name] = sum(  # type: ignore[assignment]
-            np.pad(each, ((0, 0), (0, width - each.shape[1]))) for each in (known, sums)
-        )
+            self.sums[name] = add_sums(self.sums.get(name, sums[:, :0]), sums)
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -187,16 +181,15 @@ def write_proper(folder: Path, tally: ProperTally) -> None:
 
 def read_proper(folder: Path) -> ProperTally:
     """Read what one unit has tallied."""
-    tally = ProperTally()
-    for scenario_id, name, values in pl.read_parquet(folder / PARTS).iter_rows():
-        found = tally.parts.setdefault(scenario_id, {})
-        found[name] = np.array(values, dtype=np.float64)  # type: ignore[index]
-    sums = pl.read_parquet(folder / SUMS).partition_by(
-        "metric", maintain_order=True, as_dict=True
-    )
-    for (metric,), part in sums.items():
-        tally.sums[str(metric)] = part.select("value", "rollouts").to_numpy().T
-    return tally
+    table = pl.read_parquet(folder / PARTS)
+    values = table["values"].explode().drop_nulls().to_numpy()
+    ends = np.cumsum(table["values"].list.len().to_numpy())
+    found: dict[str, dict[str, np.ndarray]] = {}
+    parts = np.split(values, ends[:-1]) if len(ends) else []
+    names = zip(table["scenario_id"].to_list(), table["part"].to_list(), strict=True)
+    for (scenario_id, name), part in zip(names, parts, strict=True):
+        found.setdefault(scenario_id, {})[name] = part.astype(np.float64)
+    return ProperTally(parts={**found}, sums=read_sums(folder / SUMS))
 
 
 def write_proper_curves(target: Path, tally: ProperTally) -> None:

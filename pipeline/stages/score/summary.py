@@ -70,7 +70,7 @@ class Tally:
         for name, values in row.curves.items():
             known = ~np.isnan(values)
             add = np.stack([np.where(known, values, 0.0), known.astype(np.float64)])
-            self.sums[name] = _add(self.sums.get(name, add[:, :0]), add)
+            self.sums[name] = add_sums(self.sums.get(name, add[:, :0]), add)
 
     def close_unit(self) -> None:
         """Average the rollouts of each scene; all of a scene's rollouts are in one unit."""
@@ -85,7 +85,7 @@ class Tally:
         self.means |= other.means
         self.rollouts += other.rollouts
         for name, sums in other.sums.items():
-            self.sums[name] = _add(self.sums.get(name, sums[:, :0]), sums)
+            self.sums[name] = add_sums(self.sums.get(name, sums[:, :0]), sums)
 
     def names(self) -> list[str]:
         """All metrics."""
@@ -261,7 +261,9 @@ def _number(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
 
 
-def _add(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Add sums [value or count, window], the shorter one padded with nothing."""
-    width = max(one.shape[1], other.shape[1])
-    return sum(np.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in (one, other))  # type: ignore[return-value]
+def add_sums(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Add sums [value or count, window]; beyond the end of the shorter there is nothing."""
+    longer, shorter = (one, other) if one.shape[1] >= other.shape[1] else (other, one)
+    total = longer.copy()
+    total[:, : shorter.shape[1]] += shorter
+    return total

@@ -8,7 +8,7 @@ from infgen.metrics.long_term.reference import add_up, divergence
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import read_json
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress
-from pipeline.stages.reference_files import read_counts
+from pipeline.stages.reference_files import read_counts, write_counts
 from pipeline.stages.score.proper import CURVES as PROPER_CURVES
 from pipeline.stages.score.proper import ProperTally, read_proper, write_proper_curves
 from pipeline.stages.score.proper_summary import summarize
@@ -27,6 +27,8 @@ def gather(
 ) -> Gathered:
     """Join all units, and write the tables of scores and curves, and the summary."""
     reference = inputs.folder("reference")
+    counts = add_up(read_counts(done.path) for done in units)
+    write_counts(target, counts)
     parts = [folder / ROWS for folder in (reference, *(done.path for done in units))]
     join_parts(parts, target / "scores.parquet")
     tally, proper = Tally(), ProperTally()
@@ -43,9 +45,7 @@ def gather(
         reference=settings["reference"],
         tally=tally,
         log_tally=read_tally(reference, 0),
-        divergence=divergence(
-            read_counts(reference), add_up(read_counts(done.path) for done in units)
-        ),
+        divergence=divergence(read_counts(reference), counts),
         wosac=wosac,
     )
     missing = sorted({scene for done in units for scene in done.report["missing"]})

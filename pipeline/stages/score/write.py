@@ -76,17 +76,21 @@ def write_tally(folder: Path, tally: Tally) -> None:
 def read_tally(folder: Path, rollouts: int) -> Tally:
     """Read what one unit has tallied of so many rollouts."""
     scenes = pl.read_parquet(folder / SCENES)
-    sums = pl.read_parquet(folder / SUMS).partition_by(
-        "metric", maintain_order=True, as_dict=True
-    )
     return Tally(
         means={row.pop("scenario_id"): row for row in scenes.iter_rows(named=True)},
         rollouts=rollouts,
-        sums={
-            str(metric): part.select("value", "rollouts").to_numpy().T
-            for (metric,), part in sums.items()
-        },
+        sums=read_sums(folder / SUMS),
     )
+
+
+def read_sums(path: Path) -> dict[str, np.ndarray]:
+    """Read sums [value or count, window] by metric; the rows of a metric lie together."""
+    table = pl.read_parquet(path)
+    values = table.select("value", "rollouts").to_numpy().T
+    metrics = table["metric"]
+    starts = np.flatnonzero((metrics != metrics.shift()).fill_null(value=True).to_numpy())
+    parts = np.split(values, starts[1:], axis=1) if len(starts) else []
+    return dict(zip(metrics.gather(starts).to_list(), parts, strict=True))
 
 
 def write_curves(target: Path, tally: Tally) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import Float32, Int16
 
 from infgen.scene import Scene
 from pipeline.engine.atomic import StoreError
-from pipeline.storage.group_file import write_group_file
+from pipeline.storage.group_file import open_group_file, write_group_file
 from pipeline.storage.zarr_store import (
     open_group,
     read_group,
@@ -284,3 +284,19 @@ def test_a_killed_write_leaves_no_group(tmp_path):
 
     assert not (tmp_path / "w.zarr").exists()
     assert [path.suffix for path in tmp_path.iterdir()] == [".partial"]
+
+
+def test_a_plain_column_that_is_read_whole_is_compared_with_its_checksum(tmp_path):
+    path = tmp_path / "group.zarr"
+    write_group(path, {"a": np.arange(5), "none": np.empty(0, np.int8)}, {}, compress=False)
+
+    columns, _ = read_group(path)
+    assert columns["a"].tolist() == [0, 1, 2, 3, 4]
+    assert columns["none"].shape == (0,)
+    columns["a"][0] = 7  # Arrays that torch may take over.
+
+    data = bytearray(path.read_bytes())
+    data[open_group_file(path)["a/c/0"].offset] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(StoreError, match="a/c/0 is damaged: its checksum does not match"):
+        read_group(path)

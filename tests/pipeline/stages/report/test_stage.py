@@ -25,6 +25,7 @@ from pipeline.engine.atomic import write_json
 from pipeline.engine.stage import FinishedUnit, Stage
 from pipeline.stages import reference
 from pipeline.stages.reference_files import read_counts
+from pipeline.stages.report import histograms
 from pipeline.stages.report import stage as report
 from pipeline.stages.report.passport import times
 from pipeline.stages.score import stage as score
@@ -164,6 +165,10 @@ def finished(root: Path) -> Inputs:
     }
     pl.DataFrame(bad).write_parquet(root / "ingest" / "quarantine.parquet")
     _score(root, inputs)
+    (played.path / "index.parquet").unlink()  # The report reads the one of all units.
+    (root / "rollout").mkdir()
+    unit = pl.lit(played.name).alias("unit")
+    ids.with_columns(unit).write_parquet(root / "rollout" / "index.parquet")
     (root / "train").mkdir()
     lines = [
         {"step": step, "learning_rate": 0.1, "motion": 7.0 / step} for step in (1, 2, 3)
@@ -398,6 +403,16 @@ def test_histograms_of_logs_and_rollouts_are_drawn_and_listed(written, inputs):
     bins = read_counts(inputs.folder("reference")).bins[1, 0, :10]
     assert [int(row["logs"]) for row in fast] == bins.tolist()
     assert sum(int(row["rollouts"]) for row in fast) > 0
+
+
+def test_histograms_are_read_from_two_files_whatever_the_number_of_units(inputs):
+    none = Inputs(inputs.folder("score").parent, {})
+
+    logs, rollouts = histograms.read_both(none)
+
+    (scored,) = inputs.units("score")
+    assert rollouts.bins.tolist() == read_counts(scored.path).bins.tolist()
+    assert logs.bins.sum() > 0
 
 
 def test_the_passport_counts_the_bytes_of_stages_and_their_units(written):
