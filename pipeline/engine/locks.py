@@ -12,6 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from pipeline.engine.atomic import naming_refusals
+
 POLL_S = 0.1
 LOCK_TIMEOUT_S = 0.5
 """A lock counts as held after so long; ``is_locked`` takes it for a moment."""
@@ -30,11 +32,13 @@ def locked(path: Path, *, wait: bool = False) -> Iterator[None]:
         wait: Wait until it is free.
 
     Raises:
+        DiskError: if the file system refuses to write it.
         LockedError: if another run holds it and ``wait`` is off, naming host, process and
             start.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    with naming_refusals(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     try:
         begun = time.monotonic()
         while not _try_lock(handle, fcntl.LOCK_EX):
@@ -42,7 +46,8 @@ def locked(path: Path, *, wait: bool = False) -> Iterator[None]:
                 raise LockedError(_locked_message(path))
             time.sleep(POLL_S)
         os.ftruncate(handle, 0)
-        os.pwrite(handle, json.dumps(_this_process()).encode(), 0)
+        with naming_refusals(path):
+            os.pwrite(handle, json.dumps(_this_process()).encode(), 0)
         yield
         os.ftruncate(handle, 0)
     finally:

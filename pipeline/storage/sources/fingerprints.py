@@ -104,10 +104,11 @@ class FingerprintCache:
         return found
 
     def save(self) -> None:
-        """Write the cache. Losing it costs only time."""
+        """Write the cache, unless the disk refuses it. Losing it costs only time."""
         if self._changed:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(self._path, self._known)
+            with suppress(OSError):  # `infgen status` also works on a read-only root.
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                write_json(self._path, self._known)
 
 
 def _damaged_offsets(unit: Path) -> set[int]:
