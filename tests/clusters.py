@@ -89,6 +89,12 @@ class Cluster:
         for process in working:
             os.kill(process, signal.SIGKILL)
 
+    def freeze_worker(self, number: int) -> None:
+        """Stop one worker: its connections stay, and it does nothing more."""
+        while not (working := self._working()):
+            time.sleep(POLL_S)
+        os.kill(working[number % len(working)], signal.SIGSTOP)
+
     def _working(self) -> list[int]:
         """Process numbers of the workers themselves."""
         found = []

@@ -186,7 +186,9 @@ def kill_stage(
             raise SystemExit(f"{stage}: only {in_time} of {number} kills came in time")
         shutil.rmtree(Root(root).stage(stage))
         delay_s = draw.uniform(0, duration_s)
-        in_time += trial.kill_once(stage, root, victim, delay_s, number)
+        hit = trial.kill_once(stage, root, victim, delay_s, number)
+        # A run that was done before is one of a machine less busy than the quiet run's.
+        in_time, duration_s = in_time + hit, duration_s if hit else delay_s
         what = f"{stage}, kill {number} of a {victim} after {delay_s:.3f} s"
         damage = list(verify(Root(root), full=True))
         if damage:
@@ -303,6 +305,7 @@ def main(arguments: list[str] | None = None) -> None:
     asked = parser.parse_args(arguments)
     killed = ALL_STAGES if asked.stages == ["all"] else tuple(asked.stages)
     stages = ALL_STAGES if asked.throughout else killed or STAGES
+    stages = tuple(sorted(stages, key=ALL_STAGES.index))
     with tempfile.TemporaryDirectory() as folder:
         words = ("--records", asked.records, "--profile", asked.profile)
         settings = [word for given in asked.set for word in ("-s", given)]

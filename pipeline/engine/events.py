@@ -20,7 +20,8 @@ Event = Mapping[str, Any]
 - ``unit-done``, ``unit-failed`` (error, trace), ``finish-started``
 - ``progress`` (done, total, note): logged only after some seconds without another event
 - ``worker-full`` (worker, memory_gib): restarted, as it exceeds its memory;
-  ``worker-lost`` (worker, units that start again); ``workers-missing`` (timeout_min)
+  ``worker-lost`` (worker, units that start again); ``workers-missing`` (timeout_min);
+  ``device-failed`` (unit, reason), ``unit-timeout`` (unit, limit_min): its worker restarts
 - around the runs of a preset: ``arm-run-started`` (arm_run, number, arm_runs),
 ``arm-run-failed`` (arm_run,
   why)
