@@ -30,7 +30,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -43,7 +43,7 @@ from pipeline.engine.atomic import MANIFEST, PARTIAL  # noqa: E402
 from pipeline.engine.layout import Root  # noqa: E402
 from pipeline.engine.manifest import verify  # noqa: E402
 from tests.clusters import Cluster  # noqa: E402
-from tests.forked_runs import ForkedRun  # noqa: E402
+from tests.runs import ForkedRun, Run, StartedRun, wait  # noqa: E402
 
 STAGES = ("ingest", "build-vocab", "tokenize")
 ALL_STAGES = (*STAGES, "train", "calibrate", "rollout", "reference", "score", "report")
@@ -66,16 +66,27 @@ class Trial:
 
     words: tuple[str, ...]
     folder: Path
+    starter: Callable[[Sequence[str], Path], Run] = StartedRun
 
-    def start(self, stage: str, root: Path, *more: str) -> ForkedRun:
+    @property
+    def said(self) -> Path:
+        """What the last run says, or said."""
+        return self.folder / "said.log"
+
+    def start(self, stage: str, root: Path, *more: str) -> Run:
         """Start to make a stage, in a process group of its own."""
         words = ("run", stage, "--root", str(root), *self.words, *more)
-        return ForkedRun(words, self.folder / "said.log")
+        return self.starter(words, self.said)
+
+    def end(self, running: Run) -> str:
+        """Wait for the end of the last run; return all it said."""
+        wait(running, LONGEST_S)
+        return self.said.read_text(errors="replace")
 
     def make(self, stage: str, root: Path, *more: str) -> None:
         """Make a stage without any trouble."""
         running = self.start(stage, root, *more)
-        said = running.wait(LONGEST_S)
+        said = self.end(running)
         if running.returncode:
             raise SystemExit(f"infgen run {stage} left with {running.returncode}:\n{said}")
 
@@ -100,7 +111,7 @@ class Trial:
         if victim == "run":
             running = self.start(stage, root)
             kill = partial(os.killpg, running.pid, signal.SIGKILL)
-            return _kill(running, stage, root, delay_s, kill)[0]
+            return self._kill(running, stage, root, delay_s, kill)[0]
         folder = self.folder / "cluster"
         folder.mkdir(exist_ok=True)
         cluster = Cluster(folder, [str(HERE)])
@@ -112,7 +123,7 @@ class Trial:
         try:
             cluster.start(CLUSTER_WORKERS)
             running = self.start(stage, root, "--dask", cluster.words)
-            in_time, said = _kill(running, stage, root, delay_s, kills[victim])
+            in_time, said = self._kill(running, stage, root, delay_s, kills[victim])
         finally:
             cluster.stop()
         lost = victim == "scheduler" and LOST in said.splitlines()[-1]
@@ -120,23 +131,18 @@ class Trial:
             raise SystemExit(f"{stage} left with {running.returncode}:\n{said}")
         return in_time
 
-
-def _kill(
-    running: ForkedRun,
-    stage: str,
-    root: Path,
-    delay_s: float,
-    kill: Callable[[], None],
-) -> tuple[bool, str]:
-    """Kill at a moment of a stage; tell if it was in time, and all the run said."""
-    attempt = Root(root).attempt(stage)
-    while running.poll() is None and not attempt.exists():
-        time.sleep(POLL_S)
-    time.sleep(delay_s)
-    in_time = running.poll() is None
-    if in_time:
-        kill()
-    return in_time, running.wait(LONGEST_S)
+    def _kill(
+        self, running: Run, stage: str, root: Path, delay_s: float, kill: Callable[[], None]
+    ) -> tuple[bool, str]:
+        """Kill at a moment of a stage; tell if it was in time, and all the run said."""
+        attempt = Root(root).attempt(stage)
+        while running.poll() is None and not attempt.exists():
+            time.sleep(POLL_S)
+        time.sleep(delay_s)
+        in_time = running.poll() is None
+        if in_time:
+            kill()
+        return in_time, self.end(running)
 
 
 def done_units(root: Path, stage: str) -> dict[str, int]:
@@ -247,7 +253,7 @@ def kill_throughout(
                 if running.poll() is None:
                     cluster.kill_worker(draw.randrange(workers))
                     kills += 1
-            said = running.wait(LONGEST_S)
+            said = trial.end(running)
             if not running.returncode:
                 break
         else:
@@ -309,7 +315,7 @@ def main(arguments: list[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         words = ("--records", asked.records, "--profile", asked.profile)
         settings = [word for given in asked.set for word in ("-s", given)]
-        trial = Trial((*words, *settings), Path(folder))
+        trial = Trial((*words, *settings), Path(folder), ForkedRun)
         quiet = trial.folder / "quiet"
         trial.make(stages[-1], quiet)
         say(f"quiet run: {len(digest(quiet, stages))} files of {', '.join(stages)}")

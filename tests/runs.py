@@ -1,29 +1,60 @@
-"""Runs of the command line as forks of this process, to be killed for good.
-
-What a run imports is imported once, here, so that starting one takes milliseconds and not
-seconds. A fork must not inherit threads: this process computes nothing itself.
-"""
+"""Runs of the command line in processes of their own, to be killed for good."""
 
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import Protocol
 
 from cli import main
 from pipeline.engine.registry import MODULES, load_stage
 
+HERE = Path(__file__).resolve().parents[1]
 IMPORTED = ("numpy", "torch", "polars", "zarr", "infgen.model.network")
 POLL_S = 0.005
 
 
-class ForkedRun:
+class Run(Protocol):
     """One run, in a session and process group of its own.
 
     Attributes:
         pid: Its process, and group.
         returncode: Its exit code, or minus the signal that ended it; None while it runs.
+    """
+
+    pid: int
+    returncode: int | None
+
+    def poll(self) -> int | None:
+        """Return the exit code if it has ended."""
+
+
+class StartedRun(subprocess.Popen):
+    """A run in a new Python process.
+
+    Args:
+        words: Of the command line.
+        said: File that gets all it says.
+    """
+
+    def __init__(self, words: Sequence[str], said: Path) -> None:
+        with said.open("w") as log:
+            super().__init__(
+                [sys.executable, "-m", "infgen", *words],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "PYTHONPATH": str(HERE)},
+                start_new_session=True,
+            )
+
+
+class ForkedRun:
+    """A run in a fork of this process, which imports everything once: it starts at once.
+
+    A fork inherits no threads. So only a process that computes nothing itself may use this.
 
     Args:
         words: Of the command line.
@@ -32,7 +63,6 @@ class ForkedRun:
 
     def __init__(self, words: Sequence[str], said: Path) -> None:
         import_all()
-        self._said = said
         self.returncode: int | None = None
         sys.stdout.flush()
         self.pid = os.fork()
@@ -47,18 +77,18 @@ class ForkedRun:
                 self.returncode = os.waitstatus_to_exitcode(status)
         return self.returncode
 
-    def wait(self, longest_s: float) -> str:
-        """Wait until it has ended; return all it said.
 
-        Raises:
-            TimeoutError: if it takes longer than that.
-        """
-        begun = time.monotonic()
-        while self.poll() is None:
-            if time.monotonic() - begun > longest_s:
-                raise TimeoutError(f"process {self.pid} runs for more than {longest_s} s")
-            time.sleep(POLL_S)
-        return self._said.read_text(errors="replace")
+def wait(run: Run, longest_s: float) -> None:
+    """Wait until a run has ended.
+
+    Raises:
+        TimeoutError: if it takes longer than that.
+    """
+    begun = time.monotonic()
+    while run.poll() is None:
+        if time.monotonic() - begun > longest_s:
+            raise TimeoutError(f"process {run.pid} runs for more than {longest_s} s")
+        time.sleep(POLL_S)
 
 
 def import_all() -> None:
