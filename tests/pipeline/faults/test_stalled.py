@@ -38,7 +38,6 @@ class SlowMount(LocalFileSystem):
     """Local files as ``slow://`` URLs."""
 
     protocol = "slow"
-    cachable = False
     on_read = staticmethod(lambda: time.sleep(ANSWER_S))
 
     def _open(self, path, mode="rb", **more):
