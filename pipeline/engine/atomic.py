@@ -78,7 +78,9 @@ def _refused(path: Path, begun: Path | None, number: int) -> str:
     place = next(folder for folder in path.parents if folder.exists())
     disk, files = shutil.disk_usage(place), os.statvfs(place)
     written = 0 if begun is None else _size(begun)
-    if files.f_files and not files.f_favail:
+    if number == errno.EDQUOT:  # What is free of a quota is not told.
+        needs = f"it needs more than the {written / _MIB:.3g} MiB written so far"
+    elif files.f_files and not files.f_favail:
         needs = f"all {files.f_files} files (inodes) that the disk can hold are in use"
     else:
         needs = (
