@@ -82,14 +82,28 @@ class Cluster:
             time.sleep(POLL_S)
         os.kill(working[number % len(working)], signal.SIGKILL)
 
+    def kill_workers(self) -> None:
+        """End all workers at once; whoever watches over them starts others."""
+        while not (working := self._working()):
+            time.sleep(POLL_S)
+        for process in working:
+            os.kill(process, signal.SIGKILL)
+
+    def freeze_worker(self, number: int) -> None:
+        """Stop one worker: its connections stay, and it does nothing more."""
+        while not (working := self._working()):
+            time.sleep(POLL_S)
+        os.kill(working[number % len(working)], signal.SIGSTOP)
+
     def _working(self) -> list[int]:
         """Process numbers of the workers themselves."""
-        return [
-            child.pid
-            for command in self._workers
-            for child in psutil.Process(command.pid).children()
-            if "spawn_main" in " ".join(child.cmdline())
-        ]
+        found = []
+        for command in self._workers:
+            for child in psutil.Process(command.pid).children():
+                with contextlib.suppress(psutil.Error):  # It has just ended.
+                    if "spawn_main" in " ".join(child.cmdline()):
+                        found.append(child.pid)
+        return found
 
     def stop(self) -> None:
         """End all of it."""

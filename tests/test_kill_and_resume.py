@@ -41,16 +41,25 @@ def test_two_workers_write_the_bytes_of_one_process(trial, quiet):
     script.compare_workers(trial, "local:2", quiet, script.STAGES)
 
 
-PLAYED = ("ingest.max_scenes_per_file=6", "rollout.max_scenes=6", "rollout.count=2")
+PLAYED = (
+    "ingest.max_scenes_per_file=6",
+    "train.validation_scenes=2",
+    "calibrate.method=simulate",
+    "calibrate.max_scenes=2",
+    "calibrate.scenes_per_unit=1",
+    "rollout.max_scenes=6",
+    "rollout.count=2",
+)
+EIGHT = 8
 
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory):
-    """A job that plays six built-in scenes by weights of seconds, and its quiet root."""
+    """A job of all stages on built-in scenes, in a minute, and its quiet root."""
     settings = [word for given in PLAYED for word in ("-s", given)]
     words = ("--records", "builtin", "--profile", "tiny", *settings)
     trial = script.Trial(words, tmp_path_factory.mktemp("played"))
-    trial.make("rollout", trial.folder / "quiet")
+    trial.make(script.ALL_STAGES[-1], trial.folder / "quiet")
     return trial, trial.folder / "quiet"
 
 
@@ -58,6 +67,23 @@ def played(tmp_path_factory):
 def test_rollouts_come_out_byte_for_byte_whatever_is_killed(played, victim):
     trial, quiet = played
     script.kill_stage(trial, "rollout", quiet, kills=1, seed=1, victim=victim)
+
+
+@pytest.mark.parametrize("stage", script.ALL_STAGES[len(script.STAGES) :])
+def test_a_killed_later_stage_comes_out_byte_for_byte_when_run_again(played, stage):
+    trial, quiet = played
+    script.kill_stage(trial, stage, quiet, kills=1, seed=0)
+
+
+@pytest.mark.parametrize("stage", script.ALL_STAGES)
+def test_a_worker_that_is_killed_at_any_stage_changes_no_byte(played, stage):
+    trial, quiet = played
+    script.kill_stage(trial, stage, quiet, kills=1, seed=2, victim="worker")
+
+
+def test_a_report_by_eight_workers_that_are_killed_all_the_time_changes_no_byte(played):
+    trial, quiet = played
+    assert script.kill_throughout(trial, quiet, EIGHT, every_s=4.0, seed=0)
 
 
 def test_two_workers_play_the_bytes_of_one_process(played):

@@ -159,6 +159,14 @@ class RunFlags:
             help="none, local[:N], gpu[:0,1], tcp://HOST:PORT, file:scheduler.json.",
         ),
     ] = "none"
+    unit_timeout: Annotated[
+        float,
+        typer.Option(
+            metavar="MINUTES",
+            help="A unit that takes a Dask worker longer fails; 0: never.",
+            min=0,
+        ),
+    ] = 1440.0
     max_bad: Annotated[
         float,
         typer.Option(
@@ -186,7 +194,11 @@ class RunFlags:
             keep_going=self.keep_going,
             wait=self.wait,
             strict_code=self.strict_code,
-            workers=choose_workers(self.dask, os.environ.get("CUDA_VISIBLE_DEVICES")),
+            workers=choose_workers(
+                self.dask,
+                os.environ.get("CUDA_VISIBLE_DEVICES"),
+                unit_limit_s=60 * self.unit_timeout,
+            ),
         )
 
 

@@ -184,6 +184,8 @@ _LINES = {
     "worker-lost": "{stage}: worker {worker} is lost; what it had under way begins again",
     "device-failed": "{stage}: a worker is restarted, as its device failed in unit {unit}: "
     "{reason}",
+    "unit-timeout": "{stage}: a worker is restarted, as unit {unit} took longer than "
+    "{limit_min:g} minutes",
     "workers-missing": "{stage}: there are no workers; waiting {timeout_min:g} minutes "
     "for one",
     "stage-done": "{stage}: made; {figures}",

@@ -3,6 +3,7 @@
 Everything is synced to disk before it gets its final name.
 """
 
+import errno
 import json
 import os
 import shutil
@@ -22,8 +23,77 @@ TRASH = "trash."
 """Beginning of the names of folders that are being removed; they end in ``PARTIAL``."""
 
 
+_MIB = 1 << 20
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_REFUSALS = (*_FULL, errno.EROFS)
+
+
 class StoreError(ValueError):
     """A file or folder that is missing, damaged or of another schema."""
+
+
+class DiskError(OSError):
+    """The file system refuses a write: it is full, over its quota, or read-only."""
+
+
+@contextmanager
+def naming_refusals(path: Path, begun: Path | None = None) -> Iterator[None]:
+    """Turn a write that the file system refuses into an error that says what is needed.
+
+    Args:
+        path: Final path of what is written.
+        begun: What is written of it so far; None if nothing is.
+
+    Raises:
+        DiskError: naming the path, its size so far, the free space and the way out.
+    """
+    try:
+        yield
+    except Exception as error:
+        number = _refusal(error)
+        if number is None:
+            raise
+        raise DiskError(_refused(path, begun, number)) from error
+
+
+def _refusal(error: BaseException | None) -> int | None:
+    """Return the number of the refusal that an error is, or comes from.
+
+    Errors of libraries carry only its text.
+    """
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        for number in _REFUSALS:
+            if os.strerror(number) in str(error):
+                return number
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def _refused(path: Path, begun: Path | None, number: int) -> str:
+    what = f"{path} cannot be written: {os.strerror(number)}"
+    if number not in _FULL:
+        return f"{what}; make it writable, or name another --root"
+    place = next(folder for folder in path.parents if folder.exists())
+    disk, files = shutil.disk_usage(place), os.statvfs(place)
+    written = 0 if begun is None else _size(begun)
+    if number == errno.EDQUOT:  # What is free of a quota is not told.
+        needs = f"it needs more than the {written / _MIB:.3g} MiB written so far"
+    elif files.f_files and not files.f_favail:
+        needs = f"all {files.f_files} files (inodes) that the disk can hold are in use"
+    else:
+        needs = (
+            f"it needs more than {(written + disk.free) / _MIB:.3g} MiB (written "
+            f"{written / _MIB:.3g}, free {disk.free / _MIB:.3g} of {disk.total / _MIB:.3g})"
+        )
+    return f"{what}; {needs}; make room there and run again: what is finished is kept"
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file, or of all files below a folder."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 @contextmanager
@@ -39,21 +109,24 @@ def publish(target: Path, *, resume: bool = False) -> Iterator[Path]:
             one process may write then.
 
     Raises:
+        DiskError: if the file system refuses a write, also one of the block.
         StoreError: if the folder was removed meanwhile, or another without a manifest is
             in its place.
     """
     mark = "" if resume else f".{uuid.uuid4().hex[:8]}"
     partial = target.with_name(f"{target.name}{mark}{PARTIAL}")
-    partial.mkdir(parents=True, exist_ok=resume)
+    with naming_refusals(target):
+        partial.mkdir(parents=True, exist_ok=resume)
     if resume:
         _remove_partial_files(partial)
     handle = os.open(partial, os.O_RDONLY)
     try:
-        yield partial
-        sync_tree(partial)
-        with signals.uninterrupted():
-            _check_not_replaced(handle, partial)
-            _rename_unless_finished(partial, target)
+        with naming_refusals(target, begun=partial):
+            yield partial
+            sync_tree(partial)
+            with signals.uninterrupted():
+                _check_not_replaced(handle, partial)
+                _rename_unless_finished(partial, target)
     finally:
         os.close(handle)
         if not resume:
@@ -106,14 +179,22 @@ def remove_folder(folder: Path) -> None:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a small file atomically, and sync it."""
+    """Write a small file atomically, and sync it.
+
+    Raises:
+        DiskError: if the file system refuses it; nothing of it is left then.
+    """
     partial = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}{PARTIAL}")
-    with signals.uninterrupted():
-        with partial.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
+    with naming_refusals(path), signals.uninterrupted():
+        try:
+            with partial.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(path)
+        except OSError:
+            partial.unlink(missing_ok=True)
+            raise
         sync_folder(path.parent)
 
 

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from pipeline.engine.atomic import naming_refusals
 from pipeline.engine.layout import Root
 
 Event = Mapping[str, Any]
@@ -19,7 +20,8 @@ Event = Mapping[str, Any]
 - ``unit-done``, ``unit-failed`` (error, trace), ``finish-started``
 - ``progress`` (done, total, note): logged only after some seconds without another event
 - ``worker-full`` (worker, memory_gib): restarted, as it exceeds its memory;
-  ``worker-lost`` (worker, units that start again); ``workers-missing`` (timeout_min)
+  ``worker-lost`` (worker, units that start again); ``workers-missing`` (timeout_min);
+  ``device-failed`` (unit, reason), ``unit-timeout`` (unit, limit_min): its worker restarts
 - around the runs of a preset: ``arm-run-started`` (arm_run, number, arm_runs),
 ``arm-run-failed`` (arm_run,
   why)
@@ -54,16 +56,23 @@ class Events:
             listener(about)
 
     def _write(self, about: dict[str, Any]) -> None:
-        self.log.parent.mkdir(parents=True, exist_ok=True)
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
         line = json.dumps({"time": now, **about}, default=str) + "\n"
-        _append(self.log, line.encode())
+        with naming_refusals(self.log):
+            self.log.parent.mkdir(parents=True, exist_ok=True)
+            _append(self.log, line.encode())
         self._wrote_at = time.monotonic()
 
 
 def _append(path: Path, data: bytes) -> None:
+    """Append a line, whole or not at all: a nearly full disk takes only a part of it."""
     handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+    before = os.fstat(handle).st_size
     try:
-        os.write(handle, data)
+        while data:
+            data = data[os.write(handle, data) :]
+    except OSError:
+        os.ftruncate(handle, before)
+        raise
     finally:
         os.close(handle)

@@ -25,7 +25,13 @@ from pathlib import Path
 from typing import Any
 
 from infgen.errors import ConfigError
-from pipeline.engine.atomic import MANIFEST, PARTIAL, StoreError, sync_folder
+from pipeline.engine.atomic import (
+    MANIFEST,
+    PARTIAL,
+    StoreError,
+    naming_refusals,
+    sync_folder,
+)
 
 RUN = "run.json"
 """Beside the manifest: what differs from run to run ..."""
@@ -173,8 +179,14 @@ def link(name: Path, target: Path) -> None:
     """Make a relative link, or replace it, in one step.
 
     Raises:
+        DiskError: if the file system refuses it.
         StoreError: if there is a file or folder of that name.
     """
+    with naming_refusals(name):
+        _link(name, target)
+
+
+def _link(name: Path, target: Path) -> None:
     name.parent.mkdir(parents=True, exist_ok=True)
     relative = os.path.relpath(target, name.parent)
     if name.is_symlink() and os.readlink(name) == relative:

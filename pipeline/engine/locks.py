@@ -12,13 +12,22 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from pipeline.engine.atomic import naming_refusals
+
 POLL_S = 0.1
 LOCK_TIMEOUT_S = 0.5
 """A lock counts as held after so long; ``is_locked`` takes it for a moment."""
 
 
+_UNSUPPORTED = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+
+
 class LockedError(ValueError):
     """Another run holds the lock."""
+
+
+class UnsupportedLockError(OSError):
+    """The file system has no locks (``flock``)."""
 
 
 @contextmanager
@@ -30,19 +39,23 @@ def locked(path: Path, *, wait: bool = False) -> Iterator[None]:
         wait: Wait until it is free.
 
     Raises:
+        DiskError: if the file system refuses to write it.
         LockedError: if another run holds it and ``wait`` is off, naming host, process and
             start.
+        UnsupportedLockError: if the file system has no locks.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    with naming_refusals(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     try:
         begun = time.monotonic()
-        while not _try_lock(handle, fcntl.LOCK_EX):
+        while not _try_lock(path, handle, fcntl.LOCK_EX):
             if not wait and time.monotonic() - begun > LOCK_TIMEOUT_S:
                 raise LockedError(_locked_message(path))
             time.sleep(POLL_S)
         os.ftruncate(handle, 0)
-        os.pwrite(handle, json.dumps(_this_process()).encode(), 0)
+        with naming_refusals(path):
+            os.pwrite(handle, json.dumps(_this_process()).encode(), 0)
         yield
         os.ftruncate(handle, 0)
     finally:
@@ -50,12 +63,14 @@ def locked(path: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether some process holds a lock."""
+    """Whether some process holds a lock; none does where there are no locks."""
     if not path.is_file():
         return False
     handle = os.open(path, os.O_RDONLY)  # Works without write permission.
     try:
-        return not _try_lock(handle, fcntl.LOCK_SH)
+        return not _try_lock(path, handle, fcntl.LOCK_SH)
+    except UnsupportedLockError:
+        return False
     finally:
         os.close(handle)
 
@@ -69,12 +84,18 @@ def holder(path: Path) -> dict[str, Any]:
     return about if isinstance(about, dict) else {}
 
 
-def _try_lock(handle: int, kind: int) -> bool:
+def _try_lock(path: Path, handle: int, kind: int) -> bool:
     try:
         fcntl.flock(handle, kind | fcntl.LOCK_NB)
     except OSError as error:
         if error.errno in (errno.EAGAIN, errno.EACCES):
             return False
+        if error.errno in _UNSUPPORTED:
+            raise UnsupportedLockError(
+                f"{path} cannot be locked: {error.strerror}; a root must be on a file "
+                "system with flock, or two runs would undo each other's work: mount this "
+                "one with locks, or name another --root"
+            ) from error
         raise
     return True
 

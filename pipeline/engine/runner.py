@@ -14,7 +14,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.engine import signals
-from pipeline.engine.atomic import MANIFEST, PARTIAL, publish, remove_folder, write_json
+from pipeline.engine.atomic import (
+    MANIFEST,
+    PARTIAL,
+    naming_refusals,
+    publish,
+    remove_folder,
+    write_json,
+)
 from pipeline.engine.events import Events
 from pipeline.engine.inputs import FinishedInputs, finished_units
 from pipeline.engine.layout import KEY_DIGITS, Root
@@ -229,7 +236,9 @@ class _StageRun:
                 outcome.error for outcome in outcomes
             )
 
-        self.root.units(self.name).mkdir(parents=True, exist_ok=True)
+        units = self.root.units(self.name)
+        with naming_refusals(units):
+            units.mkdir(parents=True, exist_ok=True)
         executor = workers.executor(here=self.planned.stage.in_driver)
         for outcome in executor.run(todo, may_start, self._progress(), self._emit):
             outcomes.append(outcome)

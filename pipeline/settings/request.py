@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from infgen.errors import ConfigError
-from pipeline.engine.atomic import StoreError, write_file, write_json
+from pipeline.engine.atomic import StoreError, naming_refusals, write_file, write_json
 from pipeline.engine.layout import Root, link, read_json
 from pipeline.engine.plan import Plan, PlanError, make_plan
 from pipeline.settings.lined_yaml import LinedMapping, inner, load
@@ -83,7 +83,8 @@ class Request:
             "keys": {**before, **{stage: plan[stage].key for stage in plan.stages}},
         }
         path = request_file(self.root, name)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        with naming_refusals(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, about)
         link(self.root.refs / LAST, path)
 

@@ -21,6 +21,7 @@ from pipeline.stages.ingest_records import Ingested, iter_ingested
 from pipeline.storage.duplicates import mark_duplicates, report_duplicates
 from pipeline.storage.parquet import make_table, read_tables
 from pipeline.storage.scenes import SCENES_SCHEMA
+from pipeline.storage.sources.changes import check_unchanged
 from pipeline.storage.splits import split_of
 
 if TYPE_CHECKING:
@@ -65,7 +66,11 @@ def plan(inputs: Inputs, settings: IngestSettings) -> Sequence[Unit]:
 
 
 def work(unit: Unit, target: Path, settings: IngestSettings, progress: Progress) -> Report:
-    """Ingest one file or group."""
+    """Ingest one file or group.
+
+    Raises:
+        ChangedSourceError: if it was replaced while it was read.
+    """
     target.mkdir(parents=True, exist_ok=True)
     shard = _Shard(target, unit.name, settings.max_scenes_per_shard)
     for record in iter_ingested(unit.name, unit.task, settings.now_step):
@@ -76,6 +81,7 @@ def work(unit: Unit, target: Path, settings: IngestSettings, progress: Progress)
         ):
             break
     shard.close()
+    check_unchanged(unit.name, unit.task, unit.inputs["source"])
     return shard.report()
 
 

@@ -41,6 +41,7 @@ from pipeline.workers.scheduling import (
     TaskEnded,
     TaskFailure,
     TaskProgress,
+    TimeLimitExceeded,
     WorkerEvent,
     WorkerLost,
     WorkerMemoryFull,
@@ -49,6 +50,7 @@ from pipeline.workers.worker_side import (
     DEVICE,
     DEVICE_TOPIC,
     PROGRESS_TOPIC,
+    TIMEOUT_TOPIC,
     run_with_progress,
 )
 
@@ -71,17 +73,22 @@ WORKERS_TOPIC, MEMORY_TOPIC = "all", "worker-restart-memory"
 """Dask's topics for workers that start and end, and for those it restarts."""
 
 
-def choose_workers(words: str, visible_devices: str | None = None) -> Workers:
+def choose_workers(
+    words: str, visible_devices: str | None = None, unit_limit_s: float = 0.0
+) -> Workers:
     """Return the workers that a word of the command line names.
 
     Args:
         words: As on the command line (``--dask``).
         visible_devices: ``CUDA_VISIBLE_DEVICES`` of this process, if it is set.
+        unit_limit_s: Longest time of a unit on a Dask worker; 0 for any.
 
     Raises:
         ConfigError: for words that name no kind of workers.
     """
-    return DriverWorkers() if words == "none" else DaskWorkers(words, visible_devices)
+    if words == "none":
+        return DriverWorkers()
+    return DaskWorkers(words, visible_devices, unit_limit_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +98,12 @@ class DaskWorkers:
     Attributes:
         words: As on the command line.
         visible_devices: ``CUDA_VISIBLE_DEVICES`` of this process, if it is set.
+        unit_limit_s: Longest time of a unit; 0 for any.
     """
 
     words: str
     visible_devices: str | None = None
+    unit_limit_s: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the word.
@@ -130,7 +139,7 @@ class OpenDaskWorkers:
         if self._executor is None:
             words, visible = self._workers.words, self._workers.visible_devices
             client = self._stack.enter_context(_client(words, visible))
-            pool = DaskPool(client)
+            pool = DaskPool(client, self._workers.unit_limit_s)
             self._stack.callback(pool.close)
             self._executor = PoolExecutor(pool)
         return self._executor
@@ -246,10 +255,15 @@ def gpu_workers(devices: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 class DaskPool:
-    """The workers of a Dask client, as a ``WorkerPool``."""
+    """The workers of a Dask client, as a ``WorkerPool``.
 
-    def __init__(self, client: Any) -> None:
-        self._client = client
+    Args:
+        client: Of Dask, which is not typed.
+        unit_limit_s: Longest time of a unit; 0 for any.
+    """
+
+    def __init__(self, client: Any, unit_limit_s: float = 0.0) -> None:
+        self._client, self._unit_limit_s = client, unit_limit_s
         self._futures: dict[str, Any] = {}
         self._inbox: SimpleQueue[WorkerEvent] = SimpleQueue()
         # Two runs on one cluster may do units of one name, for two roots.
@@ -259,6 +273,7 @@ class DaskPool:
             MEMORY_TOPIC: self._on_memory_full,
             f"{PROGRESS_TOPIC}-{self._mark}": self._on_progress,
             f"{DEVICE_TOPIC}-{self._mark}": self._on_device_failed,
+            f"{TIMEOUT_TOPIC}-{self._mark}": self._on_timeout,
         }
         for topic, hear in self._topics.items():
             client.subscribe_topic(topic, hear)
@@ -277,8 +292,9 @@ class DaskPool:
     def begin(self, name: str, task: Task) -> None:
         """Submit a task as an attempt of that name."""
         key = f"{name}-{self._mark}"
+        arguments = (task, key, self._mark, self._unit_limit_s)
         future = self._client.submit(
-            _run_on_worker, task, key, self._mark, key=key, retries=RETRIES, pure=False
+            _run_on_worker, *arguments, key=key, retries=RETRIES, pure=False
         )
         self._futures[key] = future
         future.add_done_callback(lambda _: self._inbox.put(TaskEnded(name)))
@@ -349,7 +365,12 @@ class DaskPool:
         name = str(about["key"]).removesuffix(f"-{self._mark}")
         self._inbox.put(DeviceFailed(name, str(about["reason"])))
 
+    def _on_timeout(self, event: tuple[float, Mapping[str, Any]]) -> None:
+        about = event[1]
+        name = str(about["key"]).removesuffix(f"-{self._mark}")
+        self._inbox.put(TimeLimitExceeded(name, float(about["limit_s"])))
 
-def _run_on_worker(task: Task, key: str, mark: str) -> Outcome:
+
+def _run_on_worker(task: Task, key: str, mark: str, limit_s: float) -> Outcome:
     """Do a task on the worker that this runs on."""
-    return run_with_progress(_dask().get_worker(), task, key, mark)
+    return run_with_progress(_dask().get_worker(), task, key, mark, limit_s)

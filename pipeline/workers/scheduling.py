@@ -2,7 +2,8 @@
 
 At most two tasks per worker thread are submitted at once, so that the scheduler never holds
 many. Units that were running when workers died are tried again at the end, one at a time:
-this finds the unit that kills its workers, and no other unit fails with it.
+this finds the unit that kills its workers, and no other unit fails with it. A unit that
+takes longer than a unit may is not tried again after that.
 """
 
 import math
@@ -18,6 +19,7 @@ from pipeline.engine.units import Outcome, Task, Tell, WorkersLostError, failure
 RETRIES = 2
 """A unit is retried so often before it counts as failed."""
 TASKS_PER_THREAD = 2
+S_PER_MINUTE = 60.0
 COUNT_WORKERS_EVERY_S = 5.0
 """Workers are counted again after so long."""
 NO_WORKER_TIMEOUT_S = 600.0
@@ -65,7 +67,22 @@ class DeviceFailed:
     reason: str
 
 
-WorkerEvent = TaskEnded | TaskProgress | WorkerMemoryFull | WorkerLost | DeviceFailed
+@dataclass(frozen=True, slots=True)
+class TimeLimitExceeded:
+    """An attempt took longer than a unit may, and its worker ends."""
+
+    name: str
+    limit_s: float
+
+
+WorkerEvent = (
+    TaskEnded
+    | TaskProgress
+    | WorkerMemoryFull
+    | WorkerLost
+    | DeviceFailed
+    | TimeLimitExceeded
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,6 +179,7 @@ class _Schedule:
     _memory_full: set[str] = field(default_factory=set)
     _filled_memory: set[str] = field(default_factory=set)
     _device_failures: dict[str, str] = field(default_factory=dict)
+    _timed_out: dict[str, float] = field(default_factory=dict)
     _counted_at: float = -math.inf
     _workers_seen_at: float = field(default_factory=time.monotonic)
     _workers_missing: bool = False
@@ -200,6 +218,8 @@ class _Schedule:
             self._emit_worker_lost(news)
         elif isinstance(news, DeviceFailed):
             self._emit_device_failed(news)
+        elif isinstance(news, TimeLimitExceeded):
+            self._emit_timed_out(news)
         elif news.name in self.under_way:
             self.progress_of[news.name] = news
             self.emit_progress()
@@ -210,26 +230,37 @@ class _Schedule:
         self.progress_of.pop(name, None)
         if isinstance(found, Outcome):
             return found
-        if found.killed and task.unit.name not in self._tried_again:
-            self._tried_again.add(task.unit.name)
+        unit = task.unit.name
+        if found.killed and unit not in self._tried_again | self._timed_out.keys():
+            self._tried_again.add(unit)
             self.suspects.append(task)
             return None
-        outcome = failure(task.unit.name, found.error, found.trace, 0.0)
-        name = task.unit.name
-        if name in self._filled_memory:
-            more = f"{outcome.error} (a worker that did it filled its memory)"
-            return replace(outcome, error=more)
-        if found.killed and name in self._device_failures:
-            why = self._device_failures[name]
-            more = f"{outcome.error} (it failed the device of its workers: {why})"
-            return replace(outcome, error=more)
-        return outcome
+        outcome = failure(unit, found.error, found.trace, 0.0)
+        why = self._cause(unit, killed=found.killed)
+        return replace(outcome, error=f"{outcome.error} ({why})") if why else outcome
+
+    def _cause(self, unit: str, *, killed: bool) -> str:
+        """Say why the workers of a failed unit ended; empty where that is not known."""
+        if unit in self._filled_memory:
+            return "a worker that did it filled its memory"
+        if killed and unit in self._device_failures:
+            return f"it failed the device of its workers: {self._device_failures[unit]}"
+        if killed and unit in self._timed_out:
+            limit_min = self._timed_out[unit] / S_PER_MINUTE
+            return f"it took longer than --unit-timeout, {limit_min:g} minutes"
+        return ""
 
     def _emit_device_failed(self, news: DeviceFailed) -> None:
         if news.name in self.under_way:
             unit = self.under_way[news.name].unit.name
             self._device_failures[unit] = news.reason
             self.tell("device-failed", unit=unit, reason=news.reason)
+
+    def _emit_timed_out(self, news: TimeLimitExceeded) -> None:
+        if news.name in self.under_way:
+            unit = self.under_way[news.name].unit.name
+            self._timed_out[unit] = news.limit_s
+            self.tell("unit-timeout", unit=unit, limit_min=news.limit_s / S_PER_MINUTE)
 
     def _emit_worker_lost(self, news: WorkerLost) -> None:
         names = [name for name in news.names if name in self.under_way]

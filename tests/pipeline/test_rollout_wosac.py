@@ -17,6 +17,7 @@ from pipeline.stages import ingest
 from pipeline.stages.rollout import STAGE
 from pipeline.storage.rollouts import read_rollouts
 from pipeline.storage.scene_lookup import open_scene_lookup
+from pipeline.storage.sources.fingerprints import fingerprint as file_identity
 from pipeline.storage.weights import save_network, state_dict_of
 from tests.exports.test_wosac import ABOUT
 from tests.metrics.golden import GOLDEN, needs_goldens
@@ -39,7 +40,12 @@ def played(record, metre_moves, bent_roads, tmp_path_factory, quiet):
     """A unit of rollouts of it, played by Waymo's protocol with random weights."""
     root = tmp_path_factory.mktemp("played")
     scenes, weights, target = root / "validation", root / "train", root / "rollouts"
-    ingest.work(Unit("v", {}, {"url": str(record)}), scenes, IngestSettings(), quiet)
+    ingest.work(
+        Unit("v", {"source": file_identity(record)}, {"url": str(record)}),
+        scenes,
+        IngestSettings(),
+        quiet,
+    )
     torch.manual_seed(0)
     network = Network(TINY, metre_moves, bent_roads, TokenSettings())
     for folder in (weights, target):

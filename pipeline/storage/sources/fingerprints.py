@@ -106,10 +106,11 @@ class FingerprintCache:
         return found
 
     def save(self) -> None:
-        """Write the cache. Losing it costs only time."""
+        """Write the cache, unless the disk refuses it. Losing it costs only time."""
         if self._changed:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(self._path, self._known)
+            with suppress(OSError):  # `infgen status` also works on a read-only root.
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                write_json(self._path, self._known)
 
 
 def _damaged_offsets(unit: Path) -> set[int]:
@@ -125,6 +126,13 @@ def _read_cache(path: Path) -> dict[str, list[Any]]:
     except StoreError:
         return {}
     return known if isinstance(known, dict) else {}
+
+
+def fingerprint_again(url: str, expected: str) -> str:
+    """Return the present identity of a file, found in the way of an expected one."""
+    if "://" in url:
+        return _fingerprint_remote(url)
+    return _hash_whole(Path(url)) if expected.startswith(WHOLE) else fingerprint(Path(url))
 
 
 def fingerprint(path: Path) -> str:

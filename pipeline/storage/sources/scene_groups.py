@@ -7,7 +7,7 @@ from its name alone, so that new scenes change few groups.
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from infgen.sources.registry import FoundScene
@@ -52,16 +52,23 @@ def _groups(
         groups[_hash(scene.files.name) % count].append(scene)
     for number, members in sorted(groups.items()):
         members.sort(key=lambda scene: (scene.files.name, scene.files.paths))
-        digest = hashlib.sha256()
-        for scene in members:
-            marks = [memory.fingerprint(path) for path in scene.files.paths]
-            digest.update(repr((scene.files.name, marks)).encode())
         yield Source(
             url=members[0].files.paths[0],
             name=group_name(split, source, number, count),
-            fingerprint=f"scenes:{digest.hexdigest()}",
+            fingerprint=fingerprint_group(members, memory.fingerprint),
             parts=tuple(_part(scene) for scene in members),
         )
+
+
+def fingerprint_group(
+    members: Iterable[FoundScene], fingerprint: Callable[[str], str]
+) -> str:
+    """Return the identity of a group: that of all names and bytes in it, in order."""
+    digest = hashlib.sha256()
+    for scene in members:
+        marks = [fingerprint(path) for path in scene.files.paths]
+        digest.update(repr((scene.files.name, marks)).encode())
+    return f"scenes:{digest.hexdigest()}"
 
 
 def _part(scene: FoundScene) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from pipeline.engine.stage import FinishedUnit, Inputs, Source, Unit
 from pipeline.stages import ingest
 from pipeline.stages.ingest import STAGE
 from pipeline.storage.scenes import read_scenes
+from pipeline.storage.sources.fingerprints import fingerprint as file_identity
 from tests.sources.records import changed, small_scenario, write_tfrecord
 from tests.sources.test_womd import differences, twin_tracks
 
@@ -38,7 +39,7 @@ class Files(Inputs):
 
 
 def run_unit(path: Path, target: Path, **values) -> FinishedUnit:
-    unit = Unit(path.name, {"source": "f"}, {"url": str(path)})
+    unit = Unit(path.name, {"source": file_identity(path)}, {"url": str(path)})
     report = STAGE.work(unit, target, IngestSettings(**values), no_progress)
     return FinishedUnit(path.name, "key", target, report)
 

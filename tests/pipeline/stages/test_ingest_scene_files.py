@@ -17,6 +17,7 @@ from pipeline.engine.stage import Source, Unit
 from pipeline.stages.ingest import STAGE
 from pipeline.storage.scenes import read_scenes
 from pipeline.storage.sources import scene_groups
+from pipeline.storage.sources.changes import ChangedSourceError
 from pipeline.storage.sources.source_files import find_sources
 from pipeline.storage.splits import split_of
 from tests.pipeline.stages.test_ingest import Files, no_progress
@@ -182,6 +183,16 @@ def test_the_identity_of_a_group_is_that_of_its_names_and_bytes(made, tmp_path):
     assert copied == before
     differ = {name for name, mark in changed.items() if mark != before[name]}
     assert differ == {"training.argoverse2-00000-of-00001"}
+
+
+def test_a_scene_file_that_changes_while_its_group_is_read_is_told(made, tmp_path):
+    shutil.copytree(made, tmp_path / "copy")
+    (source,) = find(tmp_path / "root", tmp_path / "copy/av2/train")
+    (path,) = (tmp_path / "copy").rglob("annotations.feather")
+    path.write_bytes(path.read_bytes() + b"x")
+
+    with pytest.raises(ChangedSourceError, match=f"a file of {source.name} changed after"):
+        ingested(source, tmp_path / "unit")
 
 
 def test_many_scenes_make_bounded_groups_and_new_ones_change_few(

@@ -15,6 +15,7 @@ from pipeline.engine.stage import FinishedUnit, Unit
 from pipeline.stages import ingest, vocabulary
 from pipeline.stages.vocabulary import load_vocabularies
 from pipeline.storage.scenes import SCENES_SCHEMA
+from pipeline.storage.sources.fingerprints import fingerprint as file_identity
 from pipeline.storage.weights import vocabulary_fingerprint
 from pipeline.storage.zarr_store import write_records
 
@@ -258,7 +259,7 @@ def test_vocabularies_from_a_few_real_files_write_held_out_scenes_closely(tmp_pa
     done = []
     for file in files:
         target = tmp_path / "ingest" / file.name
-        unit = Unit(file.name, {}, {"url": str(file)})
+        unit = Unit(file.name, {"source": file_identity(file)}, {"url": str(file)})
         report = ingest.work(
             unit, target, IngestSettings(max_scenes_per_file=10), no_progress
         )

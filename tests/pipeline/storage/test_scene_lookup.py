@@ -20,6 +20,7 @@ from pipeline.storage.scene_lookup import (
     open_split,
     unit_folders,
 )
+from pipeline.storage.sources.fingerprints import fingerprint as file_identity
 from pipeline.storage.sources.source_files import RawRecords
 
 
@@ -41,7 +42,12 @@ def records(source):
 def ingested(source, tmp_path_factory):
     target = tmp_path_factory.mktemp("ingested") / "unit"
     settings = replace(IngestSettings(), max_scenes_per_shard=2)
-    ingest.work(Unit(source.name, {}, {"url": str(source)}), target, settings, silent)
+    ingest.work(
+        Unit(source.name, {"source": file_identity(source)}, {"url": str(source)}),
+        target,
+        settings,
+        silent,
+    )
     return target
 
 

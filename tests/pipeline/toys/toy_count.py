@@ -1,7 +1,7 @@
 """Counts the words of every source file. A file that says ``fail`` makes its unit fail, one
-that says ``die`` ends its process, one that says ``hoard`` fills its memory, and one that
-says ``assert`` (or, the first time only, ``assert-once``) fails as CUDA does on a failed
-device."""
+that says ``die`` ends its process, one that says ``hoard`` fills its memory, one that says
+``hang`` never ends, and one that says ``assert`` (or, the first time only,
+``assert-once``) fails as CUDA does on a failed device."""
 
 import os
 import time
@@ -37,6 +37,8 @@ def work(unit, target, settings, progress):
     if "hoard" in words:
         hoard = [bytearray(os.urandom(1) * (1 << 24)) for _ in range(64)]
         time.sleep(len(hoard))
+    while "hang" in words:
+        time.sleep(1)
     for part in range(3):
         time.sleep(settings.sleep_s / 3)
         (target / f"part-{part}.txt").write_text(" ".join(words[part::3]))

@@ -207,9 +207,9 @@ def cluster(tmp_path):
     """``cluster(workers, **settings)``: how it is named to a run, and the cluster."""
     started = []
 
-    def start(workers=1, **settings):
+    def start(workers=1, environment=None, **settings):
         # One death of a worker is enough to suspect a unit.
-        once = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+        once = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0", **(environment or {})}
         paths = [str(path) for path in sys.path if path]
         started.append(Cluster(tmp_path, paths, environment=once, **settings))
         started[-1].start(workers)
@@ -296,6 +296,73 @@ def test_a_worker_that_fills_its_memory_is_restarted_and_told_of(workshop, clust
     assert told.count("worker-full") == 2, "it is tried again, alone, and no more"
     assert 0.3 < next(e for e in events if e["event"] == "worker-full")["memory_gib"] < 1.1
     assert "worker-lost" in told
+
+
+@pytest.mark.slow
+def test_a_unit_that_hangs_ends_with_its_time_and_the_rest_goes_on(workshop, cluster):
+    words, _ = cluster(workers=1)
+    workshop.text("c.txt", "hang")
+    workshop.text("d.txt", "after it")
+    events = []
+    workers = DaskWorkers(words, unit_limit_s=3.0)
+
+    results = workshop.run(
+        run_options=RunOptions(workers=workers, keep_going=True),
+        targets=("count",),
+        events=events,
+    )
+
+    assert results["count"].made == 3
+    assert list(results["count"].errors) == ["c.txt"]
+    why = "(it took longer than --unit-timeout, 0.05 minutes)"
+    assert results["count"].errors["c.txt"].endswith(why)
+    assert [e["unit"] for e in events if e["event"] == "unit-timeout"] == ["c.txt"]
+    assert not list(workshop.root.store.rglob("*.partial/count.json"))
+
+
+@pytest.mark.slow
+def test_a_worker_that_does_not_move_is_given_up_and_its_unit_begins_again(
+    workshop, cluster
+):
+    words, started = cluster(
+        workers=2, environment={"DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "5s"}
+    )
+    workshop.run(targets=("count",))
+    expected = workshop.files()
+    for number in range(4):
+        workshop.text(f"{number}.txt", "word " * number)
+    run_options = RunOptions(workers=DaskWorkers(words))
+    running, found = in_background(
+        functools.partial(workshop.run, run_options=run_options, targets=("count",))
+    )
+    wait_for(lambda: list(workshop.root.units("count").glob("*.partial")))
+
+    started.freeze_worker(0)
+    running.join(timeout=120)
+
+    assert found[0]["count"].state == "made"
+    assert found[0]["count"].made == 4
+    assert expected.items() <= workshop.files().items()
+
+
+@pytest.mark.slow
+def test_when_all_workers_are_killed_their_units_begin_again(workshop, cluster):
+    for number in range(4):
+        workshop.text(f"{number}.txt", "word " * number)
+    words, started = cluster(workers=2)
+    run_options = RunOptions(workers=DaskWorkers(words))
+    job = functools.partial(
+        workshop.run, "count.sleep_s=2", run_options=run_options, targets=("count",)
+    )
+    running, found = in_background(job)
+    wait_for(lambda: done_units(workshop))
+
+    started.kill_workers()
+    running.join(timeout=120)
+
+    assert found[0]["count"].state == "made"
+    assert found[0]["count"].made == 6
+    assert not list(workshop.root.store.rglob("*.partial"))
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from pipeline.workers.scheduling import (
     TaskEnded,
     TaskFailure,
     TaskProgress,
+    TimeLimitExceeded,
     WorkerLost,
     WorkerMemoryFull,
 )
@@ -250,6 +251,20 @@ def test_a_unit_that_failed_the_device_of_its_workers_fails_with_that_reason():
     assert told == [
         ("device-failed", {"unit": unit, "reason": reason}) for unit in ("u0", "u1", "u0")
     ]
+
+
+def test_a_unit_that_takes_too_long_fails_with_that_reason_and_is_not_tried_alone():
+    def hang(name):
+        pool.inbox.put(TimeLimitExceeded(name, 90.0))
+        raise KilledError("its workers ended")
+
+    told, pool = [], Threads(size=1, jobs={"u0": hang})
+
+    (failed, _) = sorted(run(pool, 2, told=told), key=lambda outcome: not outcome.error)
+
+    limit = "it took longer than --unit-timeout, 1.5 minutes"
+    assert failed.error == f"KilledError: its workers ended ({limit})"
+    assert told == [("unit-timeout", {"unit": "u0", "limit_min": 1.5})]
 
 
 def test_progress_of_several_units_is_one_sum():
