@@ -114,9 +114,7 @@ def run(
 
     Example: infgen run report --root R --records '../data/*.tfrecord*' --profile small
 
-    Example: infgen run report --root R --preset towns-benchmark --arms infgen,smart
-
-    Example: infgen run report --preset towns-benchmark --arms infgen,infgen-safe
+    Example: infgen run report --preset towns-benchmark --arms infgen,smart,infgen-safe
 
     A preset trains, simulates and scores several methods alike and compares them.
     """

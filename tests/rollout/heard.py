@@ -185,6 +185,7 @@ def _agents(played):
         pattern=torch.zeros_like(presence),
         cell=told("cell", NO_CELL),
         turn=_turns(presence, played.now),
+        removal=torch.zeros_like(presence),
         told=torch.ones(presence.shape[:2], dtype=torch.bool),
     )
 
@@ -205,6 +206,7 @@ def _entries(played):
     return Insertions(
         asked=(torch.arange(played.tokens) > played.now).expand(shape),
         count=torch.zeros(shape, dtype=torch.int64),
+        add=torch.zeros_like(nobody, dtype=torch.bool),
         agent=nobody,
         cell=torch.zeros_like(nobody),
     )

@@ -80,7 +80,7 @@ def test_limits_of_scenes_reach_all_that_follows(tmp_path):
 
 def test_rollouts_of_calibration_are_counted(tmp_path):
     found = work_of(
-        comparison(tmp_path, preset="towns-benchmark"),
+        comparison(tmp_path, "calibrate.method=simulate", preset="towns-benchmark"),
         {**WOMD, "tuning": WOMD["validation"]},
     )
 
