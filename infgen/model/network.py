@@ -151,8 +151,9 @@ class Network(nn.Module):
             known = roads if self.training else self.roads(batch.roads, covered)
             hidden = self.roads.predict_hidden(batch.roads, known, of_map)
         density = self._density(agents)
+        as_logged = index is not None  # Rows are never taken over in logs.
         return Outputs(
-            motion=self._motion(agents, rows, x, roads, density),
+            motion=self._motion(agents, rows, x, roads, density, as_logged),
             entries=None
             if cells is None
             else _entries(cells, batch, asked, rows, raw, roads, density),
@@ -178,6 +179,7 @@ class Network(nn.Module):
         x: Tensor,
         roads: MapFeatures,
         density: Density | None,
+        as_logged: bool,
     ) -> MotionOutputs:
         """Run the motion stack over the visible agents of all tokens."""
         visible, scene = agents.visible, _count(agents.agent_type)
@@ -186,7 +188,7 @@ class Network(nn.Module):
         pose = agents.pose.flatten(0, 1)  # [scene token, agent, 3]
         visible = visible.flatten(0, 1)
         others = ~torch.eye(visible.shape[1], dtype=torch.bool, device=visible.device)
-        past_index, past_present, past_relation = self._past(agents, rows)
+        past_index, past_present, past_relation = self._past(agents, rows, as_logged)
         reach, token = self.motion.map_reach(), _tokens(agents, rows)
         sight = AgentContext(
             past_relation,
@@ -212,7 +214,9 @@ class Network(nn.Module):
         shapes = self.motion.motion_features()
         return self.motion.foretell(rows, x, agent_type, shapes, sight)
 
-    def _past(self, agents: Agents, rows: Rows) -> tuple[Tensor, Tensor, Shared]:
+    def _past(
+        self, agents: Agents, rows: Rows, as_logged: bool
+    ) -> tuple[Tensor, Tensor, Shared]:
         """Rows, presence and relations of every row's own past, oldest first [N, K]."""
         window = self.settings.temporal_window_tokens
 
@@ -220,11 +224,11 @@ class Network(nn.Module):
             padded = functional.pad(values, (0, 0, window, 0))  # [scene, token, agent]
             return rows.pack(padded.unfold(1, window, 1)[:, :-1])
 
-        # Who is inserted has no past, even if the row was another's before.
-        inserted = agents.presence == int(Presence.INSERTED)
-        life = inserted.cumsum(dim=1)
-        present = past(agents.visible) & (past(life) == rows.pack(life)[:, None])
-        index = past(rows.number)
+        index, present = past(rows.number), past(agents.visible)
+        if not as_logged:  # Who is inserted has no past, even if the row had another's.
+            inserted = agents.presence == int(Presence.INSERTED)
+            life = inserted.cumsum(dim=1)
+            present &= past(life) == rows.pack(life)[:, None]
         pose = rows.pack(agents.pose)
         ago = torch.arange(-window, 0, device=pose.device, dtype=pose.dtype)
         ago = ago.expand(len(index), window)[..., None]

@@ -185,8 +185,8 @@ def _agents(played):
         pattern=torch.zeros_like(presence),
         cell=told("cell", NO_CELL),
         turn=_turns(presence, played.now),
-        removal=torch.zeros_like(presence),
-        told=torch.ones(presence.shape[:2], dtype=torch.bool),
+        removal=torch.zeros_like(presence, dtype=torch.bool),
+        told=torch.ones_like(presence, dtype=torch.bool),
     )
 
 

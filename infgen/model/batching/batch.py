@@ -51,8 +51,6 @@ FORGOTTEN_SHARE = 0.5
 BARE_RIM_SHARE = 0.5
 """Share of scenes in which nobody from beyond the rim is there from the beginning, as in a
 rollout after its first seconds."""
-UNKNOWN = -1
-"""Whether an agent is to be removed, where nothing is to be learned of that."""
 LEFT_TOKENS = 2
 """An agent unseen for so many token steps is removed; near the end of a log it is
 unknown."""
@@ -77,9 +75,10 @@ class Agents:
         cell: Cell of the ego's grid, or ``NO_CELL``.
         turn: Of an agent that enters at this token, its turn among those that do; -1 for
             all others, ``OUTSIDE`` for insertions outside the grid.
-        removal: 1 if this is to be the agent's last token step, 0 if not, or ``UNKNOWN``.
-            It differs from REMOVED ``presence`` only where the network removes agents.
-        told: Whether the log goes on long enough to know the removals at this token.
+        removal: Whether this is to be the agent's last token step. It differs from REMOVED
+            ``presence`` only where the network removes agents.
+        told: Whether that is to be learned. Near a log's end it is not known, and the ego
+            never leaves.
     """
 
     agent_type: Int64[Tensor, "scene agent"]
@@ -93,8 +92,8 @@ class Agents:
     pattern: Int64[Tensor, "scene token agent"]
     cell: Int64[Tensor, "scene token agent"]
     turn: Int64[Tensor, "scene token agent"]
-    removal: Int64[Tensor, "scene token agent"]
-    told: Bool[Tensor, "scene token"]
+    removal: Bool[Tensor, "scene token agent"]
+    told: Bool[Tensor, "scene token agent"]
 
     @property
     def visible(self) -> Bool[Tensor, "scene token agent"]:
@@ -346,6 +345,7 @@ def _keyed(key: str) -> np.random.Generator:
 
 
 def _agents(window: SceneWindow, turn: np.ndarray) -> Arrays:
+    known = np.arange(len(turn.T)) + LEFT_TOKENS < len(turn.T) + window.after
     return {
         "agent_type": window.agent_type,
         "size_lwh_m": window.size_lwh_m,
@@ -358,8 +358,8 @@ def _agents(window: SceneWindow, turn: np.ndarray) -> Arrays:
         "pattern": window.pattern.T,
         "cell": window.cell.T,
         "turn": turn.T,
-        "removal": (window.presence.T == Presence.REMOVED).astype(np.int64),
-        "told": np.arange(len(turn.T)) + LEFT_TOKENS < len(turn.T) + window.after,
+        "removal": window.presence.T == Presence.REMOVED,
+        "told": known[:, None] & (np.arange(len(turn)) > 0),
     }
 
 

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from infgen.model.batching.batch import UNKNOWN, Agents, Batch
+from infgen.model.batching.batch import Agents, Batch
 from infgen.model.batching.padding import NOBODY
 from infgen.model.batching.tensors import map_tensors
 from infgen.model.long_memory import count_around
@@ -237,7 +237,7 @@ class _Simulation:
             (played.pattern, 0),
             (played.cell, NO_CELL),
             (played.turn, -1),
-            (played.removal, 0),
+            (played.removal, False),
         ):
             values[:, token].masked_fill_(who, nothing)
 
@@ -258,7 +258,7 @@ class _Simulation:
         uniform = self.uniforms.draw(*who.shape)
         if logit is None:
             return
-        who = who & self.logged.told[:, token, None]
+        who = who & self.logged.told[:, token].any(dim=1, keepdim=True)
         who[:, EGO] = False
         leaves = uniform < torch.sigmoid(logit.double())
         stays = torch.where(leaves, REMOVED, PRESENT)
@@ -304,16 +304,19 @@ class _Simulation:
         self, token: int, matched: Tensor, surplus: Tensor, logit: Tensor | None
     ) -> None:
         """Say who is to be removed [scene, agent]; of other surplus agents nothing."""
-        removal = self.played.removal[:, token]
-        removal.masked_fill_(surplus, UNKNOWN)
+        removal, told = self.played.removal[:, token], self.logged.told[:, token]
+        known = told.any(dim=1, keepdim=True)
+        self.played.told[:, token] = told & ~surplus
         if logit is None:
             return
         more = self._correction(self._excess(token - 1, inserted=True))
         readiness = logit.masked_fill(~surplus, -torch.inf)
-        removal.masked_fill_(_first(readiness, more) & surplus, 1)
-        leaving = matched & (removal == 1)
+        ready = _first(readiness, more) & surplus
+        removal |= ready
+        self.played.told[:, token] |= known & ready
+        leaving = matched & removal
         reluctance = (-logit).masked_fill(~leaving, -torch.inf)
-        removal.masked_fill_(_first(reluctance, -more) & leaving, 0)
+        removal &= ~(_first(reluctance, -more) & leaving)
 
     def _to_insert(self, token: int) -> tuple[Tensor, Tensor]:
         """Agents to insert [scene, agent] in the insertion order, and their number."""
@@ -392,6 +395,6 @@ def _with_rows(agents: Agents, more: int) -> Agents:
         values, fill = getattr(agents, each.name), nothing.get(each.name, 0)
         if each.name in ("pose", "size_lwh_m"):
             padded[each.name] = pad(values, (0, 0, 0, more), value=fill)
-        elif each.name != "told":
+        else:
             padded[each.name] = pad(values, (0, more), value=fill)
     return replace(agents, **padded)

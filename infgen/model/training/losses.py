@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from infgen.model.batching.batch import UNKNOWN, Agents, Batch
+from infgen.model.batching.batch import Agents, Batch
 from infgen.model.logits import (
     DetailOutputs,
     InsertionOutputs,
@@ -136,10 +136,7 @@ def stay_mask(agents: Agents) -> Tensor:
     All from entering to the last but one at which the agent is seen. Not the ego: it never
     leaves. Nor at a log's end, where who is lost for a moment does not come back.
     """
-    mask = pattern_mask(agents) & _next(agents.told, False)[..., None]
-    mask &= _next(agents.removal, UNKNOWN) != UNKNOWN
-    mask[:, :, EGO] = False
-    return mask
+    return pattern_mask(agents) & _next(agents.told, False)
 
 
 def pattern_mask(agents: Agents) -> Tensor:
@@ -180,7 +177,7 @@ def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> 
 def _stay(rows: Rows, remove_logit: Tensor, agents: Agents) -> Term:
     mask = rows.pack(stay_mask(agents))
     chosen = Chosen.of(mask)
-    leaves = chosen.take(rows.pack(_next(agents.removal, 0))) == 1
+    leaves = chosen.take(rows.pack(_next(agents.removal, False)))
     return _event(chosen, chosen.take(remove_logit), leaves)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from infgen.config import TrainSettings
-from infgen.model.batching.batch import UNKNOWN, collate
+from infgen.model.batching.batch import collate
 from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.training.closed_loop_population import (
     CORRECTION_TOKENS,
@@ -152,7 +152,7 @@ def test_a_network_that_removes_everybody_is_to_remove_fewer_and_insert_more(
 
     # The first decision is on the second token step.
     others = played.agents.presence[:, 2:, 1:]
-    told = logged.agents.told[:, 1, None]
+    told = logged.agents.told[:, 1].any(dim=1, keepdim=True)
     stayed = played.agents.presence[:, 1, 1:] == int(Presence.PRESENT)
     assert not (stayed & told).any()
     assert (others == int(Presence.PRESENT)).sum() < (
@@ -169,11 +169,13 @@ def test_a_network_that_inserts_always_is_to_remove_some_surplus_and_learns_noth
     played = close_population_loop(network, logged, 3, 0)
 
     agents, rows = played.agents, logged.agents.presence.shape[2]
-    surplus = agents.removal[..., rows:][agents.observed[..., rows:]]
-    assert set(surplus.tolist()) == {UNKNOWN, 1}
+    surplus = agents.observed[..., rows:] & logged.agents.told.any(dim=2, keepdim=True)
+    removal, told = agents.removal[..., rows:], agents.told[..., rows:]
+    assert torch.equal(removal[surplus], told[surplus])
+    assert removal[surplus].any()
+    assert not removal[surplus].all()
     mask = stay_mask(agents)
-    unknown = torch.roll(agents.removal, -1, dims=1) == UNKNOWN
-    assert not (mask & unknown).any()
+    assert not (mask[:, :-1] & ~agents.told[:, 1:]).any()
     assert not played.entries.add[:, 3:, 1:].any()
 
 
@@ -285,5 +287,5 @@ def test_the_log_and_targets_of_a_batch_as_logged_agree(logged):
     agents, entries = logged.agents, logged.entries
     removed = agents.presence == int(Presence.REMOVED)
 
-    assert torch.equal(agents.removal == 1, removed)
+    assert torch.equal(agents.removal, removed)
     assert torch.equal(entries.add, entries.agent >= 0)
