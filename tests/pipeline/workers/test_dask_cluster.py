@@ -325,7 +325,7 @@ def test_a_worker_that_does_not_move_is_given_up_and_its_unit_begins_again(
     workshop, cluster
 ):
     words, started = cluster(
-        workers=2, environment={"DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "5s"}
+        workers=2, environment={"DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "15s"}
     )
     workshop.run(targets=("count",))
     expected = workshop.files()
@@ -338,7 +338,7 @@ def test_a_worker_that_does_not_move_is_given_up_and_its_unit_begins_again(
     wait_for(lambda: list(workshop.root.units("count").glob("*.partial")))
 
     started.freeze_worker(0)
-    running.join(timeout=120)
+    running.join(timeout=400)
 
     assert found[0]["count"].state == "made"
     assert found[0]["count"].made == 4
@@ -358,7 +358,7 @@ def test_when_all_workers_are_killed_their_units_begin_again(workshop, cluster):
     wait_for(lambda: done_units(workshop))
 
     started.kill_workers()
-    running.join(timeout=120)
+    running.join(timeout=400)
 
     assert found[0]["count"].state == "made"
     assert found[0]["count"].made == 6
