@@ -49,7 +49,15 @@ STAGES = ("ingest", "build-vocab", "tokenize")
 ALL_STAGES = (*STAGES, "train", "calibrate", "rollout", "reference", "score", "report")
 VICTIMS = ("run", "worker", "workers", "scheduler")
 WORKERS = ("local:1", "local:2", "local:4")
-PER_RUN = {"run.json", "lock", "attempt.json", "pace.jsonl", "trained.json"}
+PER_RUN = {
+    "run.json",
+    "lock",
+    "attempt.json",
+    "pace.jsonl",
+    "trained.json",
+    "passport.html",
+}
+"""Files that tell of machines and times, which no manifest lists."""
 POLL_S = 0.005
 TRIES = 4
 """A kill that comes when all is done does not count; the next draws another moment."""
