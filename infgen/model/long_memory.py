@@ -27,7 +27,7 @@ AVERAGED_TOKENS = (6, 60)
 """Time constants, in token steps, of the moving averages of the number of agents: 3 s for
 its recent course, 30 s for how dense traffic has been."""
 MOVED_M = 0.5
-"""Whoever gets no farther in one token step stands."""
+"""An agent that gets no farther in one token step stands."""
 MAX_STOOD_TOKENS = 16
 """Longer standing is seen as this long: about the longest that training windows show."""
 
@@ -121,7 +121,7 @@ class Standing:
 
     @classmethod
     def unknown(cls, like: Tensor) -> "Standing":
-        """Nobody has been seen yet."""
+        """No agent has been seen yet."""
         return cls(torch.zeros_like(like, dtype=torch.int64), torch.zeros_like(like) > 0)
 
     def take(self, rows: Int64[Tensor, " row"]) -> "Standing":
@@ -182,7 +182,7 @@ def moves_between(
         before: Poses one token step earlier ...
         known: ... and whether they were seen.
         pose: Poses now.
-        presence: ``Presence`` now; whoever is inserted has not moved yet.
+        presence: ``Presence`` now; inserted agents have not moved yet.
     """
     square_m2 = (pose[..., :2] - before[..., :2]).square().sum(dim=-1)
     return known & (square_m2 > MOVED_M**2) & (presence != int(Presence.INSERTED))

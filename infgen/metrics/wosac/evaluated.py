@@ -2,7 +2,7 @@
 
 WOMD names up to eight tracks of each scene that are hard to predict; the official metric
 evaluates them and the recording car. Other sources are scored alike: of the road users seen
-now and long after, the one of each type that moves farthest, and then whoever does.
+now and long after, the one of each type that moves farthest, and then any other.
 """
 
 import numpy as np

@@ -5,8 +5,8 @@ removes agents while the scene is simulated, and learns from the state that it g
 
 - At every token step each agent is removed with the probability that the network gives it,
   and at every insertion turn one more is inserted with the probability that it gives.
-- Whoever is in the log but not simulated is *missing*; whoever is simulated but not, or no
-  longer, in the log is *surplus*. The *excess* is the number of the ones less the other.
+- An agent of the log that is not simulated is *missing*; one that is simulated but not, or
+  no longer, in the log is *surplus*. The *excess* is the number of the ones less the other.
 - As many insertions and removals are to be learned as the log has in this token step,
   corrected by a share of the excess: half of the correction by insertions, half by
   removals, so that in the mean the flow is that of the log. To be inserted are missing
@@ -64,8 +64,8 @@ CORRECTION_TOKENS = 6
 SURPLUS_TOP_K = 32
 """Surplus agents sample from so many most likely motion tokens if ``top`` is 0."""
 FRESH_TOKENS = 2
-"""Whoever came into view at most so many token steps ago is fresh: it is still about where
-agents come into view."""
+"""An agent that came into view at most so many token steps ago is fresh: it is still about
+where agents come into view."""
 ALL_STEPS = 31
 """Validity pattern of an agent that is seen at all steps of a token step."""
 ABSENT, PRESENT, INSERTED, REMOVED = (int(each) for each in Presence)
@@ -227,7 +227,7 @@ class _Simulation:
         return token_step_at(self.played, token)
 
     def _clear(self, token: int, who: Tensor) -> None:
-        """Let nobody be in some rows [scene, agent]."""
+        """Free some rows [scene, agent]."""
         played = self.played
         for values, nothing in (
             (played.presence, ABSENT),
