@@ -83,7 +83,7 @@ class Cluster:
         os.kill(working[number % len(working)], signal.SIGKILL)
 
     def kill_workers(self) -> None:
-        """End all workers at once; whoever watches over them starts others."""
+        """End all workers at once; their supervisors start others."""
         while not (working := self._working()):
             time.sleep(POLL_S)
         for process in working:

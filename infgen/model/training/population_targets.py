@@ -19,8 +19,8 @@ class InsertionTurns:
 
     Attributes:
         count: Agents that were inserted [scene, token].
-        add: Whether somebody is missing at each turn [scene, token, slot].
-        agent: The next of them, if it is fresh, or ``NOBODY`` [scene, token, slot].
+        add: Whether an agent is to be inserted at each turn [scene, token, slot].
+        agent: That agent, if it is fresh, or ``NOBODY`` [scene, token, slot].
     """
 
     count: Tensor
