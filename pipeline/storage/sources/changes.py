@@ -6,11 +6,10 @@ kept under the key of another content.
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from pipeline.engine.atomic import StoreError
-from pipeline.storage.sources.fingerprints import fingerprint, fingerprint_again
+from pipeline.storage.sources.fingerprints import fingerprint_again
 from pipeline.storage.sources.scene_groups import fingerprint_group, scene_of
 
 
@@ -32,7 +31,7 @@ def check_unchanged(name: str, task: Mapping[str, Any], expected: str) -> None:
     """
     if "scenes" in task:
         members = [scene_of(part) for part in task["scenes"]]
-        found, place = fingerprint_group(members, _fingerprint_file), f"a file of {name}"
+        found, place = fingerprint_group(members, fingerprint_again), f"a file of {name}"
     else:
         found, place = fingerprint_again(task["url"], expected), task["url"]
     if found != expected:
@@ -40,7 +39,3 @@ def check_unchanged(name: str, task: Mapping[str, Any], expected: str) -> None:
             f"{place} changed after this run had begun (its content is {found}, expected "
             f"{expected}); nothing of it is kept: run again when it no longer changes"
         )
-
-
-def _fingerprint_file(path: str) -> str:
-    return fingerprint(Path(path))

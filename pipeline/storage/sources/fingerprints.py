@@ -128,9 +128,9 @@ def _read_cache(path: Path) -> dict[str, list[Any]]:
     return known if isinstance(known, dict) else {}
 
 
-def fingerprint_again(url: str, expected: str) -> str:
+def fingerprint_again(url: str, expected: str = "") -> str:
     """Return the present identity of a file, found in the way of an expected one."""
-    if "://" in url:
+    if is_url(url):
         return _fingerprint_remote(url)
     return _hash_whole(Path(url)) if expected.startswith(WHOLE) else fingerprint(Path(url))
 

@@ -34,6 +34,7 @@ from pipeline.engine.stage import Unit
 from pipeline.stages import ingest
 from pipeline.storage.rollouts import ROLLOUTS_SCHEMA, read_rollouts
 from pipeline.storage.scene_lookup import open_scene_lookup
+from pipeline.storage.sources.fingerprints import fingerprint as file_identity
 from pipeline.storage.zarr_store import write_records
 from tests.exports.replays import replay, with_newcomer, without
 from tests.exports.submission_proto import Submission
@@ -58,7 +59,10 @@ def silent(done, total, note=""):
 def logs(source, tmp_path_factory):
     target = tmp_path_factory.mktemp("logs") / "unit"
     ingest.work(
-        Unit(source.name, {}, {"url": str(source)}), target, IngestSettings(), silent
+        Unit(source.name, {"source": file_identity(source)}, {"url": str(source)}),
+        target,
+        IngestSettings(),
+        silent,
     )
     return target
 

@@ -18,6 +18,7 @@ from pipeline.commands.wosac import score_files
 from pipeline.engine.stage import Unit
 from pipeline.stages import ingest
 from pipeline.storage.rollouts import ROLLOUTS_SCHEMA
+from pipeline.storage.sources.fingerprints import fingerprint as file_identity
 from pipeline.storage.zarr_store import write_records
 from tests.metrics.golden import GOLDEN, golden_metrics, needs_goldens
 from tests.metrics.wosac.test_submission import scenario, submission
@@ -39,7 +40,7 @@ def silent(done, total, note=""):
 @pytest.fixture(scope="module")
 def ingested(source, tmp_path_factory):
     target = tmp_path_factory.mktemp("ingested") / "unit"
-    unit = Unit(source.name, {}, {"url": str(source)})
+    unit = Unit(source.name, {"source": file_identity(source)}, {"url": str(source)})
     ingest.work(unit, target, IngestSettings(), silent)
     return target
 
