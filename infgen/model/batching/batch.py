@@ -146,7 +146,7 @@ class Insertions:
         asked: Whether there is an insertion query at this token (never at the first, nor
             at the last of a log).
         count: Inserted agents within the grid at this token, also those beyond the last
-            slot.
+            slot; the decisions to learn are so many and one.
         add: Whether an agent is to be inserted at each turn. Where the network inserts
             agents, that is not always known to be one that ``agent`` could name.
         agent: The agent to be inserted at each turn, or ``NOBODY``.

@@ -13,7 +13,7 @@ removes agents while the scene is simulated, and learns from the state that it g
   agents, those first that came into view last; to be removed are those whom the log
   removes, and of the surplus those whom the network is most ready to remove.
 - An insertion that the network makes is that of the next agent to be inserted, at its
-  logged pose; or, if there is none, of the agent that the network samples.
+  logged pose; or of one that it samples, and then nothing is learned of later turns.
 
 To remove all surplus and to insert all missing agents at once, the obvious targets, would
 teach several times the flow of the log: it cannot be seen who is surplus, so all agents
@@ -220,7 +220,7 @@ class _Simulation:
             row = torch.where(left, following, self.used[active])
             self._place(token, turn, (active, row), left, invented)
             self.used[active] += (~left).long()
-            self.turns.count[active, token] += 1
+            self.turns.count[active, token] += left.long()
             entries = self._show(entries, token, (active, row))
 
     def _token_step(self, token: int) -> TokenStep:

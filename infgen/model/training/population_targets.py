@@ -18,7 +18,9 @@ class InsertionTurns:
     """What is learned at the insertion turns.
 
     Attributes:
-        count: Agents that were inserted [scene, token].
+        count: Agents that were inserted and were to be [scene, token]: one turn more is
+            learned. Those after it would teach how often so many more are inserted, where
+            the network is to know it of the steps that insert so many at all.
         add: Whether an agent is to be inserted at each turn [scene, token, slot].
         agent: That agent, if it is fresh, or ``NOBODY`` [scene, token, slot].
     """

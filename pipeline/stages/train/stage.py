@@ -213,7 +213,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=5,
+    version=6,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,
