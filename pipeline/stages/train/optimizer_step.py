@@ -147,7 +147,8 @@ class OptimizerStep:
 
     def _add(self, lessons: Lessons, weight: Tensor, number: int) -> dict[str, None]:
         """Add the gradient and the sums of one part; return the names of its terms."""
-        settings, names = self._settings, {}
+        settings = self._settings
+        names: dict[str, None] = {}
         if lessons.rollouts is not None:
             self._rollouts += lessons.rollouts.sums
         for terms, surprise in each_terms(lessons, self._training, self.forward, settings):

@@ -59,7 +59,7 @@ def simulate_lessons(
     reward = costs.reward(settings)
 
     def grouped(values: Tensor) -> Tensor:
-        return values.unflatten(0, (group, -1))
+        return values.reshape(group, -1, *values.shape[1:])
 
     advantage = advantages(
         discounted_returns(grouped(reward), settings.policy_discount),

@@ -119,7 +119,7 @@ def find_overlaps(
     last. Two pedestrians do not: groups walk closer than their boxes.
     """
     pays = np.zeros(seen.moved.shape, dtype=bool)
-    for token in range(1, pays.shape[1]):
+    for token in range(1, seen.pose.shape[1]):
         there = seen.moved[:, token] | seen.inserted[:, token]
         rollout, one, two = _near_pairs(seen, token, there)
         some = _begin_to_overlap(seen, token, (rollout, one, two), vocabulary)
@@ -219,8 +219,8 @@ def log_distance(rollouts: SimulatedRollouts) -> tuple[Tensor, Tensor]:
     agents, logged, group = rollouts.batch.agents, rollouts.logged, rollouts.count
     counts = rollouts.moved & rollouts.known[:, None] & logged.observed
     gap_m = (agents.pose[..., :2] - logged.pose[..., :2]).norm(dim=-1)
-    xy_m = agents.pose[..., :2].unflatten(0, (group, -1))
-    there = counts.unflatten(0, (group, -1))
+    xy_m = agents.pose[..., :2].reshape(group, -1, *gap_m.shape[1:], 2)
+    there = counts.view(group, -1, *gap_m.shape[1:])
     between = torch.zeros_like(gap_m)
     for number in range(group):
         away_m = (xy_m - xy_m[number]).norm(dim=-1)

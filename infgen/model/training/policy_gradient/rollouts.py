@@ -188,7 +188,8 @@ class _FreeSimulation(Simulation):
 
     def _sample_motion(self, token: int, who: Tensor, said: MotionStep) -> None:
         """Move agents as the network samples."""
-        at = who.nonzero(as_tuple=True)
+        scene, row = who.nonzero(as_tuple=True)
+        at = scene, row
         agent_type = self.played.agent_type[at]
         logits = said.packed.motion_logits[said.packed.rows.number[at]]
         likely = log_probabilities(logits, self.stationary[agent_type], self.top_p)
