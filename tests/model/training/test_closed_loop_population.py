@@ -10,11 +10,11 @@ from infgen.model.batching.batch import collate
 from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.training.closed_loop_population import (
     CORRECTION_TOKENS,
-    SURPLUS_ROWS,
     close_population_loop,
 )
 from infgen.model.training.losses import losses, stay_mask, total
 from infgen.model.training.own_choices import UniformNumbers, choose_among
+from infgen.model.training.simulation import FREE_ROWS
 from infgen.tokens.grid import from_grid, make_grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence
 
@@ -76,7 +76,7 @@ def test_somebody_is_missing_somebody_surplus_and_somebody_inserted_again(
     there = logged.agents.visible
     simulated = played.agents.visible[..., :rows]
 
-    assert played.agents.presence.shape[2] == rows + SURPLUS_ROWS
+    assert played.agents.presence.shape[2] == rows + FREE_ROWS
     assert (there & ~simulated).any()
     assert (simulated & ~there).any()
     assert played.agents.visible[..., rows:].any()
