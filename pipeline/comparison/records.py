@@ -40,6 +40,7 @@ def town_orders(comparison: Comparison) -> Iterator[Order]:
             seed=towns.seed,
             split=split,
             scenes_per_file=towns.scenes_per_file,
+            variety=towns.variety,
         )
 
 

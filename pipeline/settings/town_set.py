@@ -1,5 +1,7 @@
 """Settings of the synthetic towns that a preset reads where no records are named."""
 
+from typing import Literal
+
 from pydantic.dataclasses import dataclass
 
 from infgen.settings import RULES, AtLeastOne, Positive, Seed
@@ -17,3 +19,5 @@ class TownSet:
     """Another seed gives other towns."""
     scenes_per_file: AtLeastOne = 20
     """Most scenes of a file."""
+    variety: Literal["basic", "broad"] = "basic"
+    """How much towns differ in streets, drivers and demand."""

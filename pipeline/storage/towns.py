@@ -9,18 +9,21 @@ import json
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from infgen.errors import ConfigError
 from pipeline.engine import signals
 from pipeline.engine.atomic import PARTIAL, write_file, write_json
 from pipeline.engine.events import Event
 from pipeline.engine.locks import locked
+
+if TYPE_CHECKING:
+    from infgen.sources.towns.variety import Variety
 
 VERSION = 6
 """Raised when the same order would give other bytes."""
@@ -40,6 +43,7 @@ class Order:
         split: First part of the file names.
         scenes_per_file: Scenes of each file but perhaps the last.
         jobs: Processes that work side by side; 0 for one per core.
+        variety: How much towns differ, by name (``infgen.sources.towns.variety``).
     """
 
     out: Path
@@ -49,6 +53,7 @@ class Order:
     split: str
     scenes_per_file: int
     jobs: int = 0
+    variety: str = "basic"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be made.
@@ -67,6 +72,10 @@ class Order:
             )
         if self.jobs < 0:
             raise ConfigError(f"{self.jobs} jobs; expected 1 or more, or 0 for all cores")
+        if self.variety not in _varieties():
+            raise ConfigError(
+                f"towns of variety {self.variety!r}; expected {' or '.join(_varieties())}"
+            )
 
     @property
     def num_steps(self) -> int:
@@ -93,6 +102,7 @@ class Part:
     num_steps: int
     first: int
     count: int
+    variety: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +161,10 @@ def write_part(part: Part) -> Path:
     from infgen.sources.towns.numbering import draw_scenes  # noqa: PLC0415
     from infgen.sources.womd_write import encode_scenario, tfrecord  # noqa: PLC0415
 
-    scenes = draw_scenes(part.seed, part.split, part.num_steps, part.first, part.count)
+    variety = _varieties()[part.variety]
+    scenes = draw_scenes(
+        part.seed, part.split, part.num_steps, part.first, part.count, variety
+    )
     records = [encode_scenario(scene) for scene in scenes]
     write_file(part.path, tfrecord(records, zipped=True))
     return part.path
@@ -165,13 +178,19 @@ def _begin(order: Order) -> None:
     """
     for left in order.out.glob(f"{order.split}.*{PARTIAL}"):
         left.unlink()
-    asked = {"version": VERSION, "scenes": order.scenes, "steps": order.num_steps}
+    asked: dict[str, object] = {
+        "version": VERSION,
+        "scenes": order.scenes,
+        "steps": order.num_steps,
+    }
     asked |= {"seed": order.seed, "scenes_per_file": order.scenes_per_file}
+    asked |= {"variety": order.variety}
     path = order.out / f"{order.split}.towns.json"
     if not path.is_file():
         write_json(path, asked)
         return
-    there = json.loads(path.read_text())
+    # Towns that name no variety were written before there were several.
+    there: dict[str, object] = {"variety": "basic", **json.loads(path.read_text())}
     for name, value in asked.items():
         if there.get(name) != value:
             raise ConfigError(
@@ -180,11 +199,19 @@ def _begin(order: Order) -> None:
             )
 
 
+def _varieties() -> "Mapping[str, Variety]":
+    from infgen.sources.towns.variety import VARIETIES  # noqa: PLC0415  # Numpy: 0.1 s.
+
+    return VARIETIES
+
+
 def _parts(order: Order) -> Iterator[Part]:
     for shard, path in enumerate(order.paths):
         first = shard * order.scenes_per_file
         count = min(order.scenes_per_file, order.scenes - first)
-        yield Part(path, order.split, order.seed, order.num_steps, first, count)
+        yield Part(
+            path, order.split, order.seed, order.num_steps, first, count, order.variety
+        )
 
 
 def _made(parts: list[Part], jobs: int) -> Iterator[Path]:

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from infgen.sources.towns.numbering import SCENES_PER_TOWN, draw_scenes
+from infgen.sources.towns.numbering import draw_scenes
+from infgen.sources.towns.variety import BASIC
 from infgen.sources.womd_write import encode_scenario, write_tfrecord
 
 BUILTIN_SEED = 2
@@ -23,7 +24,9 @@ def builtin_numbers(split: str) -> list[int]:
     """Numbers of the scenes of a split, in the order of the files."""
     towns, _ = BUILTIN[split]
     return [
-        town * SCENES_PER_TOWN + at for town in range(towns) for at in range(SCENES_EACH)
+        town * BASIC.scenes_per_town + at
+        for town in range(towns)
+        for at in range(SCENES_EACH)
     ]
 
 

@@ -7,11 +7,10 @@ from infgen.scene import Scene
 from infgen.sources.towns.recording.scenes import draw_place, record
 from infgen.sources.towns.recording.viewpoints import View, draw_views
 from infgen.sources.towns.town import Town, make_town, stream
+from infgen.sources.towns.variety import BASIC, Variety
 
 FROM_RIM_M = 125.0
 """Recording cars keep so far from where streets end."""
-SCENES_PER_TOWN = 10
-"""Recorded in each town: other cars, other times."""
 LEAST_STEPS = 500
 """A town is played for at least so long, after it has warmed up."""
 WIDE_STEPS = 311
@@ -20,11 +19,16 @@ turns now and then gets as far as the root of time."""
 
 
 def draw_scenes(
-    seed: int, split: str, num_steps: int, first: int, count: int
+    seed: int,
+    split: str,
+    num_steps: int,
+    first: int,
+    count: int,
+    variety: Variety = BASIC,
 ) -> Iterator[Scene]:
     """Draw scenes of a split by number.
 
-    Each depends on the seed, the split, its length and its number alone.
+    Each depends on the seed, the split, its length, its number and the variety alone.
 
     Args:
         seed: Other scenes for another seed.
@@ -32,32 +36,33 @@ def draw_scenes(
         num_steps: Length of each scene, in steps of 0.1 s.
         first: Number of the first scene.
         count: How many.
+        variety: Ranges that towns are drawn from.
 
     Raises:
         SumoError: if SUMO is missing or fails.
     """
-    numbers = range(first, first + count)
-    for place, wanted in groupby(numbers, key=lambda number: number // SCENES_PER_TOWN):
-        name = f"towns/{seed}/{split}/{num_steps}/{place}"
-        town, views = _find_town(name, num_steps)
+    numbers, each = range(first, first + count), variety.scenes_per_town
+    kind = "towns" if variety is BASIC else f"towns-{variety.name}"
+    for place, wanted in groupby(numbers, key=lambda number: number // each):
+        name = f"{kind}/{seed}/{split}/{num_steps}/{place}"
+        town, views = _find_town(name, num_steps, variety)
         placed = draw_place(stream(name, "place"))
         for number in wanted:
-            at = number % SCENES_PER_TOWN
+            at = number % each
             rng = stream(name, "scene", at)
             scenario_id = rng.bytes(8).hex()
             yield record(scenario_id, town, views[at], num_steps, placed, rng)
 
 
-def _find_town(name: str, num_steps: int) -> tuple[Town, list[View]]:
+def _find_town(name: str, num_steps: int, variety: Variety) -> tuple[Town, list[View]]:
     """Draw towns until one has enough to record."""
     spread = max(1.0, num_steps / WIDE_STEPS) ** 0.5
     attempt = 0
     while True:
-        town = make_town(
-            stream(name, "town", attempt), max(LEAST_STEPS, 3 * num_steps // 2), spread
-        )
+        steps = max(LEAST_STEPS, 3 * num_steps // 2)
+        town = make_town(stream(name, "town", attempt), steps, spread, variety)
         rng = stream(name, "views", attempt)
-        views = draw_views(town, SCENES_PER_TOWN, num_steps, FROM_RIM_M, rng)
-        if len(views) == SCENES_PER_TOWN:
+        views = draw_views(town, variety.scenes_per_town, num_steps, FROM_RIM_M, rng)
+        if len(views) == variety.scenes_per_town:
             return town, views
         attempt += 1

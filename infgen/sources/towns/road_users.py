@@ -1,11 +1,12 @@
 """Bodies of road users: what they are, how large, and how they drive."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
 from infgen.scene import AgentType
+from infgen.sources.towns.variety import BASIC, CarFollowing, DriverVariety
 
 
 class BodyType(Enum):
@@ -54,6 +55,25 @@ _SPREAD_LWH_M = {
 
 
 @dataclass(frozen=True, slots=True)
+class LaneChanging:
+    """How a driver changes lanes; 1 is SUMO's default of the first three.
+
+    Attributes:
+        speed_gain: Eagerness to overtake.
+        cooperation: Readiness to let others in.
+        assertiveness: Readiness to accept small gaps.
+        keep_right: Eagerness to go back to the right lane.
+        lateral_mps: Highest lateral speed.
+    """
+
+    speed_gain: float = 1.0
+    cooperation: float = 1.0
+    assertiveness: float = 1.0
+    keep_right: float = 1.0
+    lateral_mps: float = 0.8
+
+
+@dataclass(frozen=True, slots=True)
 class RoadUser:
     """Somebody on the road.
 
@@ -66,6 +86,11 @@ class RoadUser:
         brake_mps2: How hard they like to brake.
         aside_m: How far left of the middle of their lane they like to be.
         hesitation_s: How long after they could they set off, if they have stood.
+        car_following: Model of how they follow.
+        imperfection: Of drivers by Krauss's model: how far they fall short of the speed
+            that they could have, as a share of a step's acceleration.
+        gap_m: Least distance to who is ahead.
+        lane_changing: How they change lanes.
     """
 
     body: BodyType
@@ -76,22 +101,50 @@ class RoadUser:
     brake_mps2: float
     aside_m: float
     hesitation_s: float
+    car_following: CarFollowing = CarFollowing.IDM
+    imperfection: float = 0.0
+    gap_m: float = 2.0
+    lane_changing: LaneChanging = LaneChanging()
 
 
-def draw_motorist(rng: np.random.Generator) -> RoadUser:
+def draw_motorist(
+    rng: np.random.Generator, variety: DriverVariety = BASIC.drivers
+) -> RoadUser:
     """Draw a driver and what they drive."""
     bodies = list(MOTOR_SHARES)
     body = bodies[rng.choice(len(bodies), p=list(MOTOR_SHARES.values()))]
     heavy = body in (BodyType.TRUCK, BodyType.BUS)
-    return RoadUser(
+    person = RoadUser(
         body=body,
         size_lwh_m=draw_size(body, rng),
-        haste=float(np.clip(rng.normal(0.98, 0.11), 0.7, 1.3)),
-        headway_s=float(rng.uniform(0.9, 1.8)),
+        haste=float(np.clip(rng.normal(*variety.haste), *variety.haste_limits)),
+        headway_s=float(rng.uniform(*variety.headway_s)),
         accel_mps2=float(rng.uniform(0.9, 1.4) if heavy else rng.uniform(1.3, 2.9)),
         brake_mps2=float(rng.uniform(1.8, 2.6) if heavy else rng.uniform(1.9, 3.4)),
         aside_m=float(np.clip(rng.normal(0.0, 0.16), -0.35, 0.35)),
         hesitation_s=draw_hesitation(rng),
+    )
+    return _with_manner(person, variety, rng) if variety.own_manners else person
+
+
+def _with_manner(
+    person: RoadUser, variety: DriverVariety, rng: np.random.Generator
+) -> RoadUser:
+    """Draw a driver's models of following and of changing lanes."""
+    models = list(variety.car_following)
+    shares = list(variety.car_following.values())
+    return replace(
+        person,
+        car_following=models[rng.choice(len(models), p=shares)],
+        imperfection=float(rng.uniform(0.0, 0.5)),
+        gap_m=float(rng.uniform(1.5, 3.0)),
+        lane_changing=LaneChanging(
+            speed_gain=float(np.exp(rng.uniform(np.log(0.5), np.log(6.0)))),
+            cooperation=float(rng.uniform(0.3, 1.0)),
+            assertiveness=float(rng.uniform(0.8, 1.4)),
+            keep_right=float(rng.uniform(0.0, 1.0)),
+            lateral_mps=float(rng.uniform(0.7, 1.3)),
+        ),
     )
 
 
@@ -106,6 +159,7 @@ def draw_cyclist(rng: np.random.Generator) -> RoadUser:
         brake_mps2=float(rng.uniform(1.5, 2.5)),
         aside_m=0.0,
         hesitation_s=draw_hesitation(rng),
+        gap_m=1.0,
     )
 
 

@@ -29,7 +29,11 @@ from infgen.sources.towns.streets.surroundings import Surroundings, surround
 from infgen.sources.towns.streets.topology import draw_skeleton
 from infgen.sources.towns.traffic.demand import Trip, draw_level, draw_trips, write_routes
 from infgen.sources.towns.traffic.motion import Bodies, follow
+from infgen.sources.towns.traffic.parking import find_spaces, with_parking
 from infgen.sources.towns.traffic.simulation import play
+from infgen.sources.towns.traffic.stops import with_stops
+from infgen.sources.towns.traffic.trips import find_ways
+from infgen.sources.towns.variety import BASIC, Variety
 
 WARM_UP_S = 35.0
 """Traffic runs so long before anyone records it; in wide towns as many times longer as they
@@ -75,38 +79,63 @@ def stream(*words: object) -> np.random.Generator:
     return np.random.default_rng(np.frombuffer(digest, np.uint32).tolist())
 
 
-def make_town(rng: np.random.Generator, num_steps: int, spread: float = 1.0) -> Town:
+def make_town(
+    rng: np.random.Generator,
+    num_steps: int,
+    spread: float = 1.0,
+    variety: Variety = BASIC,
+) -> Town:
     """Draw a town and record its traffic for so many steps.
 
     Args:
         rng: Of all that is drawn.
         num_steps: How long its traffic is recorded.
         spread: How many times as wide as most it is. No street leads out of a wide one.
+        variety: Ranges that all is drawn from.
 
     Raises:
         SumoError: if SUMO is missing or fails.
     """
     with TemporaryDirectory(prefix="infgen-town-") as name:
         folder = Path(name)
-        layout = draw_layout(draw_skeleton(folder, rng, spread), rng)
-        net = build_net(layout, folder, rng)
+        skeleton = draw_skeleton(folder, rng, spread, variety.streets)
+        layout = draw_layout(skeleton, rng, variety.streets)
+        net = build_net(layout, folder, rng, variety.streets)
         network = read_network(net)
         streets = {
             f"e{link}{way}": street
             for link, street in enumerate(layout.street)
             for way in "fb"
+            if f"e{link}{way}" in network.edges
         }
         warm_up_s = WARM_UP_S * spread
         seconds = warm_up_s + num_steps * CLOCK.step_s
-        trips = draw_trips(network, draw_level(rng), seconds, rng)
+        trips = _draw_trips(network, streets, seconds, variety, rng)
         write_routes(trips, folder / "town.rou.xml")
         seed = int(rng.integers(_MOST_SEED))
         first = sum(trip.drives and trip.depart_s == 0 for trip in trips)
         played = play(
             net, folder / "town.rou.xml", len(trips), first, warm_up_s, num_steps, seed
         )
+    if any(trip.stops for trip in trips):
+        played = with_parking(played, [trip.stops for trip in trips])
     bodies = follow(played, *_bodies(trips))
     return _with_traffic(network, streets, trips, bodies, warm_up_s, rng)
+
+
+def _draw_trips(
+    network: Network,
+    streets: dict[str, Street],
+    seconds: float,
+    variety: Variety,
+    rng: np.random.Generator,
+) -> list[Trip]:
+    level = draw_level(rng, variety.demand)
+    trips = draw_trips(network, level, seconds, rng, variety.drivers)
+    if not level.parking:
+        return trips
+    spaces, ways = find_spaces(network, streets), find_ways(network, cycling=False)
+    return with_stops(trips, level.parking, spaces, ways, seconds, variety.drivers, rng)
 
 
 def _bodies(trips: list[Trip]) -> tuple[np.ndarray, np.ndarray]:

@@ -76,6 +76,7 @@ def test_what_a_killed_run_left_half_written_is_cleared(tmp_path, quick):
         ({"seconds": 9.1}, "steps 21, not 91"),
         ({"scenes": 3}, "scenes 2, not 3"),
         ({"scenes_per_file": 2}, "scenes_per_file 1, not 2"),
+        ({"variety": "broad"}, "variety basic, not broad"),
     ],
 )
 def test_towns_of_another_order_are_not_mixed_with(tmp_path, quick, more, message):
@@ -159,3 +160,20 @@ def test_any_number_of_processes_writes_the_same_bytes(tmp_path):
         assert scene.tracks.num_steps == 21
     asked = json.loads((tmp_path / "two" / "training.towns.json").read_text())
     assert asked["seed"] == 3
+
+
+def test_towns_that_name_no_variety_are_basic(tmp_path, quick):
+    write_towns(order(tmp_path))
+    path = tmp_path / "training.towns.json"
+    about = json.loads(path.read_text())
+    assert about.pop("variety") == "basic"
+    path.write_text(json.dumps(about))
+
+    assert write_towns(order(tmp_path)).before == 2
+    with pytest.raises(ConfigError, match="variety basic, not broad"):
+        write_towns(order(tmp_path, variety="broad"))
+
+
+def test_a_variety_that_does_not_exist_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="variety 'wild'; expected basic or broad"):
+        order(tmp_path, variety="wild")

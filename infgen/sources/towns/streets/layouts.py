@@ -1,14 +1,21 @@
 """Layouts: a skeleton with a kind of street on every link and a rule at every node."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
-from infgen.sources.towns.streets.street_types import Rank, Street, draw_street
+from infgen.sources.towns.streets.one_way import draw_one_way
+from infgen.sources.towns.streets.street_types import (
+    CURB_M,
+    Rank,
+    Street,
+    draw_street,
+)
 from infgen.sources.towns.streets.topology import Skeleton
+from infgen.sources.towns.variety import BASIC, StreetVariety
 
 _STRAIGHT_RAD = np.deg2rad(38.0)
 """Links that meet at a flatter bend are one street."""
@@ -31,6 +38,8 @@ class Control(Enum):
 
 
 _DRAWN = tuple(Control)[:5]
+_LEAST_LIKING, _LIKING_SHAPE = 0.1, 0.7
+"""Where controls are mixed, a town's liking of each is gamma-distributed, and never 0."""
 _SHARES_OF_RULES = {
     (Rank.ARTERIAL, Rank.ARTERIAL): (1.0, 0.0, 0.0, 0.0, 0.0),
     (Rank.ARTERIAL, Rank.COLLECTOR): (0.45, 0.0, 0.55, 0.0, 0.0),
@@ -49,6 +58,8 @@ class Layout:
     Attributes:
         skeleton: Nodes and links.
         street: Of each link.
+        one_way: Of each link: 0 for both directions, 1 for that of its nodes alone, -1 for
+            the other alone.
         bend: How far each link bulges to its left, as a share of its length.
         control: Of each node.
         ring_m: Radius of each node's roundabout; 0 where there is none.
@@ -56,29 +67,50 @@ class Layout:
 
     skeleton: Skeleton
     street: tuple[Street, ...]
+    one_way: Int64[np.ndarray, " link"]
     bend: Float64[np.ndarray, " link"]
     control: tuple[Control, ...]
     ring_m: Float64[np.ndarray, " node"]
 
 
-def draw_layout(skeleton: Skeleton, rng: np.random.Generator) -> Layout:
+def draw_layout(
+    skeleton: Skeleton, rng: np.random.Generator, variety: StreetVariety = BASIC.streets
+) -> Layout:
     """Draw streets, bends and rules for a skeleton."""
-    street = _streets(skeleton, rng)
-    bend = np.clip(rng.normal(0.0, 0.035, len(skeleton.link)), -0.08, 0.08)
+    street_of = _strokes(skeleton)
+    street = _streets(skeleton, street_of, variety, rng)
+    one_way = np.zeros(len(street), np.int64)
+    if variety.one_way:
+        minor = np.array([each.rank < Rank.ARTERIAL for each in street])
+        one_way = draw_one_way(skeleton, street_of, minor, variety.one_way, rng)
+    # The median of a one-way street is the gutter on its left.
+    street = tuple(
+        replace(each, median_m=CURB_M) if way else each
+        for each, way in zip(street, one_way.tolist(), strict=True)
+    )
+    spread, most = variety.bend
+    bend = np.clip(rng.normal(0.0, spread, len(skeleton.link)), -most, most)
     bend *= rng.random(len(bend)) < rng.choice([0.2, 0.7])
     # A way out that swerves might meet another.
     bend[(skeleton.degree[skeleton.link] == 1).any(axis=1)] = 0.0
+    liking = np.ones(len(_DRAWN))
+    if variety.mixed_controls:
+        liking = _LEAST_LIKING + rng.gamma(_LIKING_SHAPE, size=len(_DRAWN))
     control = tuple(
-        _control(skeleton, street, node, rng) for node in range(len(skeleton.xy_m))
+        _control(skeleton, street, node, liking, rng) for node in range(len(skeleton.xy_m))
     )
     round_ = np.array([each is Control.ROUNDABOUT for each in control])
     ring_m = np.where(round_, rng.uniform(*ROUNDABOUT_M, len(control)), 0.0)
-    return Layout(skeleton, street, bend, control, ring_m)
+    return Layout(skeleton, street, one_way, bend, control, ring_m)
 
 
-def _streets(skeleton: Skeleton, rng: np.random.Generator) -> tuple[Street, ...]:
+def _streets(
+    skeleton: Skeleton,
+    street_of: Int64[np.ndarray, " link"],
+    variety: StreetVariety,
+    rng: np.random.Generator,
+) -> tuple[Street, ...]:
     """Give links that go straight on into each other one street, long ones a high rank."""
-    street_of = _strokes(skeleton)
     ends_m = skeleton.xy_m[skeleton.link]
     length_m = np.linalg.norm(ends_m[:, 1] - ends_m[:, 0], axis=1)
     names, number = np.unique(street_of, return_inverse=True)
@@ -87,11 +119,13 @@ def _streets(skeleton: Skeleton, rng: np.random.Generator) -> tuple[Street, ...]
     place = np.empty(len(names))
     place[np.argsort(-weight, kind="stable")] = (np.arange(len(names)) + 0.5) / len(names)
     shares, ranks = [share for share, _ in _SHARES], [rank for _, rank in _SHARES]
-    streets = [draw_street(ranks[int(np.searchsorted(shares, at))], rng) for at in place]
+    streets = [
+        draw_street(ranks[int(np.searchsorted(shares, at))], rng, variety) for at in place
+    ]
     return tuple(streets[at] for at in number.tolist())
 
 
-def _strokes(skeleton: Skeleton) -> np.ndarray:
+def _strokes(skeleton: Skeleton) -> Int64[np.ndarray, " link"]:
     """Number the links so that those which go straight on into each other agree."""
     leader = np.arange(len(skeleton.link))
     for node in range(len(skeleton.xy_m)):
@@ -120,7 +154,11 @@ def _bend(one_rad: float, other_rad: float) -> float:
 
 
 def _control(
-    skeleton: Skeleton, street: tuple[Street, ...], node: int, rng: np.random.Generator
+    skeleton: Skeleton,
+    street: tuple[Street, ...],
+    node: int,
+    liking: Float64[np.ndarray, " control"],
+    rng: np.random.Generator,
 ) -> Control:
     """Draw who goes first at a node, by the ranks of the streets that meet there."""
     links = np.flatnonzero((skeleton.link == node).any(axis=1)).tolist()
@@ -128,7 +166,8 @@ def _control(
         return Control.END if len(links) == 1 else Control.NONE
     ranks = sorted((street[link].rank for link in links), reverse=True)
     crossing = ranks[2]  # Two arms at most are of the main street.
-    chosen = _DRAWN[rng.choice(len(_DRAWN), p=_SHARES_OF_RULES[ranks[0], crossing])]
+    shares = liking * _SHARES_OF_RULES[ranks[0], crossing]
+    chosen = _DRAWN[rng.choice(len(_DRAWN), p=shares / shares.sum())]
     if chosen is Control.ROUNDABOUT and not _has_room(skeleton, street, node, links):
         return Control.ALL_STOP
     return chosen

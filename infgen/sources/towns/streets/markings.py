@@ -118,12 +118,12 @@ def _outline(crossing: Crossing) -> Float64[np.ndarray, "4 2"]:
 def draw_bumps(
     network: Network, streets: dict[str, Street], rng: np.random.Generator
 ) -> list[Float64[np.ndarray, "4 2"]]:
-    """Lay a speed bump across some slow streets, from lane to lane."""
+    """Lay a speed bump across some slow streets of two directions, from lane to lane."""
     made = []
     for name, street in streets.items():
         back = reverse_of(name)
         slow = street.rank is Rank.LOCAL and name < back
-        if not slow or rng.random() > BUMP_SHARE:
+        if not slow or back not in streets or rng.random() > BUMP_SHARE:
             continue
         sides_m = [
             network.edges[each].driven[0].border(-street.lane_m / 2)

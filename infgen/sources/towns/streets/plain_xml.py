@@ -9,11 +9,10 @@ from jaxtyping import Float64
 
 from infgen.sources.towns.streets.curves import Points
 from infgen.sources.towns.streets.layouts import Control, Layout
-from infgen.sources.towns.streets.street_types import Rank, Street
+from infgen.sources.towns.streets.street_types import CURB_M, Rank, Street
 from infgen.sources.towns.sumo import run_program
+from infgen.sources.towns.variety import BASIC, StreetVariety
 
-CURB_M = 0.3
-"""What lies between the outermost lane and the road edge where nothing else does."""
 NOBODY = "nobody"
 """User of strips of the road that are no lanes."""
 DRIVERS = "drivers"
@@ -40,7 +39,12 @@ _NETCONVERT: dict[str, object] = {
 }
 
 
-def build_net(layout: Layout, folder: Path, rng: np.random.Generator) -> Path:
+def build_net(
+    layout: Layout,
+    folder: Path,
+    rng: np.random.Generator,
+    variety: StreetVariety = BASIC.streets,
+) -> Path:
     """Write a layout as plain XML and let netconvert make a net of it.
 
     Raises:
@@ -58,6 +62,7 @@ def build_net(layout: Layout, folder: Path, rng: np.random.Generator) -> Path:
     timing = {
         "tls.cycle.time": int(rng.integers(50, 90)),
         "tls.default-type": "static",
+        "junctions.limit-turn-speed.min-angle": variety.free_bend_deg,
     }
     run_program("netconvert", {**_NETCONVERT, **timing, **paths, "output-file": net})
     return net
@@ -100,17 +105,19 @@ def _arms(layout: Layout, node: int) -> list[tuple[float, str]]:
 
 
 def _write_link(layout: Layout, link: int, edges: Element) -> None:
-    """Write both directions of a link."""
+    """Write both directions of a link, or the only one."""
     one, other = layout.skeleton.link[link].tolist()
     names = [
         f"n{node}x{link}" if layout.ring_m[node] else f"n{node}" for node in (one, other)
     ]
     shape_m = link_shape(layout, link)
     street = layout.street[link]
-    for name, ends, points_m in (
-        (f"e{link}f", names, shape_m),
-        (f"e{link}b", names[::-1], shape_m[::-1]),
+    for name, ends, points_m, only in (
+        (f"e{link}f", names, shape_m, 1),
+        (f"e{link}b", names[::-1], shape_m[::-1], -1),
     ):
+        if layout.one_way[link] not in (0, only):
+            continue
         edge = _add_edge(
             edges, name, (ends[0], ends[1]), points_m, street.rank, street.limit_mps
         )

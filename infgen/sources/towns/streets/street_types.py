@@ -1,11 +1,16 @@
 """Street types: widths, speed limits, and what lies between the lanes and the road edge."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 
+from infgen.sources.towns.variety import BASIC, StreetVariety
+
 MPS_PER_MPH = 0.44704
+CURB_M = 0.3
+"""What lies between the outermost lane and the road edge where nothing else does."""
 
 
 class Rank(IntEnum):
@@ -56,23 +61,25 @@ class Street:
         return self.median_m + lanes_m + self.bike_m + self.parking_m
 
 
-def draw_street(rank: Rank, rng: np.random.Generator) -> Street:
+def draw_street(
+    rank: Rank, rng: np.random.Generator, variety: StreetVariety = BASIC.streets
+) -> Street:
     """Draw a street of a rank."""
     match rank:
         case Rank.ARTERIAL:
-            return _arterial(rng)
+            return _arterial(rng, variety)
         case Rank.COLLECTOR:
-            return _collector(rng)
+            return _collector(rng, variety)
         case _:
             return _local(rng)
 
 
-def _arterial(rng: np.random.Generator) -> Street:
+def _arterial(rng: np.random.Generator, variety: StreetVariety) -> Street:
     return Street(
         rank=Rank.ARTERIAL,
-        num_lanes=int(rng.choice([2, 3], p=[0.75, 0.25])),
+        num_lanes=_num_lanes(variety.arterial_lanes, rng),
         lane_m=float(rng.uniform(3.3, 3.6)),
-        limit_mph=float(rng.choice([40, 45, 50])),
+        limit_mph=float(rng.choice(variety.arterial_limits_mph)),
         median_m=float(rng.uniform(0.8, 1.6)) if rng.random() < 0.45 else 0.0,
         bike_m=float(rng.uniform(1.5, 1.9)) if rng.random() < 0.25 else 0.0,
         parking_m=2.3 if rng.random() < 0.1 else 0.0,
@@ -82,10 +89,10 @@ def _arterial(rng: np.random.Generator) -> Street:
     )
 
 
-def _collector(rng: np.random.Generator) -> Street:
+def _collector(rng: np.random.Generator, variety: StreetVariety) -> Street:
     return Street(
         rank=Rank.COLLECTOR,
-        num_lanes=int(rng.choice([1, 2], p=[0.75, 0.25])),
+        num_lanes=_num_lanes(variety.collector_lanes, rng),
         lane_m=float(rng.uniform(3.1, 3.5)),
         limit_mph=float(rng.choice([30, 35, 40])),
         median_m=0.0,
@@ -110,3 +117,7 @@ def _local(rng: np.random.Generator) -> Street:
         lined=bool(rng.random() < 0.25),
         taken=float(rng.uniform(0.3, 0.95)),
     )
+
+
+def _num_lanes(shares: Mapping[int, float], rng: np.random.Generator) -> int:
+    return int(rng.choice(list(shares), p=list(shares.values())))

@@ -1,7 +1,6 @@
 """Where a town's streets run: skeletons of nodes and links, drawn by SUMO's netgenerate."""
 
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -9,17 +8,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from infgen.sources.towns.sumo import run_program
+from infgen.sources.towns.variety import BASIC, Pattern, StreetVariety
 
-
-class Pattern(Enum):
-    """How the streets of a town lie."""
-
-    GRID = "grid"
-    SPIDER = "spider"
-    RANDOM = "random"
-
-
-_SHARES = {Pattern.GRID: 0.35, Pattern.SPIDER: 0.15, Pattern.RANDOM: 0.5}
+_GRIDS = (Pattern.GRID, Pattern.T_JUNCTIONS, Pattern.CURVED_GRID)
 _MOST_SEED = 1 << 31
 
 
@@ -41,7 +32,12 @@ class Skeleton:
         return np.bincount(self.link.ravel(), minlength=len(self.xy_m))
 
 
-def draw_skeleton(folder: Path, rng: np.random.Generator, spread: float = 1.0) -> Skeleton:
+def draw_skeleton(
+    folder: Path,
+    rng: np.random.Generator,
+    spread: float = 1.0,
+    variety: StreetVariety = BASIC.streets,
+) -> Skeleton:
     """Draw where streets run; dead ends are cut off, and some streets lead out of town.
 
     None do of a wide town: who plays a trip of minutes must not come to where streets end.
@@ -50,37 +46,43 @@ def draw_skeleton(folder: Path, rng: np.random.Generator, spread: float = 1.0) -
         folder: Where to put netgenerate's files.
         rng: Of all that is drawn.
         spread: How many times as many blocks there are from one rim to the other.
+        variety: What patterns and blocks there are.
 
     Raises:
         SumoError: if netgenerate fails.
     """
-    pattern = list(_SHARES)[rng.choice(len(_SHARES), p=list(_SHARES.values()))]
+    shares = variety.patterns
+    pattern = list(shares)[rng.choice(len(shares), p=list(shares.values()))]
     prefix = folder / "skeleton"
     run_program(
         "netgenerate",
         {
-            **_options(pattern, spread, rng),
+            **_options(pattern, spread, variety, rng),
             "seed": int(rng.integers(_MOST_SEED)),
             "plain-output-prefix": prefix,
             "output-file": folder / "skeleton.net.xml",
         },
     )
     drawn = _without_dead_ends(_read(prefix))
+    if pattern is Pattern.T_JUNCTIONS:
+        drawn = _without_dead_ends(_without_crossings(drawn, rng))
     inner = _stirred(drawn, pattern, rng)
+    if pattern is Pattern.CURVED_GRID:
+        inner = _warped(inner, rng)
     return inner if spread > 1 else _with_ways_out(inner, rng)
 
 
 def _options(
-    pattern: Pattern, spread: float, rng: np.random.Generator
+    pattern: Pattern, spread: float, variety: StreetVariety, rng: np.random.Generator
 ) -> dict[str, object]:
     match pattern:
-        case Pattern.GRID:
+        case _ if pattern in _GRIDS:
             return {
                 "grid": True,
                 "grid.x-number": round(spread * int(rng.integers(4, 6))),
                 "grid.y-number": round(spread * int(rng.integers(4, 6))),
-                "grid.x-length": round(float(rng.uniform(85.0, 170.0)), 1),
-                "grid.y-length": round(float(rng.uniform(85.0, 170.0)), 1),
+                "grid.x-length": round(float(rng.uniform(*variety.block_m)), 1),
+                "grid.y-length": round(float(rng.uniform(*variety.block_m)), 1),
             }
         case Pattern.SPIDER:
             return {
@@ -129,15 +131,62 @@ def _without_dead_ends(skeleton: Skeleton) -> Skeleton:
     return Skeleton(skeleton.xy_m[kept], numbered.reshape(-1, 2))
 
 
+def _without_crossings(skeleton: Skeleton, rng: np.random.Generator) -> Skeleton:
+    """Take streets away between nodes of four and more, so that most join three.
+
+    A street stays where the town would fall apart without it.
+    """
+    link = skeleton.link
+    for at in rng.permutation(len(link)).tolist():
+        street = skeleton.link[at]
+        degree = np.bincount(link.ravel(), minlength=len(skeleton.xy_m))
+        if (degree[street] > 3).all():
+            left = link[(link != street).any(axis=1)]
+            if _is_connected(left, len(skeleton.xy_m)):
+                link = left
+    return Skeleton(skeleton.xy_m, link)
+
+
+def _is_connected(link: Int64[np.ndarray, "link 2"], num_nodes: int) -> bool:
+    """Whether all nodes are reached from the first."""
+    reached = np.zeros(num_nodes, bool)
+    reached[0] = True
+    while True:
+        onward = reached[link].any(axis=1)
+        if reached[link[onward]].all():
+            return bool(reached.all())
+        reached[link[onward]] = True
+
+
+def _warped(skeleton: Skeleton, rng: np.random.Generator) -> Skeleton:
+    """Shift nodes by waves across the town, so that straight streets wind."""
+    waves_m = rng.uniform(*_WAVES_M, 2)
+    phase_rad = rng.uniform(0.0, 2 * np.pi, 2)
+    height_m = rng.uniform(*_WAVE_SLOPES, 2) * waves_m / (2 * np.pi)
+    across_m = skeleton.xy_m[:, ::-1]
+    shift_m = height_m * np.sin(2 * np.pi * across_m / waves_m + phase_rad)
+    return Skeleton(skeleton.xy_m + shift_m, skeleton.link)
+
+
 def _stirred(skeleton: Skeleton, pattern: Pattern, rng: np.random.Generator) -> Skeleton:
     """Move the middle to the origin and every node a little."""
-    spread_m = {Pattern.GRID: 5.0, Pattern.SPIDER: 4.0, Pattern.RANDOM: 0.0}[pattern]
+    spread_m = _SHIFTS_M[pattern]
     shift_m = np.clip(rng.normal(0.0, spread_m, skeleton.xy_m.shape), -12.0, 12.0)
     xy_m = skeleton.xy_m + shift_m
     middle_m = (xy_m.max(axis=0) + xy_m.min(axis=0)) / 2
     return Skeleton(xy_m - middle_m, skeleton.link)
 
 
+_SHIFTS_M = {
+    Pattern.GRID: 5.0,
+    Pattern.SPIDER: 4.0,
+    Pattern.RANDOM: 0.0,
+    Pattern.T_JUNCTIONS: 5.0,
+    Pattern.CURVED_GRID: 3.0,
+}
+"""How far nodes are moved at random: standard deviation."""
+_WAVES_M, _WAVE_SLOPES = (450.0, 900.0), (0.25, 0.5)
+"""Lengths and steepest slopes of the waves of a curved grid."""
 WAY_OUT_M = 190.0
 """How far the streets out of town run."""
 _CLEAR_RAD = np.deg2rad(65.0)

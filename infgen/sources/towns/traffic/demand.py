@@ -1,6 +1,7 @@
 """Who is under way in a town and when, as SUMO's route file."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -15,13 +16,17 @@ from infgen.sources.towns.road_users import (
     draw_walker,
 )
 from infgen.sources.towns.streets.network import Network
+from infgen.sources.towns.traffic.parking import ParkingStop
 from infgen.sources.towns.traffic.trips import Ways, find_walks, find_ways
+from infgen.sources.towns.variety import BASIC, CarFollowing, DemandVariety, DriverVariety
 
 FASTEST_MPS = 14.0
 """Routes are long enough to be under way all the time at this speed."""
 NUM_WANDERERS = 14
 """Cars that never leave town: they make the trips."""
 LONGEST_WALK_M = 700.0
+_STOP_WITHIN_M = 4.0
+"""Who parks stops within the last metres before a place."""
 REACTION_S = 0.4
 """Drivers make up their minds so often: as people do, and at half the cost."""
 
@@ -35,12 +40,14 @@ class Level:
         cars_per_hour: That come from out of town on a collector's lane.
         cyclists: How many for every hundred cars.
         walkers_per_km: On every kilometre of pavement.
+        parking: Share of the cars that park on their way; as many pull out.
     """
 
     cars_per_km: float
     cars_per_hour: float
     cyclists: float
     walkers_per_km: float
+    parking: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,43 +59,64 @@ class Trip:
         depart_s: When they set out.
         route: Edges in a row.
         anywhere: Whether they begin anywhere on the first edge, not at its start.
+        stops: Where they park; one that is parked at the beginning pulls out of the first.
     """
 
     person: RoadUser
     depart_s: float
     route: list[str]
     anywhere: bool
+    stops: tuple[ParkingStop, ...] = ()
 
     @property
     def drives(self) -> bool:
         """Whether they go by vehicle or bicycle."""
         return self.person.body is not BodyType.WALKER
 
+    @property
+    def pulls_out(self) -> bool:
+        """Whether they are parked at the beginning."""
+        return bool(self.stops) and self.stops[0].until_s is not None
 
-def draw_level(rng: np.random.Generator) -> Level:
+
+def draw_level(rng: np.random.Generator, variety: DemandVariety = BASIC.demand) -> Level:
     """Draw how much is going on, from next to nothing to dense."""
-    cars = float(np.exp(rng.uniform(np.log(2.5), np.log(14.0))))
+    cars = float(np.exp(rng.uniform(*np.log(variety.cars_per_km))))
     return Level(
         cars_per_km=cars,
         cars_per_hour=cars * float(rng.uniform(14.0, 28.0)),
         cyclists=float(rng.choice([1.0, 4.0, 10.0], p=[0.5, 0.35, 0.15])),
-        walkers_per_km=float(np.exp(rng.uniform(np.log(0.2), np.log(8.0)))),
+        walkers_per_km=float(np.exp(rng.uniform(*np.log(variety.walkers_per_km)))),
+        parking=float(rng.uniform(0.0, variety.parking)) if variety.parking else 0.0,
     )
 
 
 def draw_trips(
-    network: Network, level: Level, seconds: float, rng: np.random.Generator
+    network: Network,
+    level: Level,
+    seconds: float,
+    rng: np.random.Generator,
+    variety: DriverVariety = BASIC.drivers,
 ) -> list[Trip]:
-    """Draw everybody's way, by the time they set out."""
+    """Draw everybody's way, by the time they set out.
+
+    Args:
+        network: The town.
+        level: How much is going on.
+        seconds: How long it is simulated.
+        rng: Of all that is drawn.
+        variety: What drivers there are.
+    """
+    draw_driver = partial(draw_motorist, variety=variety)
     reach_m = FASTEST_MPS * seconds
     driving, cycling = (find_ways(network, cycling=each) for each in (False, True))
     trips = [
-        Trip(draw_motorist_of(BodyType.CAR, rng), 0.0, route, anywhere=True)
+        Trip(draw_motorist_of(BodyType.CAR, rng, variety), 0.0, route, anywhere=True)
         for route in _wanderings(driving, reach_m, rng)
     ]
     share = level.cyclists / 100.0
     for ways, draw, part in (
-        (driving, draw_motorist, 1.0),
+        (driving, draw_driver, 1.0),
         (cycling, draw_cyclist, share),
     ):
         starts = _starts(ways, level, part, seconds, rng)
@@ -108,10 +136,12 @@ def draw_trips(
     return sorted(trips, key=lambda trip: trip.depart_s)
 
 
-def draw_motorist_of(body: BodyType, rng: np.random.Generator) -> RoadUser:
+def draw_motorist_of(
+    body: BodyType, rng: np.random.Generator, variety: DriverVariety = BASIC.drivers
+) -> RoadUser:
     """Draw a driver of a kind of vehicle."""
     while True:
-        person = draw_motorist(rng)
+        person = draw_motorist(rng, variety)
         if person.body is body:
             return person
 
@@ -154,9 +184,29 @@ def write_routes(trips: list[Trip], path: Path) -> None:
         if trip.anywhere:
             start = {"departPos": "random_free", "departSpeed": "max"}
             start["departLane"] = "best"
+        if trip.pulls_out:
+            lane = str(trip.stops[0].space.lane)
+            start = {"departPos": "stop", "departSpeed": "0", "departLane": lane}
         vehicle = SubElement(root, "vehicle", about | start)
         SubElement(vehicle, "route", {"edges": " ".join(trip.route)})
+        for stop in trip.stops:
+            _write_stop(vehicle, stop)
     ElementTree.ElementTree(root).write(path)
+
+
+def _write_stop(vehicle: Element, stop: ParkingStop) -> None:
+    space = stop.space
+    about = {
+        "lane": f"{space.edge}_{space.lane}",
+        "startPos": f"{space.along_m - _STOP_WITHIN_M:.1f}",
+        "endPos": f"{space.along_m:.1f}",
+        "parking": "true",
+    }
+    if stop.until_s is not None:
+        about["until"] = f"{stop.until_s:.1f}"
+    else:
+        about["duration"] = f"{stop.duration_s:.1f}"
+    SubElement(vehicle, "stop", about)
 
 
 def _write_type(root: Element, name: str, person: RoadUser) -> None:
@@ -182,16 +232,23 @@ def _driving(person: RoadUser) -> dict[str, str]:
         if cycling
         else {"speedFactor": f"{person.haste:.3f}", "speedDev": "0"}
     )
+    manner = person.lane_changing
+    if person.car_following is CarFollowing.KRAUSS:
+        limits["sigma"] = f"{person.imperfection:.3f}"
     return limits | {
-        "carFollowModel": "IDM",
+        "carFollowModel": person.car_following.value,
         "actionStepLength": f"{REACTION_S:g}",
         "tau": f"{person.headway_s:.3f}",
         "accel": f"{person.accel_mps2:.3f}",
         "decel": f"{person.brake_mps2:.3f}",
         "impatience": "0.5",
-        "minGap": "1.0" if cycling else "2.0",
+        "minGap": f"{person.gap_m:.2f}",
         "latAlignment": "right" if cycling else f"{person.aside_m:.3f}",
-        "maxSpeedLat": "0.8",
+        "maxSpeedLat": f"{manner.lateral_mps:.2f}",
+        "lcSpeedGain": f"{manner.speed_gain:.2f}",
+        "lcCooperative": f"{manner.cooperation:.2f}",
+        "lcAssertive": f"{manner.assertiveness:.2f}",
+        "lcKeepRight": f"{manner.keep_right:.2f}",
         "minGapLat": "0.5",
         "startupDelay": f"{person.hesitation_s:.2f}",
     }
