@@ -51,6 +51,8 @@ class RelationEmbedding(FourierEmbedding):
 
     first: Tensor
     gaps: Tensor
+    zero: Tensor
+    last_gap: Tensor
     per_unit: Tensor
     starts: Tensor
 
@@ -63,6 +65,8 @@ class RelationEmbedding(FourierEmbedding):
         for name, values in (
             ("first", torch.tensor([span.first for span in spans])),
             ("gaps", gaps),
+            ("zero", torch.zeros_like(gaps)),
+            ("last_gap", gaps - 1),
             ("per_unit", gaps / length),
             ("starts", starts),
         ):
@@ -111,8 +115,8 @@ class RelationEmbedding(FourierEmbedding):
 
     def _places(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Say between which nodes relations [N, F] lie: nodes and their shares [N, 2 F]."""
-        position = ((values - self.first) * self.per_unit).clamp(min=0).minimum(self.gaps)
-        lower = position.floor().minimum(self.gaps - 1)
+        position = ((values - self.first) * self.per_unit).clamp(self.zero, self.gaps)
+        lower = position.floor().minimum(self.last_gap)
         share = position - lower
         node = lower.long() + self.starts
         return torch.cat([node, node + 1], dim=-1), torch.cat([1 - share, share], dim=-1)
