@@ -15,56 +15,26 @@ of its weights, and as many zeros as keep rows aligned; T the slots of all targe
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn import functional
 
-from infgen.model.layers import Attention, AttentionSources
+from infgen.model.device.folding import ALIGNED, Folded, fold
+from infgen.model.layers import Attention, AttentionSources, normed
 from infgen.model.neighbour_attention import HIDDEN_SCORE, Shared
 
-ALIGNED = 8
-"""Columns that hold the sum of the weights, and zeros."""
 FULL_BYTES = 4
 """Of a float32; numbers of fewer bytes are products only."""
-
-
-class Folded(NamedTuple):
-    """Weights of a block with the norms of its sources folded in, in the type of products.
-
-    Attributes:
-        query: From a target to its query [D, D] ...
-        query_bias: ... with its bias [D].
-        wide: From a head of a query to features and relations [H, C, D + R].
-        value: From what a query sees to a head of its value [H, E, C].
-        gate: From what a target saw and is to its gate, and to what lies between what it
-            saw and its own value [2 D, 2 D] ...
-        gate_bias: ... with their biases.
-        hidden: From a target to the hidden layer of the feed-forward part [4 D, D] ...
-        hidden_bias: ... with its bias.
-        out: From there back [D, 4 D] ...
-        out_bias: ... with its bias.
-    """
-
-    query: Tensor
-    query_bias: Tensor
-    wide: Tensor
-    value: Tensor
-    gate: Tensor
-    gate_bias: Tensor
-    hidden: Tensor
-    hidden_bias: Tensor
-    out: Tensor
-    out_bias: Tensor
 
 
 @contextmanager
 def folded_together(blocks: Sequence[Attention]) -> Iterator[None]:
     """Let blocks of one shape be evaluated by ``attend``, their weights folded at once."""
+    blocks = sorted(blocks, key=lambda block: block.norm_source is not None)
     try:
-        for block, folded in zip(blocks, _fold(blocks), strict=True):
+        for block, folded in zip(blocks, fold(blocks), strict=True):
             block.fused = lambda target, seen, block=block, folded=folded: attend(
                 block, folded, target, seen
             )
@@ -74,62 +44,18 @@ def folded_together(blocks: Sequence[Attention]) -> Iterator[None]:
             block.fused = None
 
 
-def _fold(blocks: Sequence[Attention]) -> list[Folded]:
-    sources = [block.source_norm() for block in blocks]
-    relations = [block.norm_relation for block in blocks]
-    width, heads = blocks[0].query.in_features, blocks[0].heads
-    gain, shift = (
-        torch.cat([_stacked(sources, name), _stacked(relations, name)], dim=1)
-        for name in ("weight", "bias")
-    )
-    key, value = (
-        torch.cat([_stacked([getattr(b, x) for b in blocks], "weight") for x in pair], 2)
-        for pair in (("key", "relation_key"), ("value", "relation_value"))
-    )
-    query, gate, itself, hidden, out = (
-        {name: _stacked(layers, name) for name in ("weight", "bias")}
-        for layers in zip(*map(_layers, blocks), strict=True)
-    )
-    # A product: its type is what autocast, if any, gives to products.
-    bias = torch.baddbmm(
-        _stacked([b.value for b in blocks], "bias")[..., None], value, shift[..., None]
-    )
-    scaled = gain * (width // heads) ** -0.5
-    value = functional.pad(
-        torch.cat([value * gain[:, None], bias], dim=2), (0, ALIGNED - 1)
-    )
-    shape = (len(blocks), heads, width // heads, -1)
-    less = torch.eye(width, device=bias.device).neg_().expand(len(blocks), -1, -1)
-    between = torch.cat([less, itself["weight"]], dim=2)
-    parts = (
-        *query.values(),
-        (key * scaled[:, None]).view(shape),
-        value.view(shape).mT,
-        torch.cat([gate["weight"], between], dim=1),
-        torch.cat([gate["bias"], itself["bias"]], dim=1),
-        *hidden.values(),
-        *out.values(),
-    )
-    cut = zip(*(part.to(bias.dtype).unbind() for part in parts), strict=True)
-    return [Folded(*each) for each in cut]
-
-
-def _layers(block: Attention) -> tuple[nn.Module, ...]:
-    """Layers of a block whose weights are used as they are."""
-    feed_forward = block.feed_forward
-    return block.query, block.gate, block.itself, feed_forward[1], feed_forward[4]
-
-
-def _stacked(layers: Sequence[nn.Module], name: str) -> Tensor:
-    return torch.stack([layer.get_parameter(name) for layer in layers])
-
-
 def attend(
     block: Attention, folded: Folded, target: Tensor, seen: AttentionSources
 ) -> Tensor:
-    """Update targets [N, D] or [N, S, D] as the block does."""
+    """Update targets [N, D] or [N, S, D] as the block does.
+
+    A block without a norm for sources is one whose sources are its targets, in one order:
+    these are normed already.
+    """
     slots = target if target.dim() == 3 else target[:, None]
-    looked = _look(block, folded, block.norm_target(slots), seen)
+    alike = block.norm_source is None
+    normal = seen.features[:, None] if alike else normed(slots)
+    looked = _look(block, folded, normal, seen)
     slots = slots + block.norm_out(block.out(looked).view_as(slots))
     norm, *_, norm_out = block.feed_forward
     forward = _FeedForward.apply(  # type: ignore[no-untyped-call]
@@ -213,7 +139,7 @@ class _Look(torch.autograd.Function):
             opened = opened.sigmoid()
             found = torch.addcmul(joined.chunk(2, dim=1)[0], opened, between)
         ctx.save_for_backward(
-            query, wide, value, gate, features, index, relation, ticket,
+            query, wide, value, gate, features, index, relation,
             asked, by_both, weight, kept, looked, joined, opened, between,
         )  # fmt: skip
         ctx.pulled, ctx.share = pulled, share
@@ -223,7 +149,7 @@ class _Look(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, pull: Tensor) -> tuple[Tensor | None, ...]:
         (
-            query, wide, value, gate, features, index, relation, ticket,
+            query, wide, value, gate, features, index, relation,
             asked, by_both, weight, kept, looked, joined, opened, between,
         ) = ctx.saved_tensors  # fmt: skip
         heads, width = len(wide), pull.shape[1]
@@ -255,14 +181,13 @@ class _Look(torch.autograd.Function):
                 torch.addmm(to_normal, to_asked, query),
                 *(to_asked.T @ normal, to_asked.sum(dim=0), to_wide, to_value),
                 *(through.T @ joined, through.sum(dim=0), to_features, None),
-                *(None, None if shared is None else ticket),
-                *(None, None, None, None),
+                *(None, None, None, None, None, None),
             )
 
 
 def _heads(values_TD: Tensor, heads: int) -> Tensor:
     """View values head by head [T, H, C]."""
-    return values_TD.unflatten(1, (heads, -1))
+    return values_TD.view(len(values_TD), heads, -1)
 
 
 def _weigh(

@@ -19,8 +19,8 @@ from infgen.model.device.packed import IndexedBatch, PackedBatch, prepared
 from infgen.model.training.closed_loop import close_loop
 from infgen.model.training.closed_loop_population import close_population_loop
 from infgen.model.training.diagnostics import motion_surprise
-from infgen.model.training.loss_weights import TERMS, supervised
-from infgen.model.training.losses import Term, Terms, losses
+from infgen.model.training.loss_weights import TERMS, Supervision
+from infgen.model.training.losses import AgentMasks, Term, Terms, losses
 from pipeline.stages.train.precision import Pass
 from pipeline.stages.train.process_group import ProcessGroup
 from pipeline.stages.train.setup import TrainingError
@@ -97,6 +97,9 @@ class OptimizerStep:
         self._own = [part.view_as(parameter) for part, parameter in cut]
         for parameter, own in zip(parameters, self._own, strict=True):
             parameter.grad = own
+        factors = [getattr(settings, f"{name}_weight") for name in TERMS]
+        # Filled one by one, as the host would wait for a copy.
+        self._factors = torch.stack([parameters[0].new_full((), x) for x in factors])
         self._on_cpu = self._sums.device.type == "cpu"
 
     def step(
@@ -119,14 +122,14 @@ class OptimizerStep:
             self._prepared(part, noise_of_part(step, settings.seed, number))
             for number, part in zip(own, parts, strict=True)
         ]
-        weights = [supervised(each.batch, settings) for each in batches]
-        weight = torch.stack(weights).sum(dim=0)
+        told = [each.supervision or Supervision.of(each.batch) for each in batches]
+        weight = torch.stack([each.weight(settings) for each in told]).sum(dim=0)
         self._process_group.add_up(weight)
         self._sums.zero_()
         names: list[str] = []
-        for number, batch in zip(own, batches, strict=True):
+        for number, batch, masks in zip(own, batches, (x.masks for x in told), strict=True):
             torch.manual_seed(noise_of_part(step, settings.seed, number))  # For dropout.
-            names = self._add(batch, weight, number)
+            names = self._add(batch, masks, weight, number)
         self._process_group.add_up(self._sums)
         found = torch.cat([self._clip()[None], self._figures]).cpu()
         norm, (terms, surprise, bad) = float(found[0]), self._told(found[1:], names)
@@ -143,24 +146,26 @@ class OptimizerStep:
         top, network = self._settings.closed_loop_top_k, self._training.network
         if self._settings.closed_loop_population:
             simulated = close_population_loop(network, here.batch, top, seed)
-            return IndexedBatch(simulated, None)  # Others are there than in the log.
+            return IndexedBatch(simulated, None, None)  # Others are there than in the log.
         if not top:
             return here
-        return replace(here, batch=close_loop(network, here.batch, top))
+        return replace(here, batch=close_loop(network, here.batch, top), supervision=None)
 
-    def _add(self, indexed: IndexedBatch, weight: Tensor, number: int) -> list[str]:
+    def _add(
+        self, indexed: IndexedBatch, masks: AgentMasks, weight: Tensor, number: int
+    ) -> list[str]:
         """Add the gradient and the sums of one part; return the names of its terms."""
         batch = indexed.batch
         outputs = self.forward(batch, indexed.index)
-        terms = losses(outputs, batch, self._settings)
-        loss = _share(terms, weight, self._settings)
+        terms = losses(outputs, batch, self._settings, masks)
+        loss = _share(terms, weight, self._factors)
         self._add_gradient(loss)
         nothing = loss.new_zeros(())
         none = Term(nothing, nothing, nothing, nothing, nothing)
         found = [getattr(terms.get(each, none), name) for each in TERMS for name in FIGURES]
         sums = torch.stack([each.detach().float() for each in found])
         self._terms += sums.view_as(self._terms)
-        self._surprise += motion_surprise(outputs, batch)
+        self._surprise += motion_surprise(outputs, batch, masks.motion)
         self._bad[number] = (~torch.isfinite(loss.detach())).float()
         return list(terms)
 
@@ -205,15 +210,12 @@ def _check(norm: float, terms: Mapping[str, Term], bad: Sequence[int]) -> None:
     raise NotFiniteError(infinite, bad)
 
 
-def _share(terms: Terms, weight: Tensor, settings: TrainSettings) -> Tensor:
-    """One part's share of the loss of the whole batch."""
-    shares = [
-        getattr(settings, f"{name}_weight")
-        * term.loss
-        / weight[TERMS.index(name)].clamp(min=LEAST_WEIGHT)
-        for name, term in terms.items()
-    ]
-    return torch.stack(shares).sum()
+def _share(terms: Terms, weight: Tensor, factors: Tensor) -> Tensor:
+    """One part's share of the loss of the whole batch, by the factor of every term."""
+    loss, at = torch.stack([term.loss for term in terms.values()]), map(TERMS.index, terms)
+    both = torch.stack([factors, weight.clamp(min=LEAST_WEIGHT)])
+    factor, own = torch.stack([both[:, each] for each in at], dim=1)
+    return (factor * loss / own).sum()
 
 
 def noise_of_part(step: int, seed: int, part: int) -> int:
