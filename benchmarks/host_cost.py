@@ -89,7 +89,7 @@ def measure(batch: int, played: str, seconds: float, lines: int) -> dict[str, fl
         )
     )  # fmt: skip
     session.step()  # What is made once is not part of it.
-    profile = cProfile.Profile() if lines else None
+    profile = cProfile.Profile(time.process_time) if lines else None
     row = _steps(session, excluded, CLOCK.tokens_in(seconds), profile)
     if profile is not None:
         stats = pstats.Stats(profile, stream=sys.stderr).sort_stats("tottime")

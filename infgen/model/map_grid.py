@@ -122,17 +122,19 @@ class MapGrid:
         """
         columns, rows = self.size
         here_m, reach_m = xy_m - self.corner_m[scene], radius_m + MARGIN_M
-        low, high = _squares(here_m - reach_m), _squares(here_m + reach_m)
+        ends_m = torch.stack([here_m - reach_m, here_m + reach_m])
+        low, high = _squares(ends_m).unbind()
         left = low[:, 0].clamp(0, columns)
         right = high[:, 0].clamp(-1, columns - 1) + 1
         most = math.ceil(2 * reach_m / SIDE_M) + 1
         row = low[:, 1:] + torch.arange(most, device=xy_m.device)  # [target, row]
         touched = (row >= 0) & (row < rows) & (row <= high[:, 1:])
         touched &= (left < right)[:, None]
-        first = torch.where(touched, row * columns, 0)
+        # Those of rows that are not touched are not used, but must be there.
+        first = row.clamp(0, rows - 1) * columns
         # One by one: a row of all of a map's squares for each target would be large.
-        begin = self.start[scene[:, None], first + torch.where(touched, left[:, None], 0)]
-        end = self.start[scene[:, None], first + torch.where(touched, right[:, None], 0)]
+        begin = self.start[scene[:, None], first + left[:, None]]
+        end = self.start[scene[:, None], first + right[:, None]]
         length = (end - begin) * touched
         longest = self._longest(length, most)
         steps = torch.arange(longest, device=row.device)

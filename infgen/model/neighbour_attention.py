@@ -74,11 +74,12 @@ class _Ticket(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, tensor: Tensor, pulled: _Sum) -> Tensor:
         ctx.pulled = pulled
+        ctx.set_materialize_grads(False)  # That readers give none: it is in the sum.
         return tensor.new_zeros(())
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, _: Tensor) -> tuple[Tensor | None, None]:
+    def backward(ctx: Any, _: Tensor | None) -> tuple[Tensor | None, None]:
         summed, ctx.pulled.tensor = ctx.pulled.tensor, None
         return summed, None
 
@@ -242,10 +243,9 @@ class _Attend(torch.autograd.Function):
             if shared:
                 widened = torch.cat([_widen(query[part], relation_key), to_related], dim=1)
                 _add_product(ctx.pulled.tensor[part], both, widened, first=first)
-        ticket = relation.new_zeros(()) if shared else None
         return (
             to_query, to_key, to_value, to_relation_key, to_relation_value, to_bias,
-            to_features, None, None, ticket, None, None, None,
+            to_features, None, None, None, None, None, None,
         )  # fmt: skip
 
 

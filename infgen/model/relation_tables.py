@@ -51,6 +51,8 @@ class RelationEmbedding(FourierEmbedding):
 
     first: Tensor
     gaps: Tensor
+    zero: Tensor
+    last_gap: Tensor
     per_unit: Tensor
     starts: Tensor
 
@@ -63,12 +65,13 @@ class RelationEmbedding(FourierEmbedding):
         for name, values in (
             ("first", torch.tensor([span.first for span in spans])),
             ("gaps", gaps),
+            ("zero", torch.zeros_like(gaps)),
+            ("last_gap", gaps - 1),
             ("per_unit", gaps / length),
             ("starts", starts),
         ):
             self.register_buffer(name, values, persistent=False)
         self.evaluated: Tensor | None = None
-        self._padded: dict[tuple[int, int, torch.device], Tensor] = {}
 
     def table(self) -> Tensor:
         """Evaluate all scalars at their nodes: [P, D], one scalar after the other.
@@ -89,16 +92,6 @@ class RelationEmbedding(FourierEmbedding):
         middle = (values[:1] + values[-1:]) / 2
         return torch.cat([middle, values[1:-1], middle])
 
-    def padded_nodes(self, number: int, count: int) -> Tensor:
-        """Where the nodes of a scalar are [count], the last one repeated; made once."""
-        key = number, count, self.frequency.weight.device
-        if key not in self._padded:
-            span = self.spans[number]
-            at = torch.linspace(span.first, span.last, span.nodes)
-            at = functional.pad(at, (0, count - span.nodes), value=span.last)
-            self._padded[key] = at.to(key[2])
-        return self._padded[key]
-
     def look_up(self, values: Tensor, table_PD: Tensor) -> Tensor:
         """Embed relations [N, K, F] by a table: normed features [N, K, D]."""
         norm, _, linear = self.out
@@ -111,8 +104,8 @@ class RelationEmbedding(FourierEmbedding):
 
     def _places(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Say between which nodes relations [N, F] lie: nodes and their shares [N, 2 F]."""
-        position = ((values - self.first) * self.per_unit).clamp(min=0).minimum(self.gaps)
-        lower = position.floor().minimum(self.gaps - 1)
+        position = ((values - self.first) * self.per_unit).clamp(self.zero, self.gaps)
+        lower = position.floor().minimum(self.last_gap)
         share = position - lower
         node = lower.long() + self.starts
         return torch.cat([node, node + 1], dim=-1), torch.cat([1 - share, share], dim=-1)
@@ -136,15 +129,15 @@ class _LookUp(torch.autograd.Function):
         weight: Tensor,
         bias: Tensor,
     ) -> Tensor:
-        found = table_PD.new_empty((len(nodes), len(weight)))
-        scale = table_PD.new_empty((len(nodes), 1))
-        for part in _parts(nodes, table_PD):
-            summed = _weighted_rows(table_PD, nodes[part], shares[part])
-            hidden = functional.layer_norm(summed, gain.shape, gain, shift).relu_()
-            raw = functional.linear(hidden, weight, bias)
-            found[part], _, scale[part] = torch.native_layer_norm(
-                raw, gain.shape, None, None, NORM_EPS
-            )
+        learned, parts = (table_PD, gain, shift, weight, bias), _parts(nodes, table_PD)
+        if len(parts) == 1:
+            found, scale = _features(nodes, shares, *learned)
+        else:
+            found = table_PD.new_empty((len(nodes), len(weight)))
+            scale = table_PD.new_empty((len(nodes), 1))
+            for part in parts:
+                some = _features(nodes[part], shares[part], *learned)
+                found[part], scale[part] = some
         ctx.save_for_backward(nodes, shares, table_PD, gain, shift, weight, found, scale)
         return found
 
@@ -154,26 +147,42 @@ class _LookUp(torch.autograd.Function):
         nodes, shares, table_PD, gain, shift, weight, found, scale = ctx.saved_tensors
         learned = table_PD, gain, shift, weight
 
-        def pulled(part: slice) -> tuple[Tensor, ...]:
-            """Gradients before the linear layer, and what is summed up within it."""
-            to_raw = _through_norm(pull[part], found[part]).mul_(scale[part])
-            return to_raw, *_through_rows(to_raw, nodes[part], shares[part], *learned)
-
         if nodes.device.type != "cpu":  # All at once.
-            to_raw, hidden, to_summed, gains, shifts = pulled(slice(None))
+            to_raw = _through_norm_at_once(pull, found, scale)
+            back = _through_rows(to_raw, nodes, shares, *learned)
+            hidden, to_summed, gains, shifts = back
             table = _back_in_segments(to_summed, nodes, shares, len(table_PD))
             return None, None, table, gains, shifts, to_raw.T @ hidden, to_raw.sum(dim=0)
         table, gains, shifts, weights, biases = (
             torch.zeros_like(like) for like in (*learned, shift)
         )
         for part in _parts(nodes, table_PD):
-            to_raw, hidden, to_summed, to_gain, to_shift = pulled(part)
+            to_raw = _through_norm(pull[part], found[part]).mul_(scale[part])
+            back = _through_rows(to_raw, nodes[part], shares[part], *learned)
+            hidden, to_summed, to_gain, to_shift = back
             weights.addmm_(to_raw.T, hidden)
             biases += to_raw.sum(dim=0)
             gains += to_gain
             shifts += to_shift
             table += _back_to_rows(to_summed, nodes[part], shares[part], len(table))
         return None, None, table, gains, shifts, weights, biases
+
+
+def _features(
+    nodes: Tensor,
+    shares: Tensor,
+    table_PD: Tensor,
+    gain: Tensor,
+    shift: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Normed features [N, R] of relations, and what they were scaled by [N, 1]."""
+    summed = _weighted_rows(table_PD, nodes, shares)
+    hidden = functional.layer_norm(summed, gain.shape, gain, shift).relu_()
+    raw = functional.linear(hidden, weight, bias)
+    found, _, scale = torch.native_layer_norm(raw, gain.shape, None, None, NORM_EPS)
+    return found, scale
 
 
 def _through_rows(
@@ -191,7 +200,7 @@ def _through_rows(
         summed, gain.shape, gain, shift, NORM_EPS
     )
     hidden = normal.relu()
-    to_normal = (to_raw @ weight).mul_(hidden > 0)
+    to_normal = torch.ops.aten.threshold_backward(to_raw @ weight, hidden, 0)
     back = torch.ops.aten.native_layer_norm_backward(
         to_normal, summed, gain.shape, mean, spread, gain, shift, [True] * 3
     )
@@ -247,3 +256,11 @@ def _through_norm(pull: Tensor, normal: Tensor) -> Tensor:
     mean = pull.mean(dim=-1, keepdim=True)
     along = (pull * normal).mean(dim=-1, keepdim=True)
     return (pull - mean).addcmul_(normal, along, value=-1)
+
+
+def _through_norm_at_once(pull: Tensor, normal: Tensor, scale: Tensor) -> Tensor:
+    """The same with the scale, in fewer launches: the norm's input was like ``normal``."""
+    like, mean = normal / scale, torch.zeros_like(scale)
+    parts = pull, like, normal.shape[1:], mean, scale, None, None, [True, False, False]
+    to_input: Tensor = torch.ops.aten.native_layer_norm_backward(*parts)[0]
+    return to_input

@@ -190,14 +190,15 @@ def _nearest_keys(
 
 def wrap_angle(angle_rad: Tensor) -> Tensor:
     """Bring angles to [-pi, pi]."""
-    return angle_rad - 2 * math.pi * torch.round(angle_rad / (2 * math.pi))
+    turns = (angle_rad / (2 * math.pi)).round_()
+    return angle_rad - turns.mul_(2 * math.pi)
 
 
 def direction(away_m: Float32[Tensor, "*pair 2"], heading_rad: Tensor) -> Tensor:
     """Direction [*pair] of displacements, seen from a heading; 0 where there is none."""
     angle_rad = torch.atan2(away_m[..., 1], away_m[..., 0])
-    some = away_m.square().sum(dim=-1) > NO_DIRECTION_M**2
-    return torch.where(some, wrap_angle(angle_rad - heading_rad), 0.0)
+    none = away_m.square().sum(dim=-1) <= NO_DIRECTION_M**2
+    return wrap_angle(angle_rad - heading_rad).masked_fill_(none, 0.0)
 
 
 @torch.no_grad()
@@ -206,11 +207,12 @@ def relations(
     source_pose: Float32[Tensor, "target neighbour 3"],
 ) -> Float32[Tensor, "target neighbour 3"]:
     """Describe neighbours to their target: distance, direction, relative heading."""
-    away_m = source_pose[..., :2] - target_pose[:, None, :2]
-    distance_m = away_m.square().sum(dim=-1).sqrt()
-    heading_rad = target_pose[:, None, 2]
-    turned_rad = wrap_angle(source_pose[..., 2] - heading_rad)
-    return torch.stack([distance_m, direction(away_m, heading_rad), turned_rad], dim=-1)
+    x_m, y_m = (source_pose[..., :2] - target_pose[:, None, :2]).unbind(dim=-1)
+    square_m2 = (x_m * x_m).add_(y_m * y_m)
+    angles_rad = torch.stack([torch.atan2(y_m, x_m), source_pose[..., 2]])
+    direction_rad, turned_rad = wrap_angle(angles_rad.sub_(target_pose[:, None, 2]))
+    direction_rad.masked_fill_(square_m2 <= NO_DIRECTION_M**2, 0.0)
+    return torch.stack([square_m2.sqrt_(), direction_rad, turned_rad], dim=-1)
 
 
 @torch.no_grad()

@@ -8,7 +8,8 @@ import torch
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
 from infgen.model.batching.tensors import in_float32
-from infgen.model.device.attention import _FusedPairs, _Gate
+from infgen.model.device.attention import _FeedForward, _Look
+from infgen.model.device.folding import ALIGNED
 from infgen.model.device.index import BatchIndex
 from infgen.model.device.together import launched_together
 from infgen.model.neighbour_attention import Shared
@@ -71,37 +72,59 @@ def test_under_autocast_losses_are_nearly_those_of_float32(limits):
     assert all(torch.isfinite(each).all() for each in gradients.values())
 
 
-@pytest.mark.parametrize("share", [0.0, 0.25])
-def test_pairs_are_differentiated_as_they_are_computed(share):
-    torch.manual_seed(2)
-    double = {"dtype": torch.float64, "requires_grad": True}
-    by_both, features = torch.randn(3, 2, 5, **double), torch.randn(4, 3, **double)
-    relation = torch.randn(3, 6, 2, **double)
-    index = torch.randint(4, (3, 6))
-    hidden = torch.rand(3, 1, 6) < 0.3
-    hidden[1] = True  # Nobody is there.
-    cover = torch.zeros(3, 1, 6, dtype=torch.float64).masked_fill_(hidden, -1e9)
+def of_double(*shapes):
+    return [torch.randn(*s, dtype=torch.float64, requires_grad=True) for s in shapes]
 
-    def pairs(by_both, features, relation):
+
+@pytest.mark.parametrize("share", [0.0, 0.25])
+@pytest.mark.parametrize("slots", [1, 2])
+def test_a_look_is_differentiated_as_it_is_computed(slots, share):
+    torch.manual_seed(2)
+    width, related, heads, targets = 6, 4, 3, 3
+    each = width // heads
+    seen = width + related + ALIGNED
+    given = of_double(
+        (targets * slots, width), (width, width), (width,), (heads, each, width + related),
+        (heads, seen, each), (2 * width, 2 * width), (2 * width,), (4, width),
+        (targets, 6, related),
+    )  # fmt: skip
+    with torch.no_grad():  # As folded: itself, less what is seen; and zeros.
+        given[5][width:, :width] = -torch.eye(width)
+        given[4][:, width + related + 1 :] = 0
+    index = torch.randint(4, (targets, 6))
+    hidden = torch.rand(targets, 1, 6) < 0.3
+    hidden[1] = True  # Nobody is there.
+    cover = torch.zeros(targets, 1, 6, dtype=torch.float64).masked_fill_(hidden, -1e9)
+
+    def look(*given):
         torch.manual_seed(3)  # Drops the same weights each time.
-        shared = Shared.of(relation)
+        shared = Shared.of(given[-1])
         more = cover, hidden.all(dim=-1, keepdim=True), share
         shared = shared.values, shared.ticket, shared.pulled
-        return _FusedPairs.apply(by_both, features, index, *shared, *more)
+        return _Look.apply(*given[:-1], index, *shared, *more)
 
-    assert torch.autograd.gradcheck(pairs, (by_both, features, relation))
-    saw = pairs(by_both, features, relation)
-    assert not saw[1].any()
-    assert share or torch.allclose(saw[[0, 2], :, 5], torch.ones(2, 2, dtype=torch.float64))
-    assert not saw[..., 6:].any()
+    assert torch.autograd.gradcheck(look, given)
+    normal, gate, bias = given[0], given[5], given[6]
+    opened, own = (normal @ gate[:, width:].T + bias).chunk(2, dim=1)
+    blind = slice(slots, 2 * slots)  # Its gate is between nothing and what it is itself.
+    found = look(*given)[blind]
+    torch.testing.assert_close(found, (opened.sigmoid() * own)[blind])
 
 
-def test_gates_are_differentiated_as_they_are_computed():
+@pytest.mark.parametrize("share", [0.0, 0.25])
+def test_a_feed_forward_is_differentiated_as_it_is_computed(share):
     torch.manual_seed(2)
-    double = {"dtype": torch.float64, "requires_grad": True}
-    given = [torch.randn(*shape, **double) for shape in ((4, 3), (4, 3), (6, 6), (6,))]
+    given = of_double((5, 3), (12, 3), (12,), (3, 12), (3,))
 
-    assert torch.autograd.gradcheck(_Gate.apply, given)
+    def feed_forward(*given):
+        torch.manual_seed(3)
+        return _FeedForward.apply(*given, share)
+
+    assert torch.autograd.gradcheck(feed_forward, given)
+    if not share:
+        normal, hidden, hidden_bias, out, out_bias = given
+        expected = (normal @ hidden.T + hidden_bias).relu() @ out.T + out_bias
+        torch.testing.assert_close(feed_forward(*given), expected)
 
 
 def test_tables_evaluated_together_are_those_evaluated_alone(network):

@@ -3,54 +3,38 @@
 ``layers.Attention`` is written for a CPU, where a launch costs nothing and its cache is
 small. A GPU has the whole of a batch at once: weights are folded for all blocks together,
 queries for features and relations come from one product, and so do values, and dropout is
-drawn where weights are. Values are those of ``layers.Attention`` but for rounding.
+drawn where weights are. Gradients are written out, so that sums of them are made within
+products. Values are those of ``layers.Attention`` but for rounding.
 
 Under autocast scores and weights, and the sum of all layers' gradients of relations, are
 float32; only products have half the bits.
 
 Shape letters as in ``neighbour_attention``; E the width of what a query sees: D, R, the sum
-of its weights, and zeros that keep rows aligned.
+of its weights, and as many zeros as keep rows aligned; T the slots of all targets.
 """
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn import functional
 
-from infgen.model.layers import Attention, AttentionSources
+from infgen.model.device.folding import ALIGNED, Folded, fold
+from infgen.model.layers import Attention, AttentionSources, normed
 from infgen.model.neighbour_attention import HIDDEN_SCORE, Shared
 
-ALIGNED = 8
-"""Columns that hold the sum of the weights, and zeros."""
 FULL_BYTES = 4
 """Of a float32; numbers of fewer bytes are products only."""
-
-
-class Folded(NamedTuple):
-    """Weights of a block with its norms folded in.
-
-    Attributes:
-        query: From a head of a query to features and relations [H, C, D + R].
-        value: From what a query sees to a head of its value [H, E, C].
-        gate: From what a target saw and is to its gate and itself [2 D, 2 D] ...
-        gate_bias: ... and their biases.
-    """
-
-    query: Tensor
-    value: Tensor
-    gate: Tensor
-    gate_bias: Tensor
 
 
 @contextmanager
 def folded_together(blocks: Sequence[Attention]) -> Iterator[None]:
     """Let blocks of one shape be evaluated by ``attend``, their weights folded at once."""
+    blocks = sorted(blocks, key=lambda block: block.norm_source is not None)
     try:
-        for block, folded in zip(blocks, _fold(blocks), strict=True):
+        for block, folded in zip(blocks, fold(blocks), strict=True):
             block.fused = lambda target, seen, block=block, folded=folded: attend(
                 block, folded, target, seen
             )
@@ -60,105 +44,46 @@ def folded_together(blocks: Sequence[Attention]) -> Iterator[None]:
             block.fused = None
 
 
-def _fold(blocks: Sequence[Attention]) -> list[Folded]:
-    sources = [block.source_norm() for block in blocks]
-    relations = [block.norm_relation for block in blocks]
-    width, heads = blocks[0].query.in_features, blocks[0].heads
-    both = (sources, relations)
-    gain, shift = (
-        torch.cat([torch.stack([getattr(x, name) for x in norms]) for norms in both], dim=1)
-        for name in ("weight", "bias")
-    )
-    query, value = (
-        torch.cat([torch.stack([getattr(b, x).weight for b in blocks]) for x in pair], 2)
-        for pair in (("key", "relation_key"), ("value", "relation_value"))
-    )
-    own = torch.stack([block.value.bias for block in blocks])
-    bias = torch.baddbmm(own[..., None], value, shift[..., None])
-    scaled = gain * (width // heads) ** -0.5
-    value = functional.pad(
-        torch.cat([value * gain[:, None], bias], dim=2), (0, ALIGNED - 1)
-    )
-    shape = (len(blocks), heads, width // heads, -1)
-    gate = torch.stack([block.gate.weight for block in blocks])
-    itself = functional.pad(
-        torch.stack([block.itself.weight for block in blocks]), (width, 0)
-    )
-    parts = (
-        (query * scaled[:, None]).view(shape),
-        value.view(shape).mT,
-        torch.cat([gate, itself], dim=1),
-        torch.stack([torch.cat([b.gate.bias, b.itself.bias]) for b in blocks]),
-    )
-    return [Folded(*each) for each in zip(*(x.unbind() for x in parts), strict=True)]
-
-
 def attend(
     block: Attention, folded: Folded, target: Tensor, seen: AttentionSources
 ) -> Tensor:
-    """Update targets [N, D] or [N, S, D] as the block does."""
+    """Update targets [N, D] or [N, S, D] as the block does.
+
+    A block without a norm for sources is one whose sources are its targets, in one order:
+    these are normed already.
+    """
     slots = target if target.dim() == 3 else target[:, None]
-    normal = block.norm_target(slots)
+    alike = block.norm_source is None
+    normal = seen.features[:, None] if alike else normed(slots)
     looked = _look(block, folded, normal, seen)
-    update = _Gate.apply(  # type: ignore[no-untyped-call]
-        looked.flatten(0, 1), normal.flatten(0, 1), folded.gate, folded.gate_bias
-    ).view_as(slots)
-    slots = slots + block.norm_out(block.out(update))
-    slots = slots + block.feed_forward(slots)
+    slots = slots + block.norm_out(block.out(looked).view_as(slots))
+    norm, *_, norm_out = block.feed_forward
+    forward = _FeedForward.apply(  # type: ignore[no-untyped-call]
+        norm(slots).flatten(0, 1), *folded[-4:], _dropped(block)
+    )
+    slots = slots + norm_out(forward.view_as(slots))
     return slots.view_as(target)
 
 
-class _Gate(torch.autograd.Function):
-    """Between what targets saw [N, D] and what they are themselves, as a gate says."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, looked: Tensor, normal: Tensor, weight: Tensor, bias: Tensor
-    ) -> Tensor:
-        kind = looked.dtype
-        both = torch.cat([looked, normal.to(kind)], dim=1)
-        weight = weight.to(kind)
-        gate, itself = torch.addmm(bias.to(kind), both, weight.T).chunk(2, dim=1)
-        gate = gate.sigmoid()
-        ctx.save_for_backward(both, weight, gate, itself)
-        return torch.lerp(looked, itself, gate)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, pull: Tensor) -> tuple[Tensor, ...]:
-        both, weight, gate, itself = ctx.saved_tensors
-        width = pull.shape[1]
-        through = pull.new_empty((len(pull), 2 * width))
-        torch.mul(pull, gate, out=through[:, width:])
-        opened = (itself - both[:, :width]).mul_(pull)
-        torch.ops.aten.sigmoid_backward(opened, gate, grad_input=through[:, :width])
-        to_both = through @ weight
-        to_both[:, :width] += pull
-        to_both[:, :width] -= through[:, width:]
-        to_looked, to_normal = to_both.chunk(2, dim=1)
-        return to_looked, to_normal, through.T @ both, through.sum(dim=0)
+def _dropped(block: Attention) -> float:
+    """Share that dropout drops, as on a CPU: a multiple of 1/256."""
+    return round(block.dropout * 256) / 256 if block.training else 0.0
 
 
 def _look(
     block: Attention, folded: Folded, normal_NSD: Tensor, seen: AttentionSources
 ) -> Tensor:
-    """Sum what each slot sees [N, S, D]."""
-    targets, slots, width = normal_NSD.shape
-    query = block.query(normal_NSD).view(targets * slots, block.heads, -1)
-    kind = query.dtype
-    by_both = torch.bmm(query.transpose(0, 1), folded.query.to(kind))
-    by_both = by_both.transpose(0, 1).reshape(targets, slots * block.heads, -1)
-    score, blind = _cover(seen, slots * block.heads, block.heads)
-    share = round(block.dropout * 256) / 256 if block.training else 0.0
+    """Gate what each slot sees and what it is itself [T, D]."""
+    slots, kind = normal_NSD.shape[1], folded.query.dtype
+    cover, blind = _cover(seen, slots * block.heads, block.heads)
     relation: Shared = seen.relation
-    looked = _FusedPairs.apply(  # type: ignore[no-untyped-call]
-        *(by_both, seen.features.to(kind), seen.index),
+    looked: Tensor = _Look.apply(  # type: ignore[no-untyped-call]
+        *(normal_NSD.flatten(0, 1).to(kind), *folded[:6]),
+        *(seen.features.to(kind), seen.index),
         *(relation.of_kind(kind), relation.ticket, relation.pulled),
-        *(score, blind, share),
+        *(cover, blind, _dropped(block)),
     )
-    looked = looked.view(targets * slots, block.heads, -1).transpose(0, 1)
-    value = torch.bmm(looked, folded.value.to(kind))
-    return value.transpose(0, 1).reshape(targets, slots, width)
+    return looked
 
 
 def _cover(seen: AttentionSources, queries: int, heads: int) -> tuple[Tensor, Tensor]:
@@ -172,18 +97,23 @@ def _cover(seen: AttentionSources, queries: int, heads: int) -> tuple[Tensor, Te
             )  # [N, S H, K]
         elif hidden.dim() == 2:
             hidden = hidden[:, None]
-        score = torch.zeros(hidden.shape, device=hidden.device)
-        score = score.masked_fill_(hidden, HIDDEN_SCORE)
+        score = hidden * HIDDEN_SCORE
         covers = seen.present, score, hidden.all(dim=-1, keepdim=True)
         object.__setattr__(seen.relation, "covers", covers)
     return covers[1], covers[2]
 
 
-class _FusedPairs(torch.autograd.Function):
+class _Look(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        by_both: Tensor,
+        normal: Tensor,
+        query: Tensor,
+        query_bias: Tensor,
+        wide: Tensor,
+        value: Tensor,
+        gate: Tensor,
+        gate_bias: Tensor,
         features: Tensor,
         index: Tensor,
         relation: Tensor,
@@ -193,56 +123,170 @@ class _FusedPairs(torch.autograd.Function):
         blind: Tensor,
         share: float,
     ) -> Tensor:
-        width, both = features.shape[1], by_both.shape[2]
-        with torch.autocast(by_both.device.type, enabled=False):
-            near = _near(features, index)
-            score = _products(by_both, near, relation, cover)
-            weight = score.softmax(dim=-1).masked_fill_(blind, 0.0)
-            used, kept = weight, None
-            if share:
-                used, kept = torch.native_dropout(weight, share, True)
-            used = used.to(features.dtype)
-            looked = by_both.new_zeros((*by_both.shape[:2], both + ALIGNED))
-            torch.bmm(used, near, out=looked[..., :width])
-            torch.bmm(used, relation, out=looked[..., width:both])
-            torch.sum(used, dim=-1, out=looked[..., both])
-        ctx.save_for_backward(by_both, features, index, relation, weight, kept, ticket)
+        heads, both = len(wide), wide.shape[2]
+        with torch.autocast(normal.device.type, enabled=False):
+            asked = _heads(torch.addmm(query_bias, normal, query.T), heads)
+            by_both = normal.new_empty((*asked.shape[:2], both))
+            torch.bmm(asked.transpose(0, 1), wide, out=by_both.transpose(0, 1))
+            by_both = by_both.view(len(index), -1, both)
+            weight, kept, looked = _weigh(
+                by_both, features, index, relation, (cover, blind), share
+            )
+            each = looked.view(-1, heads, looked.shape[2]).transpose(0, 1)
+            saw = torch.bmm(each, value).transpose(0, 1)
+            joined = torch.cat([saw, _heads(normal, heads)], dim=1).flatten(1)
+            opened, between = torch.addmm(gate_bias, joined, gate.T).chunk(2, dim=1)
+            opened = opened.sigmoid()
+            found = torch.addcmul(joined.chunk(2, dim=1)[0], opened, between)
+        ctx.save_for_backward(
+            query, wide, value, gate, features, index, relation,
+            asked, by_both, weight, kept, looked, joined, opened, between,
+        )  # fmt: skip
         ctx.pulled, ctx.share = pulled, share
-        return looked
+        return found
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, pull: Tensor) -> tuple[Tensor | None, ...]:
-        by_both, features, index, relation, weight, kept, ticket = ctx.saved_tensors
-        width, both = features.shape[1], by_both.shape[2]
-        with torch.autocast(by_both.device.type, enabled=False):
-            near = _near(features, index)
-            to_weight = _products(pull[..., :both], near, relation, pull[..., both, None])
-            used = weight
-            if kept is not None:
-                scale = 1 / (1 - ctx.share)
-                to_weight = torch.ops.aten.native_dropout_backward(to_weight, kept, scale)
-                used = torch.ops.aten.native_dropout_backward(weight, kept, scale)
-            to_score = torch.ops.aten._softmax_backward_data(
-                to_weight, weight, -1, weight.dtype
+        (
+            query, wide, value, gate, features, index, relation,
+            asked, by_both, weight, kept, looked, joined, opened, between,
+        ) = ctx.saved_tensors  # fmt: skip
+        heads, width = len(wide), pull.shape[1]
+        with torch.autocast(pull.device.type, enabled=False):
+            through = pull.new_empty((len(pull), 2 * width))
+            one, other = through.chunk(2, dim=1)
+            torch.mul(pull, opened, out=other)
+            torch.ops.aten.sigmoid_backward(pull * between, opened, grad_input=one)
+            to_saw, to_normal = (through @ gate).chunk(2, dim=1)
+            to_each = _heads(to_saw.add_(pull), heads).transpose(0, 1)
+            to_looked = torch.empty_like(looked)
+            of_heads = (-1, heads, looked.shape[2])
+            torch.bmm(to_each, value.mT, out=to_looked.view(of_heads).transpose(0, 1))
+            to_value = torch.bmm(looked.view(of_heads).permute(1, 2, 0), to_each)
+
+            shared = ctx.pulled if ctx.needs_input_grad[10] else None
+            to_both, to_features = _pull_pairs(
+                to_looked, by_both, (features, index, relation), (weight, kept), ctx.share,
+                shared,
+            )  # fmt: skip
+            of_heads = (-1, heads, by_both.shape[2])
+            to_both = to_both.view(of_heads).transpose(0, 1)
+            to_asked = torch.empty_like(asked)
+            torch.bmm(to_both, wide.mT, out=to_asked.transpose(0, 1))
+            to_wide = torch.bmm(asked.permute(1, 2, 0), to_both)
+            to_asked = to_asked.flatten(1)
+            normal = joined.chunk(2, dim=1)[1]
+            return (
+                torch.addmm(to_normal, to_asked, query),
+                *(to_asked.T @ normal, to_asked.sum(dim=0), to_wide, to_value),
+                *(through.T @ joined, through.sum(dim=0), to_features, None),
+                *(None, None, None, None, None, None),
             )
-            pair = torch.cat([to_score, used], dim=1).to(features.dtype)  # [N, 2 Q, K]
-            to_both = torch.empty_like(by_both)
-            to_score = pair[:, : weight.shape[1]]
-            torch.bmm(to_score, near, out=to_both[..., :width])
-            torch.bmm(to_score, relation, out=to_both[..., width:])
-            queries = torch.cat([by_both, pull[..., :both]], dim=1)
-            to_near = torch.bmm(pair.mT, queries[..., :width])
-            to_features = torch.ops.aten.embedding_dense_backward(
-                to_near.flatten(0, 1), index.flatten(), len(features), -1, False
+
+
+def _heads(values_TD: Tensor, heads: int) -> Tensor:
+    """View values head by head [T, H, C]."""
+    return values_TD.view(len(values_TD), heads, -1)
+
+
+def _weigh(
+    by_both: Tensor,
+    features: Tensor,
+    index: Tensor,
+    relation: Tensor,
+    hiding: tuple[Tensor, Tensor],
+    share: float,
+) -> tuple[Tensor, Tensor | None, Tensor]:
+    """Weights of pairs [N, Q, K], which of them dropout keeps, and their sums [N, Q, E]."""
+    (cover, blind), width, both = hiding, features.shape[1], by_both.shape[2]
+    near = _near(features, index)
+    score = _products(by_both, near, relation, cover)
+    weight = score.softmax(dim=-1).masked_fill_(blind, 0.0)
+    used, kept = weight, None
+    if share:
+        used, kept = torch.native_dropout(weight, share, True)
+    used = used.to(features.dtype)
+    looked = by_both.new_empty((*by_both.shape[:2], both + ALIGNED))
+    torch.bmm(used, near, out=looked[..., :width])
+    torch.bmm(used, relation, out=looked[..., width:both])
+    # Columns beyond the first meet zeros in the weights: they need be no more than finite.
+    alike = used[:, :, None].expand(-1, -1, ALIGNED, -1)
+    torch.sum(alike, dim=-1, out=looked[..., both:])
+    return weight, kept, looked
+
+
+def _pull_pairs(
+    pull: Tensor,
+    by_both: Tensor,
+    sources: tuple[Tensor, Tensor, Tensor],
+    weights: tuple[Tensor, Tensor | None],
+    share: float,
+    pulled: Any,
+) -> tuple[Tensor, Tensor]:
+    """Gradients of queries and features; those of relations are added to ``pulled``."""
+    (features, index, relation), (weight, kept) = sources, weights
+    width, both = features.shape[1], by_both.shape[2]
+    near = _near(features, index)
+    to_weight = _products(pull[..., :both], near, relation, pull[..., both, None])
+    used = weight
+    if kept is not None:
+        scale = 1 / (1 - share)
+        to_weight = torch.ops.aten.native_dropout_backward(to_weight, kept, scale)
+        used = torch.ops.aten.native_dropout_backward(weight, kept, scale)
+    to_score = torch.ops.aten._softmax_backward_data(to_weight, weight, -1, weight.dtype)
+    pair = torch.cat([to_score, used], dim=1).to(features.dtype)  # [N, 2 Q, K]
+    to_both = torch.empty_like(by_both)
+    to_score = pair[:, : weight.shape[1]]
+    torch.bmm(to_score, near, out=to_both[..., :width])
+    torch.bmm(to_score, relation, out=to_both[..., width:])
+    queries = torch.cat([by_both, pull[..., :both]], dim=1)
+    to_near = torch.bmm(pair.mT, queries[..., :width])
+    to_features = torch.ops.aten.embedding_dense_backward(
+        to_near.flatten(0, 1), index.flatten(), len(features), -1, False
+    )
+    if pulled is not None:
+        _add_products(pulled, pair.mT, queries[..., width:])
+    return to_both, to_features
+
+
+class _FeedForward(torch.autograd.Function):
+    """Two layers with ReLU and dropout between them: only what is left of it is kept."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        normal: Tensor,
+        hidden: Tensor,
+        hidden_bias: Tensor,
+        out: Tensor,
+        out_bias: Tensor,
+        share: float,
+    ) -> Tensor:
+        kind = hidden.dtype
+        with torch.autocast(normal.device.type, enabled=False):
+            normal = normal.to(kind)
+            left = torch._addmm_activation(hidden_bias, normal, hidden.T)  # With ReLU.
+            if share:
+                left = torch.native_dropout(left, share, True)[0]
+            found = torch.addmm(out_bias, left, out.T)
+        ctx.save_for_backward(normal, hidden, out, left)
+        ctx.scale = 1 / (1 - share)
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, pull: Tensor) -> tuple[Tensor | None, ...]:
+        normal, hidden, out, left = ctx.saved_tensors
+        with torch.autocast(pull.device.type, enabled=False):
+            # A product alone, scaled: beta is zero.
+            scaled = torch.addmm(out[:1], pull, out, beta=0, alpha=ctx.scale)
+            through = torch.ops.aten.threshold_backward(scaled, left, 0)
+            return (
+                through @ hidden,
+                *(through.T @ normal, through.sum(dim=0)),
+                *(pull.T @ left, pull.sum(dim=0), None),
             )
-            shared = ctx.needs_input_grad[4]
-            if shared:
-                _add_products(ctx.pulled, pair.mT, queries[..., width:])
-        return (
-            to_both, to_features, None,
-            None, ticket if shared else None, None, None, None, None,
-        )  # fmt: skip
 
 
 def _near(features: Tensor, index: Tensor) -> Tensor:

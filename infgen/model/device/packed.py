@@ -13,6 +13,7 @@ from torch import Tensor
 from infgen.model.batching.batch import Batch
 from infgen.model.batching.tensors import map_tensors
 from infgen.model.device.index import BatchIndex
+from infgen.model.training.loss_weights import Supervision
 
 ALIGNED_BYTES = 16
 """Tensors begin at multiples of this, as products on GPUs want them to."""
@@ -25,10 +26,12 @@ class IndexedBatch:
     Attributes:
         batch: The batch.
         index: The places; None to find them where the batch is.
+        supervision: What is supervised of it; None likewise.
     """
 
     batch: Batch
     index: BatchIndex | None
+    supervision: Supervision | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +56,9 @@ class PackedBatch:
             parts.append(torch.zeros(_gap(parts[-1].numel()), dtype=torch.uint8))
             return torch.empty_like(tensor, device="meta")
 
-        layout = map_tensors(IndexedBatch(batch, BatchIndex.of(batch)), lay)
+        layout = map_tensors(
+            IndexedBatch(batch, BatchIndex.of(batch), Supervision.of(batch)), lay
+        )
         return cls(torch.cat(parts), layout)
 
     @property
@@ -83,7 +88,7 @@ def prepared(part: Batch | PackedBatch, device: torch.device) -> IndexedBatch:
     """Bring a batch to a device, however it comes."""
     if isinstance(part, PackedBatch):
         return part.unpack(device)
-    return IndexedBatch(map_tensors(part, lambda x: x.to(device)), None)
+    return IndexedBatch(map_tensors(part, lambda x: x.to(device)), None, None)
 
 
 def _gap(length: int) -> int:

@@ -15,13 +15,16 @@ BIN_EDGES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
 @torch.no_grad()
-def motion_surprise(outputs: Outputs, batch: Batch) -> Float32[Tensor, "2"]:
+def motion_surprise(
+    outputs: Outputs, batch: Batch, mask: Tensor | None = None
+) -> Float32[Tensor, "2"]:
     """Sum the negative log-likelihoods of the next motion tokens, and count them.
 
     Without label smoothing and weights: the exponential of their mean is the perplexity.
+    ``mask`` is ``motion_mask`` of the batch's agents, if it is known already.
     """
     rows, agents = outputs.motion.rows, batch.agents
-    chosen = Chosen.of(rows.pack(motion_mask(agents)))
+    chosen = Chosen.of(rows.pack(motion_mask(agents) if mask is None else mask))
     target = chosen.take(rows.pack(agents.label.roll(-1, dims=1)))
     if chosen.counted is not None:
         target = target.clamp(min=0)  # Of rows that do not count.

@@ -79,15 +79,50 @@ MEASURED = (
 """Terms of which nothing is right or wrong."""
 
 
-def losses(outputs: Outputs, batch: Batch, settings: TrainSettings) -> Terms:
-    """Compute every term, by name; none of what the network has no head for."""
+@dataclass(frozen=True, slots=True)
+class AgentMasks:
+    """Which tokens of agents are supervised; it follows from a batch alone.
+
+    Attributes:
+        motion: ``motion_mask`` [scene, token, agent].
+        stay: ``stay_mask`` [scene, token, agent].
+        pattern: ``pattern_mask`` [scene, token, agent].
+    """
+
+    motion: Tensor
+    stay: Tensor
+    pattern: Tensor
+
+    @classmethod
+    def of(cls, agents: Agents) -> "AgentMasks":
+        """Find them."""
+        return cls(motion_mask(agents), stay_mask(agents), pattern_mask(agents))
+
+
+def losses(
+    outputs: Outputs,
+    batch: Batch,
+    settings: TrainSettings,
+    masks: AgentMasks | None = None,
+) -> Terms:
+    """Compute every term, by name; none of what the network has no head for.
+
+    Args:
+        outputs: Of the network.
+        batch: What they should have been.
+        settings: Weights of first motion tokens and smoothing of labels.
+        masks: Those of the batch's agents, if they are known already.
+    """
     smoothing, motion = settings.label_smoothing, outputs.motion
-    terms = {"motion": _motion(motion, batch.agents, settings)}
+    masks = masks or AgentMasks.of(batch.agents)
+    terms = {"motion": _motion(motion, batch.agents, settings, masks.motion)}
     if motion.remove_logit is not None:
-        terms["keep"] = _stay(motion.rows, motion.remove_logit, batch.agents)
+        logit = motion.remove_logit
+        terms["keep"] = _stay(motion.rows, logit, batch.agents, masks.stay)
     if motion.pattern_logits is not None:
+        logits = motion.pattern_logits
         terms["validity_pattern"] = _pattern(
-            motion.rows, motion.pattern_logits, batch.agents
+            motion.rows, logits, batch.agents, masks.pattern
         )
     if outputs.entries is not None:
         terms |= _entries(outputs.entries, batch, smoothing)
@@ -160,10 +195,12 @@ def _before(values: Tensor) -> Tensor:
     return torch.cat([torch.zeros_like(values[:, :1]), values[:, :-1]], dim=1)
 
 
-def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> Term:
+def _motion(
+    outputs: MotionOutputs, agents: Agents, settings: TrainSettings, mask: Tensor
+) -> Term:
     """Next motion token of every agent; an inserted agent's first one counts more."""
     rows = outputs.rows
-    mask = rows.pack(motion_mask(agents))
+    mask = rows.pack(mask)
     weight = torch.ones(agents.motion_token.shape, device=mask.device)
     entering = agents.presence[:, 1:] == int(Presence.INSERTED)
     # At token 0 nobody comes in.
@@ -179,17 +216,15 @@ def _motion(outputs: MotionOutputs, agents: Agents, settings: TrainSettings) -> 
     )
 
 
-def _stay(rows: Rows, remove_logit: Tensor, agents: Agents) -> Term:
-    mask = rows.pack(stay_mask(agents))
-    chosen = Chosen.of(mask)
+def _stay(rows: Rows, remove_logit: Tensor, agents: Agents, mask: Tensor) -> Term:
+    chosen = Chosen.of(rows.pack(mask))
     leaves = chosen.take(rows.pack(_next(agents.removal, False)))
     return _event(chosen, chosen.take(remove_logit), leaves)
 
 
-def _pattern(rows: Rows, pattern_logits: Tensor, agents: Agents) -> Term:
-    mask = rows.pack(pattern_mask(agents))
+def _pattern(rows: Rows, pattern_logits: Tensor, agents: Agents, mask: Tensor) -> Term:
     target = rows.pack(_next(agents.pattern, 0))
-    chosen = Chosen.of(mask)
+    chosen = Chosen.of(rows.pack(mask))
     return _choice(chosen, chosen.take(pattern_logits), chosen.take(target), 0.0)
 
 

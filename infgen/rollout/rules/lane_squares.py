@@ -28,6 +28,7 @@ class LaneSquares:
         start_m: First point of the segments, by square.
         along_m: Vector from there to their last point.
         reach_m: The distance.
+        has_any: Which maps have lanes.
     """
 
     corner_m: Float32[np.ndarray, "scene 2"]
@@ -37,6 +38,7 @@ class LaneSquares:
     start_m: Float32[np.ndarray, "listed 2"]
     along_m: Float32[np.ndarray, "listed 2"]
     reach_m: float
+    has_any: Bool[np.ndarray, " scene"]
 
     @classmethod
     def of(cls, maps: Sequence[Lanes], reach_m: float) -> "LaneSquares":
@@ -66,7 +68,9 @@ class LaneSquares:
             )
             for k in (0, 1)
         )
-        return cls(corner_m, side_m, (columns, rows), begin, start_m, along_m, reach_m)
+        has_any = np.array([len(low_m) > 0 for low_m, _ in boxes], dtype=bool)
+        size = (columns, rows)
+        return cls(corner_m, side_m, size, begin, start_m, along_m, reach_m, has_any)
 
     def has_lane(
         self, xy_m: Float32[np.ndarray, "point 2"], scene: Int64[np.ndarray, " point"]

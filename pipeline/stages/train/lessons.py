@@ -13,7 +13,7 @@ from infgen.model.network import Network
 from infgen.model.training.closed_loop import close_loop
 from infgen.model.training.closed_loop_population import close_population_loop
 from infgen.model.training.diagnostics import motion_surprise
-from infgen.model.training.loss_weights import supervised, supervised_choices
+from infgen.model.training.loss_weights import Supervision, supervised_choices
 from infgen.model.training.losses import Terms, losses
 from infgen.model.training.policy_gradient.lessons import PolicyLessons, simulate_lessons
 from infgen.model.training.policy_gradient.terms import policy_terms
@@ -22,22 +22,35 @@ from pipeline.storage.checkpoint import TrainingState
 
 
 @dataclass(frozen=True, slots=True)
+class LogLesson:
+    """What is learned from scenes as logged, or near to the log.
+
+    Attributes:
+        given: The scenes.
+        supervision: What is supervised of them.
+    """
+
+    given: IndexedBatch
+    supervision: Supervision
+
+
+@dataclass(frozen=True, slots=True)
 class Lessons:
     """One part of a batch, to learn from.
 
     Attributes:
-        log: The scenes as logged, or near to the log; None to leave them out.
+        log: Its scenes; None to leave the log out.
         rollouts: Rollouts of them; None for none.
     """
 
-    log: IndexedBatch | None
+    log: LogLesson | None
     rollouts: PolicyLessons | None
 
     def weight(self, settings: TrainSettings) -> Tensor:
         """Sum the weights of every term of the loss [term]."""
         found = []
         if self.log is not None:
-            found.append(supervised(self.log.batch, settings))
+            found.append(self.log.supervision.weight(settings))
         for lesson in self.rollouts.lessons if self.rollouts else ():
             found.append(supervised_choices(lesson.moved.sum()))
         return torch.stack(found).sum(dim=0)
@@ -57,7 +70,8 @@ def prepare_lessons(
         rollouts = simulate_lessons(network, here.batch, settings, seed)
     if rollouts is not None and not settings.log_weight:
         return Lessons(None, rollouts)
-    return Lessons(_near_log(here, network, settings, seed), rollouts)
+    log = _near_log(here, network, settings, seed)
+    return Lessons(LogLesson(log, log.supervision or Supervision.of(log.batch)), rollouts)
 
 
 def _near_log(
@@ -67,10 +81,10 @@ def _near_log(
     top = settings.closed_loop_top_k
     if settings.closed_loop_population:
         simulated = close_population_loop(network, here.batch, top, seed)
-        return IndexedBatch(simulated, None)  # Others are there than in the log.
+        return IndexedBatch(simulated, None, None)  # Others are there than in the log.
     if not top:
         return here
-    return replace(here, batch=close_loop(network, here.batch, top))
+    return replace(here, batch=close_loop(network, here.batch, top), supervision=None)
 
 
 def each_terms(
@@ -83,9 +97,10 @@ def each_terms(
     sampled from.
     """
     if lessons.log is not None:
-        batch = lessons.log.batch
-        outputs = forward(batch, lessons.log.index)
-        yield losses(outputs, batch, settings), motion_surprise(outputs, batch)
+        batch, masks = lessons.log.given.batch, lessons.log.supervision.masks
+        outputs = forward(batch, lessons.log.given.index)
+        terms = losses(outputs, batch, settings, masks)
+        yield terms, motion_surprise(outputs, batch, masks.motion)
     if lessons.rollouts is None:
         return
     network, pretrained = training.network, training.pretrained

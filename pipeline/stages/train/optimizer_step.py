@@ -98,6 +98,9 @@ class OptimizerStep:
         self._own = [part.view_as(parameter) for part, parameter in cut]
         for parameter, own in zip(parameters, self._own, strict=True):
             parameter.grad = own
+        factors = [settings.loss_weight(name) for name in TERMS]
+        # Filled one by one, as the host would wait for a copy.
+        self._factors = torch.stack([parameters[0].new_full((), x) for x in factors])
         self._on_cpu = self._sums.device.type == "cpu"
 
     def step(
@@ -152,7 +155,7 @@ class OptimizerStep:
         if lessons.rollouts is not None:
             self._rollouts += lessons.rollouts.sums
         for terms, surprise in each_terms(lessons, self._training, self.forward, settings):
-            loss = _share(terms, weight, settings)
+            loss = _share(terms, weight, self._factors)
             self._add_gradient(loss)
             nothing = loss.new_zeros(())
             none = Term(nothing, nothing, nothing, nothing, nothing)
@@ -207,15 +210,12 @@ def _check(norm: float, terms: Mapping[str, Term], bad: Sequence[int]) -> None:
     raise NotFiniteError(infinite, bad)
 
 
-def _share(terms: Terms, weight: Tensor, settings: TrainSettings) -> Tensor:
-    """One part's share of the loss of the whole batch."""
-    shares = [
-        settings.loss_weight(name)
-        * term.loss
-        / weight[TERMS.index(name)].clamp(min=LEAST_WEIGHT)
-        for name, term in terms.items()
-    ]
-    return torch.stack(shares).sum()
+def _share(terms: Terms, weight: Tensor, factors: Tensor) -> Tensor:
+    """One part's share of the loss of the whole batch, by the factor of every term."""
+    loss, at = torch.stack([term.loss for term in terms.values()]), map(TERMS.index, terms)
+    both = torch.stack([factors, weight.clamp(min=LEAST_WEIGHT)])
+    factor, own = torch.stack([both[:, each] for each in at], dim=1)
+    return (factor * loss / own).sum()
 
 
 def noise_of_part(step: int, seed: int, part: int) -> int:

@@ -7,8 +7,9 @@ import torch
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
+from infgen.model.device.packed import PackedBatch
 from infgen.model.training.loss_weights import TERMS, supervised
-from infgen.model.training.losses import losses
+from infgen.model.training.losses import losses, motion_mask, pattern_mask, stay_mask
 
 HOW = TrainSettings(first_motion_weight=3.0)
 VARIANTS = {
@@ -41,3 +42,16 @@ def test_weights_of_parts_add_up_to_those_of_the_whole(record, limits):
     parts = sum(supervised(collate(scenes[at::2], limits, 0), HOW) for at in (0, 1))
 
     torch.testing.assert_close(parts, supervised(collate(scenes, limits, 0), HOW))
+
+
+def test_a_packed_batch_says_what_it_supervises(record, limits):
+    batch = collate([record(seed, agents=6) for seed in range(2)], limits, 0)
+
+    found = PackedBatch.of(batch).unpack(torch.device("cpu"))
+
+    assert found.supervision is not None
+    torch.testing.assert_close(found.supervision.weight(HOW), supervised(batch, HOW))
+    masks, agents = found.supervision.masks, batch.agents
+    assert torch.equal(masks.motion, motion_mask(agents))
+    assert torch.equal(masks.stay, stay_mask(agents))
+    assert torch.equal(masks.pattern, pattern_mask(agents))
