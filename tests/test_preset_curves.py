@@ -13,7 +13,7 @@ pytestmark = pytest.mark.slow
 
 TINY = (
     *("--profile", "tiny", "--seeds", "1", "--root", "R", "--json"),
-    *("-s", "train.steps=1", "-s", "train.batch_scenes=1", "-s", "rollout.seconds=4"),
+    *("-s", "train.steps=1", "-s", "train.batch_scenes=1"),
     *("-s", "train.validation_scenes=1", "-s", "ingest.max_scenes_per_file=1"),
     *("-s", "train.checkpoint_every_steps=0", "-s", "score.bootstrap_resamples=20"),
 )
@@ -33,7 +33,9 @@ def rows_of(folder):
 def test_points_of_a_scaling_curve_go_on_from_each_other(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
-    run_preset("scaling", "--records", "builtin", "--arms", "shown-1k,shown-2k,shown-4k")
+    arms = "shown-1k,shown-2k,shown-4k"
+
+    run_preset("scaling", "--records", "builtin", "--arms", arms, "-s", "rollout.seconds=4")
 
     shown = tmp_path / "R/presets/scaling"
     header, *rows = rows_of(shown)
