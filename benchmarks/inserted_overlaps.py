@@ -22,8 +22,9 @@ import infgen
 from infgen.geometry import boxes_overlap
 from infgen.metrics.motion import Motion
 from infgen.metrics.traffic import Traffic, from_rollout, observe_log
-from infgen.rollout.rules.off_road import lane_segments, lanes_distance_m
+from infgen.rollout.rules.off_road import lane_segments
 from infgen.scene import AgentType, Scene
+from infgen.spatial.lanes import lanes_distance_m
 from pipeline.commands.screen import show_table
 
 RULES: dict[str, dict[str, Any]] = {

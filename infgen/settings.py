@@ -75,6 +75,7 @@ AtLeastOne = Annotated[Int, Field(ge=1)]
 NonNegative = Annotated[Float, Field(ge=0)]
 Positive = Annotated[Float, Field(gt=0)]
 Share = Annotated[Float, Field(ge=0, le=1)]
+Nucleus = Annotated[Float, Field(gt=0, le=1)]
 Seed = Annotated[Int, Field(ge=0, le=MAX_SEED)]
 
 

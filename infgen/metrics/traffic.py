@@ -9,8 +9,9 @@ from infgen.clock import CLOCK
 from infgen.metrics.motion import Motion
 from infgen.metrics.placement import Events, logged_events, simulated_events
 from infgen.rollout.rollout import Rollout
-from infgen.rollout.rules.off_road import Lanes, lanes_distance_m
+from infgen.rollout.rules.off_road import Lanes
 from infgen.scene import AgentType, Scene
+from infgen.spatial.lanes import lanes_distance_m
 from infgen.tokens.settings import TokenSettings
 
 

@@ -1,6 +1,7 @@
 """Settings of stage ``train``: how the network learns."""
 
 import re
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -15,6 +16,7 @@ from infgen.settings import (
     Float,
     Int,
     NonNegative,
+    Nucleus,
     Seed,
     Share,
     Text,
@@ -28,6 +30,9 @@ def _shares(value: str) -> str:
         raise ValueError("expected sources and shares, as tfrecord:2,argoverse2:1")
     return value
 
+
+LEAST_ROLLOUTS = 3
+"""Rollouts of a scene that a policy gradient needs: of two, one has no spread."""
 
 SourceShares = Annotated[str, AfterValidator(_shares)]
 
@@ -129,6 +134,28 @@ class TrainSettings:
     """Scenes are simulated with the insertions and removals of the network before they are
     learned from, and it learns to correct their number. Agents that the log has too move as
     `closed_loop_top_k` says, or as logged."""
+    policy_gradient_rollouts: Count = 0
+    """Rollouts of each scene that the network simulates and learns from by policy gradient,
+    3 or more; 0 for none. The penalties below are its rewards, the initial weights the
+    pretrained network that it stays near to."""
+    policy_top_p: Nucleus = 0.9
+    """Motion tokens of these rollouts are sampled from the nucleus, as with
+    `rollout.motion_top_p`; 1 for all."""
+    policy_discount: Share = 0.9
+    """Factor on rewards for each token step that they come later."""
+    overlap_penalty: NonNegative = 1.0
+    """Cost of running into another agent."""
+    off_road_penalty: NonNegative = 0.5
+    """Cost of each token step in which a vehicle leaves the road or gets farther off it."""
+    log_distance_penalty: NonNegative = 0.1
+    """Cost of the square root of a metre from the logged position, less that from the
+    other rollouts, for each token step (an energy score)."""
+    divergence_weight: NonNegative = 0.1
+    """Weight of the divergence from the pretrained network: cost of a nat per motion
+    token."""
+    log_weight: NonNegative = 0.0
+    """Weight of the loss terms of the log beside the policy gradient; 0 to leave the log
+    out."""
     loader_workers: Annotated[Count | None, NOT_IN_KEY] = None
     """Processes that prepare batches, 0 for a thread; by default two on a GPU, whose
     launches keep this process busy, and a thread on a CPU."""
@@ -150,14 +177,33 @@ class TrainSettings:
     @model_validator(mode="after")
     def _check(self) -> "TrainSettings":
         for noise in ("motion_noise_neighbours", "lateral_drift_share"):
-            if self.closed_loop_top_k and getattr(self, noise):
-                raise ValueError(
-                    f"closed_loop_top_k and {noise} both lead agents off their logged "
-                    "paths; set one of them to 0"
-                )
+            for simulated in ("closed_loop_top_k", "policy_gradient_rollouts"):
+                if getattr(self, simulated) and getattr(self, noise):
+                    raise ValueError(
+                        f"{simulated} and {noise} both lead agents off their logged "
+                        "paths; set one of them to 0"
+                    )
+        if 0 < self.policy_gradient_rollouts < LEAST_ROLLOUTS:
+            raise ValueError(
+                f"policy_gradient_rollouts is {self.policy_gradient_rollouts}; expected 0, "
+                f"or {LEAST_ROLLOUTS} or more, that each can be compared with others"
+            )
         if self.gradient_accumulation > self.batch_scenes:
             raise ValueError(
                 f"gradient_accumulation is {self.gradient_accumulation}, more than the "
                 f"{self.batch_scenes} scenes of a batch"
             )
         return self
+
+    def loss_weight(self, term: str) -> float:
+        """Weight of a loss term, by its name, in what is minimised."""
+        if term == "policy":
+            return 1.0
+        weight: float = getattr(self, f"{term}_weight")
+        learns_log = term == "divergence" or not self.policy_gradient_rollouts
+        return weight if learns_log else weight * self.log_weight
+
+    @property
+    def of_the_log(self) -> "TrainSettings":
+        """Return them without policy gradient: the loss of held-out logs."""
+        return replace(self, policy_gradient_rollouts=0)

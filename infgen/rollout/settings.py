@@ -17,11 +17,11 @@ from infgen.settings import (
     Count,
     Float,
     NonNegative,
+    Nucleus,
     Seed,
 )
 
 Temperature = Annotated[Float, Field(gt=0)]
-Nucleus = Annotated[Float, Field(gt=0, le=1)]
 
 
 @plain_dataclass(frozen=True, slots=True)

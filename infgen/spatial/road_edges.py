@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Bool, Float32, Int32
 
 from infgen.scene import FeatureType, Scene
 from infgen.spatial.nearest import nearest_by_cells
@@ -21,6 +21,10 @@ HEIGHT_SCALE = np.float32(3.0)
 CLOSED_GAP_M2 = np.float32(1.0)
 """Squared distance of first and last point below which an edge is closed."""
 NONE = -1
+OFF_M = 1.0
+"""Who is farther off the road than this does not leave it (driveways, parking lots)."""
+SLACK_M = 0.05
+"""Changes of the distance below this are ignored."""
 
 
 class RoadError(ValueError):
@@ -115,6 +119,15 @@ def signed_distance_m(
         both = np.stack([side[rows], other_side])
         side[rows] = np.where(convex, both.max(axis=0), both.min(axis=0))
     return side * np.sqrt(_dot(gap_m, gap_m))
+
+
+def leaves_road(
+    before_m: Float32[np.ndarray, "*agent"], after_m: Float32[np.ndarray, "*agent"]
+) -> Bool[np.ndarray, "*agent"]:
+    """Tell whose signed distance says that it leaves the road, or gets farther off it."""
+    farther = after_m > np.maximum(before_m, 0) + np.float32(SLACK_M)
+    left: np.ndarray = farther & (before_m < OFF_M)
+    return left
 
 
 def project(

@@ -29,11 +29,15 @@ class TrainingState:
         network: The network.
         average: Moving average of its parameters, by name; empty if there is none.
         optimiser: AdamW over its parameters.
+        pretrained: The network as it was before any step, which it is to stay near to; None
+            if nothing is measured by it. No checkpoint holds it: it is that of the initial
+            weights, whose fingerprint is part of the key.
     """
 
     network: Network
     average: dict[str, Tensor]
     optimiser: torch.optim.AdamW
+    pretrained: Network | None = None
 
 
 def save_checkpoint(folder: Path, training: TrainingState, step: int) -> None:

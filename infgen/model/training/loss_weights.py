@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from infgen.model.batching.batch import Batch
-from infgen.model.training.losses import motion_mask, pattern_mask, stay_mask
+from infgen.model.training.losses import OF_ROLLOUTS, motion_mask, pattern_mask, stay_mask
 from infgen.model.training_settings import TrainSettings
 from infgen.tokens.scene_tokens import Presence
 
@@ -17,6 +17,7 @@ TERMS = (
     *("add", "position", "position_regression"),
     *("agent_type", "size", "heading", "heading_regression", "offset"),
     "map",
+    *OF_ROLLOUTS,
 )
 """Every term that a network may have, in this order."""
 
@@ -39,8 +40,16 @@ def supervised(batch: Batch, settings: TrainSettings) -> Tensor:
         **dict.fromkeys(("agent_type", "size"), real),
         **dict.fromkeys(("heading", "heading_regression", "offset"), described),
         "map": batch.roads.predicted.sum(),
+        **dict.fromkeys(OF_ROLLOUTS, num_inserted.new_zeros(())),
     }
     return torch.stack([weight[name].float() for name in TERMS])
+
+
+def supervised_choices(count: Tensor) -> Tensor:
+    """The same [term] of simulated rollouts, of the number of motion tokens chosen."""
+    nothing = torch.zeros_like(count)
+    weights = [count if name in OF_ROLLOUTS else nothing for name in TERMS]
+    return torch.stack(weights).float()
 
 
 def _motion(batch: Batch, settings: TrainSettings) -> Tensor:

@@ -70,8 +70,13 @@ class Term:
 Terms = dict[str, Term]
 CONTROLS = ("keep", "add")
 """Terms of binary control tokens."""
-MEASURED = ("size", "offset", "position_regression", "heading_regression")
-"""Terms that are distances: nothing is right or wrong."""
+OF_ROLLOUTS = ("policy", "divergence")
+"""Terms of simulated rollouts (``policy_gradient``)."""
+MEASURED = (
+    *("size", "offset", "position_regression", "heading_regression"),
+    *OF_ROLLOUTS,
+)
+"""Terms of which nothing is right or wrong."""
 
 
 def losses(outputs: Outputs, batch: Batch, settings: TrainSettings) -> Terms:
@@ -94,8 +99,8 @@ def losses(outputs: Outputs, batch: Batch, settings: TrainSettings) -> Terms:
 
 
 def total(terms: Mapping[str, Term], settings: TrainSettings) -> Tensor:
-    """Sum the terms' means, weighted as ``<name>_weight`` says."""
-    weighted = [getattr(settings, f"{name}_weight") * t.mean for name, t in terms.items()]
+    """Sum the terms' means, weighted as ``settings.loss_weight`` says."""
+    weighted = [settings.loss_weight(name) * t.mean for name, t in terms.items()]
     return torch.stack(weighted).sum()
 
 

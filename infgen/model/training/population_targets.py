@@ -49,19 +49,31 @@ def targets(
         turns: Insertions.
         grid: Cells and heading bins.
     """
+    entries = insertions_of(turns, batch.entries.asked, played)
+    pseudo = _pseudo(batch.details, logged, played)
+    details = describe_details(
+        _join(pseudo, inserted_details(entries, played)), played, grid
+    )
+    return replace(batch, agents=played, entries=entries, details=details)
+
+
+def insertions_of(turns: InsertionTurns, asked: Tensor, played: Agents) -> Insertions:
+    """Write insertion turns as a batch has them.
+
+    Args:
+        turns: Insertions.
+        asked: Token steps with insertion queries [scene, token].
+        played: Agents as they were simulated.
+    """
     used = int(turns.count.max()) + 1
     agent = turns.agent[..., :used]
     cell = played.cell.gather(2, agent.clamp(min=0))
-    entries = Insertions(
-        asked=batch.entries.asked,
+    return Insertions(
+        asked=asked,
         count=turns.count,
         add=turns.add[..., :used],
         agent=agent,
         cell=torch.where(agent >= 0, cell, 0),
-    )
-    details = _join(_pseudo(batch.details, logged, played), _inserted(entries, played))
-    return replace(
-        batch, agents=played, entries=entries, details=_describe(details, played, grid)
     )
 
 
@@ -75,8 +87,8 @@ def _pseudo(details: Details, logged: Agents, played: Agents) -> Details:
     return replace(details, present=there, cell=torch.where(there, cell, 0))
 
 
-def _inserted(entries: Insertions, played: Agents) -> Details:
-    """Missing agents at the turns at which they are to be inserted."""
+def inserted_details(entries: Insertions, played: Agents) -> Details:
+    """Take the inserted agents of all turns; headings and offsets are still to be told."""
     scenes, tokens, slots = entries.agent.shape
     agent, device = entries.agent.flatten(1), entries.agent.device
     own, row = agent >= 0, agent.clamp(min=0)
@@ -105,7 +117,7 @@ def _join(one: Details, other: Details) -> Details:
     return Details(**parts)
 
 
-def _describe(details: Details, agents: Agents, grid: Grid) -> Details:
+def describe_details(details: Details, agents: Agents, grid: Grid) -> Details:
     """Tell headings and offsets within cells of all who are described."""
     scene = torch.arange(len(details.agent), device=details.agent.device)[:, None]
     pose = agents.pose[scene, details.token, details.agent]

@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float32, Int64
 from infgen.geometry import box_corners, grid_squares
 from infgen.rollout.population import Population
 from infgen.scene import AgentType, FeatureType, Scene
-from infgen.spatial.nearest import nearest_by_cells
+from infgen.spatial.lanes import LANE_M, lanes_distance_m
 from infgen.spatial.road_edges import (
     RoadEdges,
-    project,
+    leaves_road,
     scene_road_edges,
     signed_distance_m,
 )
@@ -20,13 +20,6 @@ POINT_M = 0.5
 """Distances are computed at points this far apart, and interpolated."""
 TILE = 32
 """Points along a side of a tile; its distances are computed when a vehicle gets there."""
-LANE_M = 1.2
-"""Points this near to a lane centre are on the road, whatever edge is near (bridges)."""
-OFF_M = 1.0
-"""Vehicles farther off the road than this are not checked (driveways, parking lots)."""
-SLACK_M = 0.05
-"""Changes of the distance below this are ignored."""
-
 
 Lanes = tuple[Float32[np.ndarray, "segment 3"], Float32[np.ndarray, "segment 3"]]
 """Lane segments in the plane: first points, and vectors to their last points."""
@@ -102,20 +95,6 @@ def lane_segments(scene: Scene) -> Lanes:
     return flat_m[row], flat_m[row + 1] - flat_m[row]
 
 
-def lanes_distance_m(
-    points_m: Float32[np.ndarray, "point 3"],
-    start_m: Float32[np.ndarray, "segment 3"],
-    along_m: Float32[np.ndarray, "segment 3"],
-) -> Float32[np.ndarray, " point"]:
-    """Distance of points to the nearest segment; infinite if there is none."""
-    if not len(start_m):
-        return np.full(len(points_m), np.inf, dtype=np.float32)
-    nearest = nearest_by_cells(points_m, start_m, along_m)
-    along_m, away_m = along_m[nearest, :2], (points_m - start_m[nearest])[:, :2]
-    share = np.clip(project(away_m, along_m), 0, 1)
-    return np.linalg.norm(away_m - share[:, None] * along_m, axis=1).astype(np.float32)
-
-
 def find_off_road(
     before: Population,
     which: Bool[np.ndarray, "rollout row"],
@@ -148,6 +127,5 @@ def find_off_road(
         off_m = np.full((*counts.shape, 4), -np.inf, dtype=np.float32)
         off_m[counts] = edge.off_m(corners_m.reshape(-1, 2)).reshape(-1, 4)
         now_m, then_m = off_m[:, 0].max(axis=1), off_m[:, 1:].max(axis=(1, 2))
-        farther = then_m > np.maximum(now_m, 0) + np.float32(SLACK_M)
-        departs[rollout, row] = farther & (now_m < OFF_M)
+        departs[rollout, row] = leaves_road(now_m, then_m)
     return departs

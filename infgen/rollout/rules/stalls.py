@@ -16,8 +16,9 @@ from infgen.geometry import wrap_angle
 from infgen.model.signal_features import StopLines
 from infgen.rollout.population import Population
 from infgen.rollout.recording import NOBODY
-from infgen.rollout.rules.off_road import lane_segments, lanes_distance_m
+from infgen.rollout.rules.off_road import lane_segments
 from infgen.scene import AgentType, Scene
+from infgen.spatial.lanes import lanes_distance_m
 from infgen.tokens.scene_tokens import Presence, SignalClass
 
 AWAY_M = 1.0

@@ -7,20 +7,19 @@ latter are known beforehand (``supervised``), so gradients simply add up.
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import Batch
-from infgen.model.device.packed import IndexedBatch, PackedBatch, prepared
-from infgen.model.training.closed_loop import close_loop
-from infgen.model.training.closed_loop_population import close_population_loop
-from infgen.model.training.diagnostics import motion_surprise
-from infgen.model.training.loss_weights import TERMS, supervised
-from infgen.model.training.losses import Term, Terms, losses
+from infgen.model.device.packed import PackedBatch
+from infgen.model.training.loss_weights import TERMS
+from infgen.model.training.losses import Term, Terms
+from infgen.model.training.policy_gradient.lessons import SUMS
+from pipeline.stages.train.lessons import Lessons, each_terms, prepare_lessons
 from pipeline.stages.train.precision import Pass
 from pipeline.stages.train.process_group import ProcessGroup
 from pipeline.stages.train.setup import TrainingError
@@ -53,11 +52,13 @@ class StepResult:
         terms: The loss before it, of the whole batch.
         norm: Of the gradient, before it was clipped.
         surprise: Sum of the negative log-likelihoods of moves, and their number.
+        rollouts: ``policy_gradient.lessons.SUMS`` of simulated rollouts; None without any.
     """
 
     terms: Terms
     norm: float
     surprise: Tensor
+    rollouts: Tensor | None = None
 
     @property
     def perplexity(self) -> float:
@@ -88,10 +89,10 @@ class OptimizerStep:
         self.forward = Pass(training.network, settings)
         self._parameters = parameters = list(training.network.parameters())
         sizes = [p.numel() for p in parameters]
-        tail = [len(TERMS) * len(FIGURES), 2, parts]
+        tail = [len(TERMS) * len(FIGURES), 2, len(SUMS), parts]
         self._sums = parameters[0].new_zeros(sum(sizes) + sum(tail))
         self._gradient, self._figures = torch.split(self._sums, [sum(sizes), sum(tail)])
-        terms, self._surprise, self._bad = torch.split(self._figures, tail)
+        terms, self._surprise, self._rollouts, self._bad = torch.split(self._figures, tail)
         self._terms = terms.view(len(TERMS), len(FIGURES))
         cut = zip(torch.split(self._gradient, sizes), parameters, strict=True)
         self._own = [part.view_as(parameter) for part, parameter in cut]
@@ -115,54 +116,56 @@ class OptimizerStep:
         """
         training, settings = self._training, self._settings
         training.network.train()
-        batches = [
-            self._prepared(part, noise_of_part(step, settings.seed, number))
+        lessons = [
+            prepare_lessons(
+                part,
+                training.network,
+                settings,
+                self._sums.device,
+                noise_of_part(step, settings.seed, number),
+            )
             for number, part in zip(own, parts, strict=True)
         ]
-        weights = [supervised(each.batch, settings) for each in batches]
-        weight = torch.stack(weights).sum(dim=0)
+        weight = torch.stack([each.weight(settings) for each in lessons]).sum(dim=0)
         self._process_group.add_up(weight)
         self._sums.zero_()
-        names: list[str] = []
-        for number, batch in zip(own, batches, strict=True):
+        names: dict[str, None] = {}
+        for number, each in zip(own, lessons, strict=True):
             torch.manual_seed(noise_of_part(step, settings.seed, number))  # For dropout.
-            names = self._add(batch, weight, number)
+            names |= self._add(each, weight, number)
         self._process_group.add_up(self._sums)
         found = torch.cat([self._clip()[None], self._figures]).cpu()
-        norm, (terms, surprise, bad) = float(found[0]), self._told(found[1:], names)
+        norm, told = float(found[0]), self._told(found[1:], names)
+        terms, surprise, rollouts, bad = told
         _check(norm, terms, bad)
         for group in training.optimiser.param_groups:
             group["lr"] = learning_rate(settings, step)
         training.optimiser.step()
         _move_average(training, settings, step)
-        return StepResult(terms, norm, surprise)
+        simulated = rollouts if settings.policy_gradient_rollouts else None
+        return StepResult(terms, norm, surprise, simulated)
 
-    def _prepared(self, part: Batch | PackedBatch, seed: int) -> IndexedBatch:
-        """Move a part to its device; simulate it for closed-loop fine-tuning."""
-        here = prepared(part, self._sums.device)
-        top, network = self._settings.closed_loop_top_k, self._training.network
-        if self._settings.closed_loop_population:
-            simulated = close_population_loop(network, here.batch, top, seed)
-            return IndexedBatch(simulated, None)  # Others are there than in the log.
-        if not top:
-            return here
-        return replace(here, batch=close_loop(network, here.batch, top))
-
-    def _add(self, indexed: IndexedBatch, weight: Tensor, number: int) -> list[str]:
+    def _add(self, lessons: Lessons, weight: Tensor, number: int) -> dict[str, None]:
         """Add the gradient and the sums of one part; return the names of its terms."""
-        batch = indexed.batch
-        outputs = self.forward(batch, indexed.index)
-        terms = losses(outputs, batch, self._settings)
-        loss = _share(terms, weight, self._settings)
-        self._add_gradient(loss)
-        nothing = loss.new_zeros(())
-        none = Term(nothing, nothing, nothing, nothing, nothing)
-        found = [getattr(terms.get(each, none), name) for each in TERMS for name in FIGURES]
-        sums = torch.stack([each.detach().float() for each in found])
-        self._terms += sums.view_as(self._terms)
-        self._surprise += motion_surprise(outputs, batch)
-        self._bad[number] = (~torch.isfinite(loss.detach())).float()
-        return list(terms)
+        settings = self._settings
+        names: dict[str, None] = {}
+        if lessons.rollouts is not None:
+            self._rollouts += lessons.rollouts.sums
+        for terms, surprise in each_terms(lessons, self._training, self.forward, settings):
+            loss = _share(terms, weight, settings)
+            self._add_gradient(loss)
+            nothing = loss.new_zeros(())
+            none = Term(nothing, nothing, nothing, nothing, nothing)
+            found = [
+                getattr(terms.get(each, none), name) for each in TERMS for name in FIGURES
+            ]
+            sums = torch.stack([each.detach().float() for each in found])
+            self._terms += sums.view_as(self._terms)
+            self._surprise += surprise
+            bad = (~torch.isfinite(loss.detach())).float()
+            self._bad[number] = torch.maximum(self._bad[number], bad)
+            names |= dict.fromkeys(terms)
+        return names
 
     def _add_gradient(self, loss: Tensor) -> None:
         if self._on_cpu:
@@ -187,15 +190,14 @@ class OptimizerStep:
         return norm
 
     def _told(
-        self, figures: Tensor, names: Sequence[str]
-    ) -> tuple[Terms, Tensor, list[int]]:
-        """Terms, surprise and the parts that are not finite, of figures on the host."""
-        rows, surprise, bad = torch.split(
-            figures, [self._terms.numel(), len(self._surprise), len(self._bad)]
-        )
+        self, figures: Tensor, names: Iterable[str]
+    ) -> tuple[Terms, Tensor, Tensor, list[int]]:
+        """Terms, surprise, rollouts and the parts that are not finite, on the host."""
+        sizes = [self._terms.numel(), len(self._surprise), len(self._rollouts)]
+        rows, surprise, rollouts, bad = torch.split(figures, [*sizes, len(self._bad)])
         rows = rows.view_as(self._terms)
         terms = {name: Term(*rows[TERMS.index(name)].unbind()) for name in names}
-        return terms, surprise, bad.nonzero()[:, 0].tolist()
+        return terms, surprise, rollouts, bad.nonzero()[:, 0].tolist()
 
 
 def _check(norm: float, terms: Mapping[str, Term], bad: Sequence[int]) -> None:
@@ -208,7 +210,7 @@ def _check(norm: float, terms: Mapping[str, Term], bad: Sequence[int]) -> None:
 def _share(terms: Terms, weight: Tensor, settings: TrainSettings) -> Tensor:
     """One part's share of the loss of the whole batch."""
     shares = [
-        getattr(settings, f"{name}_weight")
+        settings.loss_weight(name)
         * term.loss
         / weight[TERMS.index(name)].clamp(min=LEAST_WEIGHT)
         for name, term in terms.items()

@@ -42,6 +42,12 @@ class Pass:
         with self._casting():
             return in_float32(self._forward(batch, index))
 
+    def evaluated(self, network: Network, batch: Batch) -> Outputs:
+        """Compute the outputs of a network in evaluation mode: nothing is hidden."""
+        with self._casting():
+            outputs: Outputs = network(batch)
+            return in_float32(outputs)
+
     def averaged(self, batch: Batch, average: Mapping[str, Tensor]) -> Outputs:
         """Compute all outputs with other parameters: those of a moving average."""
         wanted = {"hidden_roads": self._hidden_roads}

@@ -7,6 +7,7 @@ from typing import Any
 
 from infgen.config import TrainSettings
 from infgen.model.training.losses import figures, total
+from infgen.model.training.policy_gradient.lessons import figures as rollout_figures
 from pipeline.engine.layout import RUN_FOLDER
 from pipeline.engine.stage import Progress
 from pipeline.stages.train.optimizer_step import StepResult, learning_rate
@@ -63,7 +64,8 @@ class TrainingRecorder:
             "gradient_norm": stepped.norm,
             "total": float(total(stepped.terms, self._course.train)),
             **figures(stepped.terms),
-            "motion_perplexity": stepped.perplexity,
+            **_perplexity(stepped),
+            **_of_rollouts(stepped),
         }
         self._write("train", {"step": done, **line}, line)
         throughput = self.throughput.note(done)
@@ -111,6 +113,17 @@ class TrainingRecorder:
         self._log.add(line)
         if self._events is not None:
             self._events.add(group, self._done, figures)
+
+
+def _perplexity(stepped: StepResult) -> dict[str, float]:
+    """Perplexity of the log's motion tokens, if there were any to learn from."""
+    counted = float(stepped.surprise[1]) > 0 or stepped.rollouts is None
+    return {"motion_perplexity": stepped.perplexity} if counted else {}
+
+
+def _of_rollouts(stepped: StepResult) -> dict[str, float]:
+    """Figures of the rollouts that the network simulated, if it did."""
+    return {} if stepped.rollouts is None else rollout_figures(stepped.rollouts)
 
 
 def is_validated(how: TrainSettings, done: int) -> bool:

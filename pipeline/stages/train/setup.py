@@ -1,5 +1,6 @@
 """What is trained on what, and the network it begins with."""
 
+import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -108,7 +109,17 @@ def begin(
         fused=True,
     )
     average = {name: p.detach().clone() for name, p in network.named_parameters()}
-    return TrainingState(network, average if setup.train.ema_decay else {}, optimiser)
+    return TrainingState(
+        network,
+        average if setup.train.ema_decay else {},
+        optimiser,
+        _frozen(network) if setup.train.policy_gradient_rollouts else None,
+    )
+
+
+def _frozen(network: Network) -> Network:
+    """Copy a network that is not to change any more."""
+    return copy.deepcopy(network).eval().requires_grad_(requires_grad=False)
 
 
 @contextmanager

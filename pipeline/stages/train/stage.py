@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
+from infgen.errors import ConfigError
 from infgen.settings import build
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import RUN_FOLDER, read_json
@@ -26,6 +27,7 @@ from pipeline.engine.stage import (
 )
 from pipeline.stages.devices import name_device
 from pipeline.storage.initial_weights import (
+    BUILTIN,
     DESCRIPTION,
     INITIAL_WEIGHTS,
     WEIGHTS,
@@ -60,11 +62,17 @@ def reads(root: Path, settings: Mapping[str, Any]) -> list[Source]:
     """Find the weights to begin with, if any are named: a folder, or a key of this stage.
 
     Raises:
-        ConfigError: if there are none, or the key is of several.
+        ConfigError: if there are none, or the key is of several; or if none are named, and
+            training is to stay near to them.
     """
-    return find_initial_weights(
-        root, "train.initial_weights", settings["train"].initial_weights
-    )
+    how: TrainSettings = settings["train"]
+    if how.policy_gradient_rollouts and not how.initial_weights:
+        raise ConfigError(
+            f"train.policy_gradient_rollouts is {how.policy_gradient_rollouts}, but "
+            "train.initial_weights is empty; expected the weights to be fine-tuned: "
+            f"{BUILTIN!r}, a folder, or the start of a key of stage train"
+        )
+    return find_initial_weights(root, "train.initial_weights", how.initial_weights)
 
 
 def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
@@ -223,6 +231,7 @@ STAGE = Stage(
         "pipeline.stages.devices",
         "pipeline.storage.checkpoint",
         "pipeline.stages.train.setup",
+        "pipeline.stages.train.lessons",
         "pipeline.stages.train.optimizer_step",
         "pipeline.stages.train.recorder",
         "pipeline.stages.train.loader",

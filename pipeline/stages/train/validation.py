@@ -51,7 +51,7 @@ def validate(setup: TrainingSetup, training: TrainingState, forward: Pass) -> Fo
         return {}
     nats, count = surprise.tolist()
     return {
-        "total": float(total(terms, settings)),
+        "total": float(total(terms, settings.of_the_log)),
         **figures(terms),
         "motion_perplexity": math.exp(min(nats / max(count, 1.0), 700.0)),
         **{f"{name}_bins": _bins(found) for name, found in bins.items()},

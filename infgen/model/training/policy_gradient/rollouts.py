@@ -1,0 +1,203 @@
+"""Rollouts of a batch by the network alone, several of each scene.
+
+The first ``HISTORY_TOKENS`` token steps are the log's. From then on all agents move, are
+removed and are inserted as the network samples, without rules, as in rollouts with
+``rollout.rules=none``; a rollout ends where its log ends. So a token step of a rollout and
+of its log can be compared.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from infgen.model.batching.batch import Agents, Batch
+from infgen.model.batching.tensors import map_tensors
+from infgen.model.network import Network
+from infgen.model.token_step import MotionStep
+from infgen.model.training.policy_gradient.nucleus import log_probabilities, sample
+from infgen.model.training.population_targets import (
+    describe_details,
+    inserted_details,
+    insertions_of,
+)
+from infgen.model.training.simulation import (
+    INSERTED,
+    PRESENT,
+    NextInsertions,
+    Simulation,
+)
+
+HISTORY_TOKENS = 2
+"""Token steps of the log that a rollout begins with, as in WOMD."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedRollouts:
+    """Rollouts of the scenes of a batch: the first of each scene, then the second, ...
+
+    Attributes:
+        batch: Their agents, insertions and details; the maps are one for each scene.
+        logged: Agents as logged, in the same rows [rollout, ...].
+        count: Rollouts of each scene.
+        moved: Agents whose motion token the network sampled.
+        inserted: Agents that the network inserted.
+        known: Rows whose agent was there at the end of the history: it is the same one in
+            the log, and in all rollouts of the scene.
+    """
+
+    batch: Batch
+    logged: Agents
+    count: int
+    moved: Bool[Tensor, "rollout token agent"]
+    inserted: Bool[Tensor, "rollout token agent"]
+    known: Bool[Tensor, "rollout agent"]
+
+    @property
+    def scenes(self) -> int:
+        """Number of scenes."""
+        return len(self.moved) // self.count
+
+    def rows(self, number: int) -> slice:
+        """Rows of one rollout of every scene."""
+        return slice(number * self.scenes, (number + 1) * self.scenes)
+
+    def only(self, number: int) -> Batch:
+        """Take one rollout of every scene."""
+        batch, rows = self.batch, self.rows(number)
+        return replace(
+            batch,
+            agents=map_tensors(batch.agents, lambda x: x[rows]),
+            entries=map_tensors(batch.entries, lambda x: x[rows]),
+            details=map_tensors(batch.details, lambda x: x[rows]),
+        )
+
+
+@torch.no_grad()
+def simulate_rollouts(
+    network: Network, batch: Batch, count: int, top_p: float, seed: int
+) -> SimulatedRollouts:
+    """Simulate rollouts of every scene of a batch.
+
+    Args:
+        network: The network; its mode (training or not) is kept.
+        batch: Scenes as logged, without noise, on the network's device.
+        count: Rollouts of each scene.
+        top_p: Share of the probability that motion tokens are sampled from.
+        seed: Of everything that is sampled.
+    """
+    learning = network.training
+    try:
+        simulation = _FreeSimulation(network, batch, count, top_p, seed)
+        for token in range(1, simulation.logged.pose.shape[1]):
+            simulation.move(token)
+            simulation.insert(token)
+    finally:
+        network.train(learning)
+    return simulation.found(batch)
+
+
+class _FreeSimulation(Simulation):
+    """Rollouts in simulation.
+
+    Attributes:
+        top_p: Share of the probability that motion tokens are sampled from.
+        stationary: Motion tokens that stand still, by agent type.
+        goes_on: Token steps that the log has [rollout, token].
+        moved: Agents whose motion token was sampled [rollout, token, agent].
+        known: Agents that are there at the end of the history [rollout, agent].
+        vacant: Rows without an agent until then, in order, and behind them the others.
+        room: How many vacant rows there are [rollout].
+        used: How many of the vacant rows are in use [rollout].
+    """
+
+    def __init__(
+        self, network: Network, batch: Batch, count: int, top_p: float, seed: int
+    ) -> None:
+        """Begin with the history as logged."""
+        super().__init__(network, batch, seed, count)
+        logged, last = self.logged, min(HISTORY_TOKENS, self.logged.pose.shape[1]) - 1
+        presence = logged.presence[:, last]
+        stays = (presence == PRESENT) | (presence == INSERTED)
+        stationary = network.motion_vocabulary().stationary
+        self.top_p = top_p
+        self.stationary = torch.from_numpy(stationary).to(presence.device)
+        self.goes_on = _until_the_last(logged.visible.any(dim=2))
+        self.moved = torch.zeros_like(logged.observed)
+        self.known = stays & logged.visible[:, last]
+        taken = logged.visible[:, : last + 1].any(dim=1)
+        self.vacant = taken.long().argsort(dim=1, stable=True)
+        self.room = (~taken).sum(dim=1)
+        self.used = torch.zeros(len(presence), dtype=torch.int64, device=presence.device)
+        self.asked[:, :HISTORY_TOKENS] = False
+        if network.cells is None:
+            self.asked[:] = False
+
+    def move(self, token: int) -> None:
+        """Move everybody, and remove whom the network removes."""
+        said = self.stepper.motion_step(self.memory, self.token_step(token - 1))
+        if token < HISTORY_TOKENS:
+            return
+        before = self.played.presence[:, token - 1]
+        alive = (before == PRESENT) | (before == INSERTED)
+        alive &= self.played.visible[:, token - 1] & self.goes_on[:, token, None]
+        self.clear(token, ~alive)
+        self.played.turn[:, token] = -1
+        self.keep(token, alive)
+        self._sample_motion(token, alive, said)
+        self.remove(token, alive, said.remove_logit)
+        cell = self.cells(self.played.pose[:, token], token)
+        self.played.cell[:, token] = torch.where(alive, cell, self.played.cell[:, token])
+
+    def next_insertions(self, token: int, turn: int, active: Tensor) -> NextInsertions:
+        """Offer the next vacant row of each rollout."""
+        used, last = self.used[active], self.vacant.shape[1] - 1
+        row = self.vacant[active, used.clamp(max=last)]
+        none = torch.zeros_like(row, dtype=torch.bool)
+        return NextInsertions(row, none, used < self.room[active])
+
+    def is_inserted(self, token: int, turn: int, at: tuple[Tensor, Tensor]) -> None:
+        """Write down the turn."""
+        self.turns.add[at[0], token, turn] = True
+        self.turns.agent[at[0], token, turn] = at[1]
+        self.used[at[0]] += 1
+
+    def found(self, batch: Batch) -> SimulatedRollouts:
+        """Gather what was simulated."""
+        played, inserted = self.played, torch.zeros_like(self.moved)
+        entries = insertions_of(self.turns, self.asked, played)
+        details = inserted_details(entries, played)
+        rollout = torch.arange(len(inserted), device=inserted.device)[:, None]
+        rollout = rollout.expand_as(details.agent)[details.present]
+        token, row = details.token[details.present], details.agent[details.present]
+        inserted[rollout, token, row] = True
+        return SimulatedRollouts(
+            batch=replace(
+                batch,
+                agents=played,
+                entries=entries,
+                details=describe_details(details, played, self.network.grid),
+            ),
+            logged=self.logged,
+            count=len(played.pose) // len(batch.agents.pose),
+            moved=self.moved,
+            inserted=inserted,
+            known=self.known,
+        )
+
+    def _sample_motion(self, token: int, who: Tensor, said: MotionStep) -> None:
+        """Move agents as the network samples."""
+        scene, row = who.nonzero(as_tuple=True)
+        at = scene, row
+        agent_type = self.played.agent_type[at]
+        logits = said.packed.motion_logits[said.packed.rows.number[at]]
+        likely = log_probabilities(logits, self.stationary[agent_type], self.top_p)
+        uniform = self.uniforms.draw(*who.shape)[at]
+        self.move_by(token, at, sample(likely, uniform))
+        self.moved[:, token] = who
+
+
+def _until_the_last(some: Tensor) -> Tensor:
+    """Mark the token steps [rollout, token] up to the last one that is marked."""
+    return some.flip(1).long().cumsum(dim=1).flip(1) > 0

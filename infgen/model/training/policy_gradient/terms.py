@@ -1,0 +1,178 @@
+"""What is learned from rollouts: likelier good choices, near to the pretrained network.
+
+The policy term is minus the sum of advantage times log-probability (Williams 1992); the
+divergence is the Kullback-Leibler divergence from the network to the pretrained one, summed
+over all choices of the rollout: motion tokens, removals, insertions, and the cells, types
+and headings of inserted agents. Sizes and offsets, which are not sampled, count as means of
+normal distributions of variance one. Both terms are divided by the number of motion tokens,
+so ``divergence_weight`` is in rewards per nat.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float32
+from torch import Tensor
+from torch.nn.functional import logsigmoid
+
+from infgen.model.batching.batch import Batch
+from infgen.model.logits import InsertionOutputs, Outputs
+from infgen.model.network import EGO
+from infgen.model.training.losses import Term, Terms
+from infgen.model.training.policy_gradient.nucleus import log_probabilities
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyLesson:
+    """One rollout of every scene of a batch, to learn from.
+
+    Attributes:
+        batch: The rollouts.
+        moved: Agents whose motion token was sampled.
+        advantage: Of every choice, at the token step that it led to.
+    """
+
+    batch: Batch
+    moved: Bool[Tensor, "scene token agent"]
+    advantage: Float32[Tensor, "scene token agent"]
+
+
+def policy_terms(
+    outputs: Outputs,
+    pretrained: Outputs,
+    lesson: PolicyLesson,
+    stationary: Bool[Tensor, "3 motion_token"],
+    top_p: float,
+) -> Terms:
+    """Compute the terms ``policy`` and ``divergence``.
+
+    Args:
+        outputs: Of the network, in evaluation mode.
+        pretrained: The same of the pretrained network.
+        lesson: The rollouts.
+        stationary: Motion tokens that stand still, by agent type.
+        top_p: Share of the probability that motion tokens were sampled from.
+    """
+    count = lesson.moved.sum().float()
+    gained = _motion_gain(outputs, lesson, stationary, top_p)
+    gained = gained + _insertion_gain(outputs, lesson)
+    nothing = gained.new_zeros(())
+
+    def term(loss: Tensor) -> Term:
+        return Term(loss, count, count, nothing, nothing)
+
+    return {
+        "policy": term(-gained),
+        "divergence": term(divergence(outputs, pretrained, lesson)),
+    }
+
+
+def divergence(outputs: Outputs, pretrained: Outputs, lesson: PolicyLesson) -> Tensor:
+    """Sum the divergence from the pretrained network over all choices."""
+    rows, entries = outputs.motion.rows, lesson.batch.entries
+    moves = rows.pack(_next(lesson.moved))
+    one, other = outputs.motion, pretrained.motion
+    found = _of_choice(one.motion_logits[moves], other.motion_logits[moves])
+    if one.remove_logit is not None and other.remove_logit is not None:
+        removable = lesson.moved.clone()
+        removable[:, :, EGO] = False
+        asked = rows.pack(_next(removable))
+        found = found + _of_event(one.remove_logit[asked], other.remove_logit[asked])
+    if outputs.entries is not None and pretrained.entries is not None:
+        slot = torch.arange(entries.agent.shape[2], device=found.device)
+        count = outputs.entries.rows.pack(entries.count)[:, None]
+        found = found + _of_insertions(outputs.entries, pretrained.entries, slot <= count)
+    return found + _of_details(outputs, pretrained)
+
+
+def _motion_gain(
+    outputs: Outputs, lesson: PolicyLesson, stationary: Tensor, top_p: float
+) -> Tensor:
+    """Advantages times log-probabilities of motion tokens, summed."""
+    rows, agents = outputs.motion.rows, lesson.batch.agents
+    moves = rows.pack(_next(lesson.moved))
+    chosen = rows.pack(_next(agents.motion_token))[moves]
+    advantage = rows.pack(_next(lesson.advantage))[moves]
+    agent_type = agents.agent_type[:, None].expand(agents.presence.shape)
+    apart = stationary[rows.pack(agent_type)[moves]]
+    logits = outputs.motion.motion_logits[moves]
+    likely = log_probabilities(logits, apart, top_p, chosen)
+    return (advantage * likely.gather(1, chosen[:, None])[:, 0]).sum()
+
+
+def _insertion_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:
+    """The same of the cells and headings of inserted agents.
+
+    Not of insertions themselves nor of agent types: rewards are costs, and who is not there
+    has none.
+    """
+    gained = outputs.motion.motion_logits.new_zeros(())
+    entries, details = lesson.batch.entries, lesson.batch.details
+    if outputs.entries is not None and outputs.entries.position_logits is not None:
+        rows, agent = outputs.entries.rows, entries.agent
+        came = rows.pack(agent) >= 0
+        advantage = lesson.advantage.gather(2, agent.clamp(min=0))
+        likely = outputs.entries.position_logits[came].log_softmax(dim=-1)
+        cell = rows.pack(entries.cell)[came][:, None]
+        gained = gained + (rows.pack(advantage)[came] * likely.gather(1, cell)[:, 0]).sum()
+    if outputs.details is not None and outputs.details.heading_logits is not None:
+        rows = outputs.details.rows
+        scene = rows.at // details.present.shape[1]
+        at = scene, rows.pack(details.token), rows.pack(details.agent)
+        likely = outputs.details.heading_logits.log_softmax(dim=-1)
+        heading = rows.pack(details.heading)[:, None]
+        gained = gained + (lesson.advantage[at] * likely.gather(1, heading)[:, 0]).sum()
+    return gained
+
+
+def _of_insertions(
+    one: InsertionOutputs, other: InsertionOutputs, decided: Tensor
+) -> Tensor:
+    """Divergence of insertions, and of the cells of those that there were."""
+    found = _of_event(one.add_logit[decided], other.add_logit[decided])
+    came = decided[:, 1:]  # Where a turn follows, the one before it inserted an agent.
+    if one.position_logits is not None and other.position_logits is not None:
+        logits = one.position_logits[:, :-1], other.position_logits[:, :-1]
+        found = found + _of_choice(logits[0][came], logits[1][came])
+    if one.position_m is not None and other.position_m is not None:
+        gap_m = (one.position_m - other.position_m)[:, :-1][came]
+        found = found + _of_mean(gap_m / one.radius_m)
+    return found
+
+
+def _of_details(outputs: Outputs, pretrained: Outputs) -> Tensor:
+    """Divergence of the types, headings, sizes and offsets of inserted agents."""
+    one, other = outputs.details, pretrained.details
+    if one is None or other is None:
+        return outputs.motion.motion_logits.new_zeros(())
+    found = _of_choice(one.agent_type_logits, other.agent_type_logits)
+    found = found + _of_mean(one.size_log_m - other.size_log_m)
+    if one.heading_logits is not None and other.heading_logits is not None:
+        found = found + _of_choice(one.heading_logits, other.heading_logits)
+    for own, theirs in (
+        (one.turned_rad, other.turned_rad),
+        (one.offset_m, other.offset_m),
+    ):
+        if own is not None and theirs is not None:
+            found = found + _of_mean(own - theirs)
+    return found
+
+
+def _of_choice(logits: Tensor, others: Tensor) -> Tensor:
+    own, theirs = logits.log_softmax(dim=-1), others.log_softmax(dim=-1)
+    return (own.exp() * (own - theirs)).sum()
+
+
+def _of_event(logit: Tensor, other: Tensor) -> Tensor:
+    happens = logit.sigmoid()
+    found = happens * (logsigmoid(logit) - logsigmoid(other))
+    return (found + (1 - happens) * (logsigmoid(-logit) - logsigmoid(-other))).sum()
+
+
+def _of_mean(gap: Tensor) -> Tensor:
+    return gap.square().sum() / 2
+
+
+def _next(values: Tensor) -> Tensor:
+    """Shift values by one token step, so that each stands where it is predicted from."""
+    return torch.cat([values[:, 1:], torch.zeros_like(values[:, :1])], dim=1)

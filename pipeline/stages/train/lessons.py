@@ -1,0 +1,102 @@
+"""What is learned from one part of a batch: from logs, from rollouts, or from both."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from infgen.config import TrainSettings
+from infgen.model.batching.batch import Batch
+from infgen.model.device.packed import IndexedBatch, PackedBatch, prepared
+from infgen.model.network import Network
+from infgen.model.training.closed_loop import close_loop
+from infgen.model.training.closed_loop_population import close_population_loop
+from infgen.model.training.diagnostics import motion_surprise
+from infgen.model.training.loss_weights import supervised, supervised_choices
+from infgen.model.training.losses import Terms, losses
+from infgen.model.training.policy_gradient.lessons import PolicyLessons, simulate_lessons
+from infgen.model.training.policy_gradient.terms import policy_terms
+from pipeline.stages.train.precision import Pass
+from pipeline.storage.checkpoint import TrainingState
+
+
+@dataclass(frozen=True, slots=True)
+class Lessons:
+    """One part of a batch, to learn from.
+
+    Attributes:
+        log: The scenes as logged, or near to the log; None to leave them out.
+        rollouts: Rollouts of them; None for none.
+    """
+
+    log: IndexedBatch | None
+    rollouts: PolicyLessons | None
+
+    def weight(self, settings: TrainSettings) -> Tensor:
+        """Sum the weights of every term of the loss [term]."""
+        found = []
+        if self.log is not None:
+            found.append(supervised(self.log.batch, settings))
+        for lesson in self.rollouts.lessons if self.rollouts else ():
+            found.append(supervised_choices(lesson.moved.sum()))
+        return torch.stack(found).sum(dim=0)
+
+
+def prepare_lessons(
+    part: Batch | PackedBatch,
+    network: Network,
+    settings: TrainSettings,
+    device: torch.device,
+    seed: int,
+) -> Lessons:
+    """Move a part of a batch to its device; simulate it as the settings say."""
+    here = prepared(part, device)
+    rollouts = None
+    if settings.policy_gradient_rollouts:
+        rollouts = simulate_lessons(network, here.batch, settings, seed)
+    if rollouts is not None and not settings.log_weight:
+        return Lessons(None, rollouts)
+    return Lessons(_near_log(here, network, settings, seed), rollouts)
+
+
+def _near_log(
+    here: IndexedBatch, network: Network, settings: TrainSettings, seed: int
+) -> IndexedBatch:
+    """Simulate a batch near to its log for closed-loop fine-tuning."""
+    top = settings.closed_loop_top_k
+    if settings.closed_loop_population:
+        simulated = close_population_loop(network, here.batch, top, seed)
+        return IndexedBatch(simulated, None)  # Others are there than in the log.
+    if not top:
+        return here
+    return replace(here, batch=close_loop(network, here.batch, top))
+
+
+def each_terms(
+    lessons: Lessons, training: TrainingState, forward: Pass, settings: TrainSettings
+) -> Iterator[tuple[Terms, Tensor]]:
+    """Compute the terms of the loss, lesson by lesson, and the surprise of the log's moves.
+
+    The caller adds up the gradient of one before it asks for the next: so much is in memory
+    at once. Rollouts are learned from in evaluation mode: what is made likelier is what was
+    sampled from.
+    """
+    if lessons.log is not None:
+        batch = lessons.log.batch
+        outputs = forward(batch, lessons.log.index)
+        yield losses(outputs, batch, settings), motion_surprise(outputs, batch)
+    if lessons.rollouts is None:
+        return
+    network, pretrained = training.network, training.pretrained
+    assert pretrained is not None
+    stationary = torch.from_numpy(network.motion_vocabulary().stationary)
+    network.eval()
+    for lesson in lessons.rollouts.lessons:
+        here = stationary.to(lesson.moved.device)
+        outputs = forward.evaluated(network, lesson.batch)
+        with torch.no_grad():
+            before = forward.evaluated(pretrained, lesson.batch)
+        terms = policy_terms(outputs, before, lesson, here, settings.policy_top_p)
+        yield terms, torch.zeros(2, device=here.device)
+    network.train()

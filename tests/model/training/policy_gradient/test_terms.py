@@ -1,0 +1,157 @@
+"""What rollouts teach: good choices become likelier, near to the pretrained network."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+
+from infgen.config import TrainSettings
+from infgen.model.batching.batch import collate
+from infgen.model.training.policy_gradient.lessons import (
+    SUMS,
+    figures,
+    simulate_lessons,
+)
+from infgen.model.training.policy_gradient.rollouts import HISTORY_TOKENS
+from infgen.model.training.policy_gradient.terms import divergence, policy_terms
+
+HOW = TrainSettings(policy_gradient_rollouts=3, policy_top_p=0.9)
+
+
+@pytest.fixture(scope="module")
+def logged(record, limits):
+    return collate([record(3, tokens=9, spread_m=12.0), record(4, tokens=9)], limits, 7)
+
+
+@pytest.fixture(scope="module")
+def lessons(network, logged):
+    return simulate_lessons(network, logged, HOW, 5)
+
+
+def steepest(part):
+    """Largest entry of the gradient of a part."""
+    found = [p.grad.abs().max() for p in part.parameters() if p.grad is not None]
+    return max(map(float, found), default=0.0)
+
+
+def terms(network, pretrained, lesson):
+    stationary = torch.from_numpy(network.motion_vocabulary().stationary)
+    with torch.no_grad():
+        before = pretrained(lesson.batch)
+    return policy_terms(network(lesson.batch), before, lesson, stationary, HOW.policy_top_p)
+
+
+def test_there_is_a_lesson_for_every_rollout_and_choices_have_advantages(lessons, logged):
+    assert len(lessons.lessons) == 3
+    for lesson in lessons.lessons:
+        assert lesson.moved.shape[0] == len(logged.agents.pose)
+        assert lesson.advantage[lesson.moved].abs().max() > 0
+    total = torch.stack([each.advantage for each in lessons.lessons])
+    moved = torch.stack([each.moved for each in lessons.lessons])
+    everywhere = moved.all(dim=0)
+    everywhere &= everywhere[:, HISTORY_TOKENS, None]  # Others are not the same agent.
+    # What is the mean of the others' to one is the others' mean to the next.
+    torch.testing.assert_close(
+        total.sum(dim=0)[everywhere],
+        torch.zeros(int(everywhere.sum())),
+        atol=1e-5,
+        rtol=0,
+    )
+
+
+def test_the_divergence_from_itself_is_zero_and_grows_with_the_distance(network, lessons):
+    lesson = lessons.lessons[0]
+    near, far = copy.deepcopy(network), copy.deepcopy(network)
+    random = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for one, other in zip(near.parameters(), far.parameters(), strict=True):
+            step = torch.randn(one.shape, generator=random)
+            one += 0.001 * step
+            other += 0.01 * step
+
+    with torch.no_grad():
+        found = [
+            divergence(each(lesson.batch), network(lesson.batch), lesson)
+            for each in (network, near, far)
+        ]
+
+    assert found[0] == 0
+    assert 0 < found[1] < found[2]
+
+
+def test_choices_with_a_positive_advantage_become_likelier(network, lessons):
+    """A step along the gradient of an advantage of one motion token."""
+    lesson = lessons.lessons[0]
+    chosen = lesson.moved.nonzero()[10]
+    for sign in (1.0, -1.0):
+        advantage = torch.zeros_like(lesson.advantage)
+        advantage[tuple(chosen)] = sign
+        only = replace(lesson, advantage=advantage)
+        student = copy.deepcopy(network)
+
+        before = terms(student, network, only)["policy"].loss
+        before.backward()
+        with torch.no_grad():
+            for each in student.parameters():
+                if each.grad is not None:
+                    each -= 1e-3 * each.grad
+        after = terms(student, network, only)["policy"].loss
+
+        # The loss is minus the log-probability, times the sign.
+        assert after < before
+
+
+def test_cells_and_headings_of_inserted_agents_are_learned_too(network, lessons):
+    found = []
+    for lesson in lessons.lessons:
+        agents = lesson.batch.entries.agent
+        at = (agents >= 0).nonzero()
+        advantage = torch.zeros_like(lesson.advantage)
+        for scene, token, slot in at.tolist():
+            advantage[scene, token, agents[scene, token, slot]] = 1.0
+        network.zero_grad()
+        only = replace(lesson, advantage=advantage)
+        terms(network, network, only)["policy"].loss.backward()
+        found.append([steepest(head) for head in (network.cells, network.details)])
+        network.zero_grad(set_to_none=True)
+
+    assert all(value > 0 for value in map(max, zip(*found, strict=True)))
+
+
+def test_without_penalties_nothing_is_better_than_anything_else(network, logged):
+    free = replace(HOW, overlap_penalty=0, off_road_penalty=0, log_distance_penalty=0)
+
+    for lesson in simulate_lessons(network, logged, free, 5).lessons:
+        assert not lesson.advantage.any()
+
+
+def test_networks_of_all_kinds_learn_from_rollouts(variant, new_network, logged):
+    network = new_network(variant).eval()
+    lesson = simulate_lessons(network, logged, HOW, 1).lessons[0]
+
+    found = terms(network, copy.deepcopy(network), lesson)
+    (found["policy"].mean + found["divergence"].mean).backward()
+
+    assert found["divergence"].loss == 0
+    gradients = [p.grad for p in network.parameters() if p.grad is not None]
+    assert all(torch.isfinite(each).all() for each in gradients)
+    assert steepest(network) > 0
+
+
+def test_figures_are_means_of_the_rollouts(lessons):
+    sums = dict.fromkeys(SUMS, 0.0)
+    sums |= {"choices": 50, "reward": -5, "overlap": 2, "agents": 8, "token_steps": 10}
+    sums |= {"overlapping_agents": 2, "present": 40, "logged": 60, "entries": 5}
+
+    found = figures(torch.tensor([float(sums[name]) for name in SUMS]))
+
+    assert found["rollout_reward"] == pytest.approx(-0.1)
+    assert found["rollout_overlap"] == pytest.approx(0.04)
+    assert found["rollout_overlapping_agents"] == pytest.approx(0.25)
+    assert found["rollout_agents"] == 4
+    assert found["rollout_agents_logged"] == 6
+    assert found["rollout_entries"] == pytest.approx(0.5)
+    seen = dict(zip(SUMS, lessons.sums.tolist(), strict=True))
+    moved = sum(int(each.moved.sum()) for each in lessons.lessons)
+    assert seen["choices"] == moved + seen["entries"]

@@ -1,0 +1,142 @@
+"""Training by policy gradient: what it notes, what it starts from, that it resumes."""
+
+import signal
+from dataclasses import replace
+
+import pytest
+import torch
+
+from infgen.config import TrainSettings
+from infgen.errors import ConfigError
+from pipeline.engine.signals import Stopped
+from pipeline.stages.train.loop import train
+from pipeline.stages.train.optimizer_step import OptimizerStep
+from pipeline.stages.train.process_group import ProcessGroup
+from pipeline.stages.train.setup import begin
+from pipeline.stages.train.stage import reads
+from pipeline.stages.train.train_log import read_log
+from pipeline.storage.checkpoint import load_checkpoint
+from pipeline.storage.weights import save_network, state_dict_of
+
+HOW = {
+    "policy_gradient_rollouts": 3,
+    "max_token_steps": 6,
+    "steps": 3,
+    "checkpoint_every_steps": 0,
+    "validate_every_steps": 0,
+    "validation_scenes": 0,
+}
+
+
+@pytest.fixture
+def tuned(setup, books, tmp_path):
+    """``tuned(folder, **changes)``: fine-tuning of weights that lie in a folder."""
+    pretrained = tmp_path / "pretrained"
+    pretrained.mkdir()
+    network = begin(setup, *books).network
+    save_network(pretrained, network, state_dict_of(network), 0)
+
+    def tune(folder, **changes):
+        target = tmp_path / folder
+        target.mkdir()
+        how = replace(setup.train, **{**HOW, **changes})
+        return replace(setup, train=how, folder=target, start=pretrained)
+
+    return tune
+
+
+def lines_of(setup, books, quiet):
+    train(setup, begin(setup, *books), quiet)
+    return [
+        line for line in read_log(setup.folder / "train.jsonl") if "validation" not in line
+    ]
+
+
+def test_the_log_tells_rewards_and_the_divergence_which_begins_at_zero(tuned, books, quiet):
+    lines = lines_of(tuned("run"), books, quiet)
+
+    assert len(lines) == 3
+    assert lines[0]["divergence"] == 0
+    assert lines[-1]["divergence"] > 0
+    for line in lines:
+        assert line["policy_count"] == line["divergence_count"] > 0
+        assert {"policy", "rollout_reward", "rollout_overlapping_agents"} <= set(line)
+        assert "motion" not in line
+        assert "motion_perplexity" not in line
+        assert line["total"] == pytest.approx(line["policy"] + 0.1 * line["divergence"])
+
+
+def test_the_log_can_be_learned_from_besides(tuned, books, quiet):
+    lines = lines_of(tuned("run", log_weight=0.5, steps=1), books, quiet)
+
+    assert lines[0]["motion_count"] > 0
+    assert lines[0]["motion_perplexity"] > 1
+    assert lines[0]["total"] > 0.4 * lines[0]["motion"]
+
+
+def test_a_run_that_is_stopped_goes_on_to_the_same_bits(tuned, books, quiet, monkeypatch):
+    monkeypatch.setattr("pipeline.stages.train.throughput.TELL_EVERY_S", 0.0)
+
+    def stop(done, total, note=""):
+        if done == 1:
+            raise Stopped(signal.SIGTERM)
+
+    whole, cut = tuned("whole"), tuned("cut")
+    one = begin(whole, *books)
+    train(whole, one, quiet)
+    with pytest.raises(Stopped):
+        train(cut, begin(cut, *books), stop)
+    other = begin(cut, *books)
+    assert load_checkpoint(cut.folder, other) == 1
+    train(cut, other, quiet)
+
+    pairs = zip(one.network.parameters(), other.network.parameters(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+    pairs = zip(one.pretrained.parameters(), other.pretrained.parameters(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+    logs = [(each.folder / "train.jsonl").read_bytes() for each in (whole, cut)]
+    assert logs[0] == logs[1]
+
+
+def test_the_pretrained_network_is_that_of_the_initial_weights_and_never_changes(
+    tuned, books, quiet
+):
+    setup = tuned("run", learning_rate=1e-2)
+    training = begin(setup, *books)
+    before = [each.clone() for each in training.network.parameters()]
+
+    train(setup, training, quiet)
+
+    pretrained = list(training.pretrained.parameters())
+    assert all(torch.equal(a, b) for a, b in zip(pretrained, before, strict=True))
+    assert not any(each.requires_grad for each in pretrained)
+    moved = training.network.parameters()
+    assert not all(torch.equal(a, b) for a, b in zip(moved, before, strict=True))
+    assert begin(replace(setup, train=TrainSettings()), *books).pretrained is None
+
+
+def test_no_step_is_done_where_nothing_is_better_than_anything_else(tuned, books):
+    setup = tuned(
+        "run",
+        overlap_penalty=0,
+        off_road_penalty=0,
+        log_distance_penalty=0,
+        weight_decay=0,
+    )
+    training, recipe = begin(setup, *books), setup.recipe(ProcessGroup())
+
+    stepped = OptimizerStep(training, setup.train, ProcessGroup(), recipe.parts).step(
+        recipe[0], recipe.own, 0
+    )
+
+    assert stepped.norm == pytest.approx(0, abs=1e-5)
+
+
+def test_fine_tuning_needs_weights_to_start_from(tmp_path):
+    how = TrainSettings(policy_gradient_rollouts=4)
+
+    with pytest.raises(ConfigError, match=r"rollouts is 4, but train\.initial_weights is"):
+        reads(tmp_path, {"train": how})
+
+    (source,) = reads(tmp_path, {"train": replace(how, initial_weights="builtin")})
+    assert source.fingerprint
