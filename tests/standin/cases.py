@@ -248,10 +248,6 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {**FEATURES, "density_features": True, "standing_features": True},
         {"motion_noise_neighbours": 5, "closed_loop_population": True},
     ),
-    "policy-gradient": (
-        FEATURES,
-        {"policy_gradient_rollouts": 3, "max_token_steps": 6, "log_weight": 0.5},
-    ),
     "accumulated": ({}, {"gradient_accumulation": 2}),
     "smart": ({"insertion_and_removal": False}, {}),
     "no-remove-token": ({"remove_token": False}, {}),
