@@ -46,6 +46,12 @@ class TrainSettings:
     source_share: SourceShares = ""
     """Shares of sources among the scenes of training, as `tfrecord:2,argoverse2:1`; empty
     for every scene as often as any other."""
+    max_scenes: Count = 0
+    """Scenes to learn from, drawn from those of the split by `train.seed`; fewer are among
+    more. 0 for all."""
+    skip_steps: Count = 0
+    """Steps of the order of scenes that are left out: those that the initial weights were
+    trained for, so that the scenes after them are read."""
     steps: Count = 100_000
     """Optimizer steps."""
     batch_scenes: AtLeastOne = 16
@@ -155,6 +161,10 @@ class TrainSettings:
                     f"closed_loop_top_k and {noise} both lead agents off their logged "
                     "paths; set one of them to 0"
                 )
+        if self.max_scenes and self.source_share:
+            raise ValueError(
+                "max_scenes and source_share both say which scenes are read; leave one out"
+            )
         if self.gradient_accumulation > self.batch_scenes:
             raise ValueError(
                 f"gradient_accumulation is {self.gradient_accumulation}, more than the "

@@ -106,7 +106,7 @@ class Recipe(Dataset[list[Made]]):
 
     def __getitem__(self, step: int) -> list[Made]:
         """Make the own parts of the batch of one step."""
-        draw = draw_of_step(step, self.order.seed)
+        draw = draw_of_step(self.order.skip + step, self.order.seed)
         scenes = [[self.scenes[row] for row in self.rows(step, part)] for part in self.own]
         made = [collate(part, self.limits, draw, self.noise) for part in scenes]
         return [PackedBatch.of(batch) for batch in made] if self.packed else [*made]

@@ -18,6 +18,9 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Int64
 
+_CHOICE = 1 << 31
+"""In place of an epoch: which scenes are read at all."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mixture:
@@ -42,6 +45,9 @@ class ScenePermutation:
         pool: Batches that are sorted together; 1 to leave scenes as they are drawn.
         seed: Of all permutations.
         mixture: Shares of the sources; None for every scene once an epoch.
+        most: How many scenes are read at all, if there are more; 0 for all. Without
+            ``mixture`` only.
+        skip: Steps that are left out at the beginning.
     """
 
     size: Int64[np.ndarray, "scene 2"]
@@ -49,16 +55,26 @@ class ScenePermutation:
     pool: int
     seed: int
     mixture: Mixture | None = None
+    most: int = 0
+    skip: int = 0
 
     @property
     def epoch_scenes(self) -> int:
         """Scenes of an epoch."""
-        return sum(self.mixture.counts) if self.mixture else len(self.size)
+        return sum(self.mixture.counts) if self.mixture else len(self.rows)
+
+    @property
+    def rows(self) -> Int64[np.ndarray, " row"]:
+        """Scenes that are read where no source has a share, ascending."""
+        if not 0 < self.most < len(self.size):
+            return np.arange(len(self.size))
+        random = np.random.default_rng([self.seed, _CHOICE])
+        return np.sort(random.permutation(len(self.size))[: self.most])
 
     def scenes(self, step: int) -> list[int]:
         """Rows of the scenes of one step."""
-        count = self.epoch_scenes
-        places = range(step * self.batch, (step + 1) * self.batch)
+        count, first = self.epoch_scenes, (self.skip + step) * self.batch
+        places = range(first, first + self.batch)
         return [int(_rows_of_epoch(self, at // count)[at % count]) for at in places]
 
 
@@ -79,7 +95,7 @@ def _rows_of_epoch(order: ScenePermutation, epoch: int) -> np.ndarray:
 def _drawn(order: ScenePermutation, epoch: int) -> np.ndarray:
     """All scenes of one epoch, in no order."""
     if order.mixture is None:
-        return np.arange(len(order.size))
+        return order.rows
     drawn = []
     for source, (rows, count) in enumerate(
         zip(order.mixture.rows, order.mixture.counts, strict=True)

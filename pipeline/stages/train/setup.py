@@ -72,12 +72,23 @@ class TrainingSetup:
             )
         sizes = self.scenes.sizes(self.limits)
         order = ScenePermutation(
-            sizes, how.batch_scenes, how.bucket_batches, how.seed, self._mixture()
+            size=sizes,
+            batch=how.batch_scenes,
+            pool=how.bucket_batches,
+            seed=how.seed,
+            mixture=self._mixture(),
+            most=how.max_scenes,
+            skip=how.skip_steps,
         )
         first = group.rank * how.gradient_accumulation
         own = range(first, first + how.gradient_accumulation)
         packed = group.device.type != "cpu"
         return Recipe(self.scenes, self.limits, order, parts, own, packed=packed)
+
+    @property
+    def num_scenes(self) -> int:
+        """Number of scenes that are learned from."""
+        return min(len(self.scenes), self.train.max_scenes or len(self.scenes))
 
     def _mixture(self) -> Mixture | None:
         shares = read_shares(self.train.source_share)

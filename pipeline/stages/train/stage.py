@@ -143,7 +143,7 @@ def _train(
     weights = save_network(target, training.network, final_state(training), how.steps)
     return {
         "steps": how.steps,
-        "scenes": len(setup.scenes),
+        "scenes": setup.num_scenes,
         "validation_split": len(setup.validation_split),
         "parameters": sum(p.numel() for p in training.network.parameters()),
         "weights": weights,

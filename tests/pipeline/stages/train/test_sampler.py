@@ -74,3 +74,27 @@ def test_batches_of_one_size_come_in_any_order():
 @pytest.mark.parametrize("pool", [1, 4])
 def test_batches_larger_than_the_data_wrap_around(pool):
     assert sorted(order([1, 2], batch=5, pool=pool).scenes(0)[:4]) == [0, 0, 1, 1]
+
+
+@given(count=st.integers(2, 40), batch=st.integers(1, 5), pool=st.integers(1, 4))
+def test_steps_that_are_left_out_are_those_that_were_read_before(count, batch, pool):
+    sizes = np.zeros((count, 2), np.int64)
+    whole = ScenePermutation(sizes, batch, pool, 3)
+    later = ScenePermutation(sizes, batch, pool, 3, skip=7)
+
+    assert [later.scenes(step) for step in range(9)] == [
+        whole.scenes(step) for step in range(7, 16)
+    ]
+
+
+def test_the_scenes_that_are_read_are_as_many_as_asked_for_and_of_the_seed():
+    sizes = np.zeros((60, 2), np.int64)
+
+    def read(most, seed=1):
+        reads = ScenePermutation(sizes, 4, 1, seed, most=most)
+        steps = [reads.scenes(step) for step in range(reads.epoch_scenes)]
+        return {row for step in steps for row in step}
+
+    assert [len(read(most)) for most in (0, 8, 24, 60, 99)] == [60, 8, 24, 60, 60]
+    assert read(8) < read(24)  # Fewer are among more.
+    assert read(8, seed=2) != read(8)
