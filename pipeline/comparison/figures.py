@@ -8,6 +8,7 @@ from infgen.views.charts.canvas import Chart
 from infgen.views.charts.lines import Series, line_chart
 from infgen.views.sheets import Sheet
 from pipeline.comparison.claims import PROTOCOLS
+from pipeline.comparison.learning_curve import learning_curve_charts
 from pipeline.comparison.result import LONG, ComparisonResult
 from pipeline.comparison.scores import Scored, middle_s
 from pipeline.comparison.statistics import mean_curve
@@ -43,7 +44,8 @@ def _charts(found: ComparisonResult, where: str) -> list[Chart]:
         for protocol in PROTOCOLS
         for name, label in {"composite": "composite", **BUCKETS}.items()
     ]
-    return [chart for chart in drawn if chart is not None]
+    curves = learning_curve_charts(found, where)
+    return [*curves, *[chart for chart in drawn if chart is not None]]
 
 
 def curve_sheet(found: ComparisonResult) -> Sheet:

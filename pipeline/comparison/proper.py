@@ -19,6 +19,9 @@ _AFTER = {
     "proper/w1/time_headway": "time headway, W1 in s",
 }
 
+SCORES = {**_BEFORE, **_AFTER}
+"""Scores that stand in tables: their names, and the words above them."""
+
 
 def proper(found: ComparisonResult) -> Sheet:
     """Scores that are best for the true distribution, over what log and rollouts share."""

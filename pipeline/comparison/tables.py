@@ -7,6 +7,7 @@ from infgen.clock import CLOCK
 from infgen.views.published import ABLATIONS, CAVEAT, PAPER, Published
 from infgen.views.sheets import Measured, Sheet, SheetCell
 from pipeline.comparison.claims import PROTOCOLS, claims
+from pipeline.comparison.learning_curve import learning_curve
 from pipeline.comparison.proper import proper
 from pipeline.comparison.result import LONG, MOTION_ONLY, OFFICIAL_PLAY, ComparisonResult
 from pipeline.comparison.rules import rules, rules_in_tables
@@ -50,6 +51,7 @@ def _compared(found: ComparisonResult) -> list[Sheet]:
         long_term(found),
         motion_only(found),
         proper(found),
+        learning_curve(found),
         ablations(found),
         against_logs(found),
         rules(found),

@@ -14,6 +14,7 @@ from infgen.views.charts.canvas import write_pdf
 from infgen.views.page import render
 from pipeline.comparison.execution import ExecutedRun
 from pipeline.comparison.figures import charts, curve_sheet
+from pipeline.comparison.learning_curve import learning_curve_scores
 from pipeline.comparison.result import ComparisonResult, compare
 from pipeline.comparison.runs import PAGE, PRESET, SHOWN, Comparison
 from pipeline.comparison.tables import caveats, standing_alone, tables
@@ -22,7 +23,7 @@ from pipeline.engine.code_hash import code_hash
 from pipeline.engine.layout import link
 from pipeline.engine.manifest import Run, package_versions, write_manifest
 from pipeline.engine.plan import digest
-from pipeline.settings.presets import Preset
+from pipeline.settings.presets import Arm, Preset
 
 SCHEMA = "infgen.comparison/2"
 STAGE, PRESETS = "comparison", "presets"
@@ -37,6 +38,7 @@ _MODULES = (
     "pipeline.comparison.claims",
     "pipeline.comparison.result",
     "pipeline.comparison.figures",
+    "pipeline.comparison.learning_curve",
     "pipeline.comparison.proper",
     "pipeline.comparison.rules",
     "pipeline.comparison.statistics",
@@ -80,7 +82,7 @@ def write_comparison(
 def _about(preset: Preset, ran: Sequence[ExecutedRun]) -> dict[str, Any]:
     """What the manifest says; the key follows from it."""
     arms = [
-        [arm.name, arm.label, arm.published, arm.ablates, arm.rules_of]
+        [*(arm.name, arm.label, arm.published, arm.ablates, arm.rules_of), _point(arm)]
         for arm in preset.arms.values()
     ]
     decides = {
@@ -88,7 +90,7 @@ def _about(preset: Preset, ran: Sequence[ExecutedRun]) -> dict[str, Any]:
         "stage": STAGE,
         "version": 1,
         "code": code_hash(_MODULES),
-        "settings": {PRESET: {"name": preset.name, "count_error": preset.count_error}},
+        "settings": {PRESET: _shown_of(preset)},
         "arms": arms,
         "runs": [each.to_json() for each in ran],
     }
@@ -99,6 +101,19 @@ def _about(preset: Preset, ran: Sequence[ExecutedRun]) -> dict[str, Any]:
         "key": digest(decides),
         "packages": package_versions(),
     }
+
+
+def _shown_of(preset: Preset) -> dict[str, Any]:
+    """Which words of a preset are shown."""
+    return {
+        "name": preset.name,
+        "count_error": preset.count_error,
+        "curve_axis": preset.curve_axis,
+    }
+
+
+def _point(arm: Arm) -> list[Any] | None:
+    return None if arm.curve is None else [arm.curve.line, arm.curve.at]
 
 
 def _write(folder: Path, found: ComparisonResult) -> None:
@@ -112,9 +127,11 @@ def _write(folder: Path, found: ComparisonResult) -> None:
             ("csv", sheet.for_programs().to_csv()),
         ):
             write_file(folder / TABLES / f"{sheet.name}.{suffix}", text.encode())
-    curves = curve_sheet(found)  # Thousands of rows: nobody reads them as they are.
-    data = curves.for_programs().to_csv().encode()
-    write_file(folder / TABLES / f"{curves.name}.csv", data)
+    # Thousands of rows: nobody reads them as they are.
+    points = learning_curve_scores(found)
+    for curves in [curve_sheet(found), *([points] if points.rows else [])]:
+        data = curves.for_programs().to_csv().encode()
+        write_file(folder / TABLES / f"{curves.name}.csv", data)
     write_json(folder / NUMBERS, found.to_json())
     shown = {sheet.name: sheet.for_people() for sheet in sheets}
     told = {name: {"title": one.title, **one.to_json()} for name, one in shown.items()}

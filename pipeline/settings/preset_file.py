@@ -9,15 +9,18 @@ from infgen.errors import ConfigError
 from infgen.views.published import ABLATIONS, PAPER
 from pipeline.settings.lined_yaml import LinedMapping, did_you_mean, inner, known, words
 from pipeline.settings.overlay import Overlay, merge_overlays, read_sections
-from pipeline.settings.presets import Arm, Preset
+from pipeline.settings.presets import SCENES_SHOWN, Arm, CurvePoint, Preset
 
 if TYPE_CHECKING:
     from pipeline.settings.town_set import TownSet
 
 COUNT_ERRORS = ("own", "split", "truth")
 """See ``infgen.metrics.long_term.table``: own log, mean of the split, same step."""
-_PRESET = ("profile", "seeds", "count_error", "towns", "rollout_sets", "arms")
-_ARM = ("profile", "published", "label", "starts_from", "ablates", "rollout_sets")
+_PRESET = (
+    *("profile", "seeds", "count_error", "towns", "rollout_sets", "arms"),
+    "curve_axis",
+)
+_ARM = ("profile", "published", "label", "starts_from", "ablates", "rollout_sets", "curve")
 _RULES_ARM = ("label", "rules_of", "rollout")
 """Keys of an arm that simulates the weights of another one with other rules."""
 _METHODS = tuple(each.method for each in PAPER)
@@ -66,6 +69,7 @@ def read_preset(
             for split in inner(entry, "towns")
         },
         arms={name: arms[name] for name in _ordered(arms)},
+        curve_axis=_word(entry, "curve_axis", ()) or SCENES_SHOWN,
     )
 
 
@@ -102,7 +106,22 @@ def _arm(arms: LinedMapping, name: str, context: _Context) -> Arm:
         rules_of=None,
         published=published,
         where=arms.where(name),
+        curve=_curve_point(entry),
     )
+
+
+def _curve_point(entry: LinedMapping) -> CurvePoint | None:
+    """Read which point of a learning curve an arm is."""
+    if "curve" not in entry:
+        return None
+    given = inner(entry, "curve")
+    known(given, ("line", "at"), "curve")
+    line, at = _word(given, "line", ()), given.get("at")
+    if line is None:
+        raise ConfigError(f"{entry.where('curve')}: curve names no line")
+    if at is not None and (isinstance(at, bool) or not isinstance(at, int) or at < 1):
+        raise ConfigError(f"{given.where('at')}: at is {at!r}; expected 1 or more")
+    return CurvePoint(line, at)
 
 
 def _rules_arm(arms: LinedMapping, name: str, context: _Context) -> Arm:
@@ -128,6 +147,7 @@ def _rules_arm(arms: LinedMapping, name: str, context: _Context) -> Arm:
         ablates=None,
         rules_of=of,
         published=None,
+        curve=None,
         where=arms.where(name),
     )
 

@@ -20,6 +20,7 @@
           catk: {profile: "smart,closed-loop", starts_from: smart, rollout_sets: [long]}
           no-cell: {profile: no-position-token, ablates: infgen, rollout_sets: [long]}
           infgen-safe: {rules_of: infgen, rollout: {rules: safe}}  # made if it is named
+          twice: {starts_from: infgen, curve: {line: InfGen}, rollout_sets: [long]}
 
 Settings may be given in the preset, in an arm, in a rollout set, and in a rollout set of an
 arm. Each takes precedence over those before it, and all of them over the profiles.
@@ -35,6 +36,22 @@ from pipeline.settings.overlay import Overlay
 
 if TYPE_CHECKING:
     from pipeline.settings.town_set import TownSet
+
+SCENES_SHOWN = "scenes shown in training"
+
+
+@dataclass(frozen=True, slots=True)
+class CurvePoint:
+    """A point of a learning curve.
+
+    Attributes:
+        line: Name of the line that it is on.
+        at: Its place on the axis; None for the scenes that training has shown, those of
+            the arms that it starts from among them.
+    """
+
+    line: str
+    at: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +69,7 @@ class Arm:
         rules_of: Arm whose weights and rollout sets it has, with other settings of
             rollouts. It is made only if it is named, and listed in the table of rules only.
         published: Row of the paper that it is compared with.
+        curve: Point of a learning curve that it is; None for none.
         where: Its place in the file.
     """
 
@@ -65,6 +83,7 @@ class Arm:
     rules_of: str | None
     published: str | None
     where: str
+    curve: CurvePoint | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +97,7 @@ class Preset:
         count_error: What agent counts in its tables are compared with.
         towns: Synthetic towns, by split, used where no records are named.
         arms: Its methods by name, each after the one it starts from.
+        curve_axis: What the axis of its learning curve is.
     """
 
     name: str
@@ -86,6 +106,7 @@ class Preset:
     count_error: str
     towns: "Mapping[str, TownSet]"
     arms: Mapping[str, Arm]
+    curve_axis: str = SCENES_SHOWN
 
     def chosen(self, names: Sequence[str]) -> list[Arm]:
         """Pick arms by name; without names all but those that show what rules change.

@@ -117,12 +117,13 @@ class Chart:
         return figure
 
 
-def set_logarithmic(axes: Axes, *, x: bool = False) -> None:
-    """Make the y axis logarithmic, and x too if asked: 1, 2, 5, 10, as plain numbers."""
-    axes.set_yscale("log")
+def set_logarithmic(axes: Axes, *, x: bool = False, y: bool = True) -> None:
+    """Make the y axis logarithmic, and x if asked: 1, 2, 5, 10, as plain numbers."""
+    if y:
+        axes.set_yscale("log")
     if x:
         axes.set_xscale("log")
-    for axis in (axes.yaxis, axes.xaxis) if x else (axes.yaxis,):
+    for axis in [axes.yaxis] * y + [axes.xaxis] * x:
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_locator(NullLocator())

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from infgen.views.charts.canvas import COLOURS, DASHES, INK, PAPER, Chart
+from infgen.views.charts.canvas import COLOURS, DASHES, INK, PAPER, Chart, set_logarithmic
 
 _WIDTH_PX, _PLOT_PX = 520.0, 200.0
 _LEFT_PX, _RIGHT_PX, _TOP_PX, _LABEL_PX = 62.0, 14.0, 34.0, 46.0
@@ -56,6 +56,7 @@ def line_chart(
     title: str,
     x_label: str,
     y_label: str,
+    log_x: bool = False,
 ) -> Chart:
     """Draw lines over a common x axis, each with its own colour and dash.
 
@@ -65,12 +66,17 @@ def line_chart(
         title: Of the chart.
         x_label: Below it.
         y_label: Beside it.
+        log_x: Whether the axis is logarithmic, with a dot at every point.
     """
 
     def draw(axes: Axes) -> None:
+        if log_x:
+            set_logarithmic(axes, x=True, y=False)
         for at, line in enumerate(lines):
             dash = DASHES[(at + at // len(COLOURS)) % len(DASHES)]
             _draw_line(axes, line, COLOURS[at % len(COLOURS)], dash)
+            if log_x:
+                axes.plot(line.x, line.y, "o", color=COLOURS[at % len(COLOURS)], ms=4.0)
         if truth is not None:
             _draw_line(axes, truth, INK, DASHES[0])
         axes.set(xlabel=x_label, ylabel=y_label)

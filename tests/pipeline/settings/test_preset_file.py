@@ -5,6 +5,7 @@ import pytest
 from infgen.config import CalibrateSettings, RolloutSettings
 from infgen.errors import ConfigError
 from infgen.views.published import ABLATIONS, PAPER
+from pipeline.settings.presets import SCENES_SHOWN, CurvePoint
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
 from pipeline.settings.town_set import TownSet
 
@@ -199,6 +200,21 @@ def test_arms_are_picked_by_name_and_bring_those_that_they_start_from(load):
         ("published: InfGen", "published: Infgen", "stages.yaml:25: no published 'Infg"),
         ("ablates: whole", "ablates: hole", "stages.yaml:26: no ablates 'hole'; did"),
         ("  mini:\n", "  mi.ni:\n", "stages.yaml:9: preset 'mi.ni'; expected letters"),
+        (
+            "ablates: whole",
+            "curve: {at: 3}",
+            "stages.yaml:26: curve names no line",
+        ),
+        (
+            "ablates: whole",
+            "curve: {line: a, at: 0}",
+            "stages.yaml:26: at is 0; expected 1 or more",
+        ),
+        (
+            "ablates: whole",
+            "curve: {lin: a}",
+            "stages.yaml:26: curve: no entry 'lin'; did you mean 'line'",
+        ),
         (GOOD[GOOD.index("    arms:") :], "", "stages.yaml:9: preset 'mini' has no arms"),
     ],
 )
@@ -206,6 +222,46 @@ def test_what_is_wrong_is_named_with_its_line(load, old, new, message):
     assert old in GOOD
     with pytest.raises(ConfigError, match=message):
         load(GOOD.replace(old, new, 1))
+
+
+def test_points_of_a_learning_curve_are_read(load):
+    text = GOOD.replace("count_error: truth", "count_error: truth\n    curve_axis: logs", 1)
+    text = text.replace("ablates: whole", "curve: {line: few, at: 50}", 1)
+
+    mini = load(text).preset("mini")
+
+    assert mini.curve_axis == "logs"
+    assert mini.arms["part"].curve == CurvePoint("few", 50)
+    assert mini.arms["whole"].curve is None
+    assert load().preset("mini").curve_axis == SCENES_SHOWN
+
+
+def test_every_point_of_the_scaling_curve_reads_the_scenes_after_those_before_it():
+    preset = load_stages(DEFAULT_FILE, {}).preset("scaling")
+
+    shown, before = 0, None
+    for arm in preset.arms.values():
+        train = {name: one.value for name, one in arm.settings.values["train"].items()}
+        assert arm.starts_from == before
+        assert train.get("skip_steps", 0) == shown
+        shown, before = shown + train["steps"], arm.name
+        assert arm.name == f"shown-{shown // 1000}k"
+    assert shown >= 60_000
+    assert preset.towns["training"].variety == "broad"
+
+
+def test_transfer_has_each_number_of_real_scenes_on_each_line():
+    preset = load_stages(DEFAULT_FILE, {}).preset("transfer")
+
+    lines = {}
+    for arm in preset.arms.values():
+        if arm.curve is not None:
+            lines.setdefault(arm.curve.line, []).append(arm.curve.at)
+    assert lines == {
+        "real alone": [50, 150, 543],
+        "towns, then real": [50, 150, 543],
+        "real, then towns": [50, 150, 543],
+    }
 
 
 def test_a_preset_that_does_not_exist_is_refused_with_those_that_do(load):
