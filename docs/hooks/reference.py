@@ -5,6 +5,7 @@ A page says where, by a comment on a line of its own:
 - ``<!-- commands -->``: every verb of the command line with its options.
 - ``<!-- settings -->``: every setting of every stage, with its default.
 - ``<!-- fields: infgen.scene.Tracks -->``: the fields of a record.
+- ``<!-- model card -->``: the card of the weights that come with the package.
 """
 
 import inspect
@@ -17,10 +18,13 @@ from typing import Any, get_type_hints
 import typer
 
 import cli
+from infgen.pretrained.card import builtin_card
 from pipeline.settings.described import one_line, sections
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
 
-_DIRECTIVE = re.compile(r"^<!-- (commands|settings|fields: \S+) -->$", re.MULTILINE)
+_DIRECTIVE = re.compile(
+    r"^<!-- (commands|settings|model card|fields: \S+) -->$", re.MULTILINE
+)
 _ATTRIBUTE = re.compile(r"^    (\w+(?:,\s+\w+)*): ((?:.|\n     )*)", re.MULTILINE)
 """One attribute of a docstring, or several that are described together."""
 
@@ -35,6 +39,8 @@ def _written(directive: str) -> str:
         return "\n".join(commands())
     if directive == "settings":
         return "\n".join(settings())
+    if directive == "model card":
+        return builtin_card().partition("\n")[2]
     module, _, name = directive.removeprefix("fields: ").rpartition(".")
     return "\n".join(record(getattr(import_module(module), name)))
 
