@@ -2,7 +2,7 @@
 
 A batch may be cut into parts, done one after the other and by several processes. Every
 loss term is its sum over all parts divided by the sum of its weights over all parts; the
-latter are known beforehand (``supervised``), so gradients simply add up.
+latter are known beforehand (``Supervision``), so gradients simply add up.
 """
 
 import hashlib
@@ -15,12 +15,12 @@ from torch import Tensor
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import Batch
+from infgen.model.batching.supervision import TERMS, AgentMasks, Supervision
 from infgen.model.device.packed import IndexedBatch, PackedBatch, prepared
 from infgen.model.training.closed_loop import close_loop
 from infgen.model.training.closed_loop_population import close_population_loop
 from infgen.model.training.diagnostics import motion_surprise
-from infgen.model.training.loss_weights import TERMS, Supervision
-from infgen.model.training.losses import AgentMasks, Term, Terms, losses
+from infgen.model.training.losses import Term, Terms, losses
 from pipeline.stages.train.precision import Pass
 from pipeline.stages.train.process_group import ProcessGroup
 from pipeline.stages.train.setup import TrainingError

@@ -8,12 +8,13 @@ import torch
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
 from infgen.model.batching.insertion_targets import OUTSIDE
+from infgen.model.batching.supervision import stay_mask
 from infgen.model.training.closed_loop_population import (
     CORRECTION_TOKENS,
     SURPLUS_ROWS,
     close_population_loop,
 )
-from infgen.model.training.losses import losses, stay_mask, total
+from infgen.model.training.losses import losses, total
 from infgen.model.training.own_choices import UniformNumbers, choose_among
 from infgen.tokens.grid import from_grid, make_grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence
