@@ -9,7 +9,7 @@ from infgen.model.batching.batch import collate, collate_maps
 from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.neighbours import grid_place
 from infgen.model.stepping import Stepper
-from infgen.model.token_step import PositionOutputs, TokenStep
+from infgen.model.token_step import TokenStep
 from infgen.tokens.scene_tokens import NO_CELL, NO_MOTION_TOKEN, Presence
 
 CLOSE = {"atol": 1e-4, "rtol": 1e-4}
@@ -146,15 +146,3 @@ def test_weights_that_know_motion_only_let_nobody_in(tiny, new_network, records)
 
     with pytest.raises(ValueError, match="motion only"):
         stepper.entry_begin(memory, nobody)
-
-
-def test_nobody_enters_at_cells_that_are_taken_or_excluded():
-    given = PositionOutputs(torch.zeros(2), torch.zeros(2, 3), None)
-    taken = torch.tensor([[True, False, False], [False, False, False]])
-
-    query = given.without(taken)
-    query.exclude(torch.tensor([1]), torch.tensor([2]))
-
-    ruled_out = query.position_logits.isinf()
-    assert ruled_out.tolist() == [[True, False, False], [False, False, True]]
-    assert not given.position_logits.isinf().any()
