@@ -3,7 +3,7 @@
 Dims as in ``steps``. What a network has no head for is None in its answers.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float32, Int64
@@ -119,20 +119,6 @@ class PositionOutputs:
             None if cell is None else cell[rollouts],
             None if place is None else place[rollouts],
         )
-
-    def without(self, taken: Bool[Tensor, "rollout cell"]) -> "PositionOutputs":
-        """Return logits of its own, in which nobody enters at the cells that are taken."""
-        if self.position_logits is None:
-            return self
-        logits = self.position_logits.masked_fill(taken, -torch.inf)
-        return replace(self, position_logits=logits)
-
-    def exclude(
-        self, rollouts: Int64[Tensor, " taken"], cell: Int64[Tensor, " taken"]
-    ) -> None:
-        """Let nobody enter at one more cell of some rollouts, in place."""
-        if self.position_logits is not None:
-            self.position_logits[rollouts, cell] = -torch.inf
 
 
 @dataclass(frozen=True, slots=True)

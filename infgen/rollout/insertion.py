@@ -132,20 +132,20 @@ def _sample_positions(
     """
     batch, found = active.batch, None
     simulator, mask = batch.request.simulator, batch.request.insertion_mask
-    query = query.without(simulator.tensor(batch.occupied[active.rollout]))
-    left = np.ones(len(active), dtype=bool)
+    taken, left = batch.occupied[active.rollout], np.ones(len(active), dtype=bool)
     for attempt in range(batch.request.attempts):
         asked, places = active.take(left), np.flatnonzero(left)
         inserted, cell = _sample_agents(
             asked,
             query if left.all() else query.take(simulator.tensor(places)),
+            taken if left.all() else taken[places],
             _attempt_numbers(simulator, numbers, number[places], attempt),
         )
         if mask is not None:
             allowed = mask.allows(batch.population, inserted, asked.rollout, batch.circles)
             inserted = replace(inserted, who=allowed)
         found = inserted if found is None else found.put(places, inserted)
-        query.exclude(simulator.tensor(places), simulator.tensor(cell))
+        taken[places, cell] = True
         left = ~found.who
         if not left.any():
             break
@@ -161,14 +161,17 @@ def _attempt_numbers(
 
 
 def _sample_agents(
-    active: _ActiveRollouts, query: PositionOutputs, uniforms: UniformNumbers
+    active: _ActiveRollouts,
+    query: PositionOutputs,
+    taken: Bool[np.ndarray, "rollout cell"],
+    uniforms: UniformNumbers,
 ) -> tuple[InsertedAgents, Int64[np.ndarray, " rollout"]]:
     """Sample position, type, size and heading; return them and the cells.
 
     Everything is sampled where the network is, and fetched at once.
     """
     simulator, grid = active.batch.request.simulator, active.batch.request.simulator.grid
-    cell, regressed_m = _sample_cell(simulator, query, uniforms)
+    cell, regressed_m = _sample_cell(simulator, query, taken, uniforms)
     details = simulator.stepper.entry_details(active.entries, cell, regressed_m)
     agent_type = choose(details.agent_type_logits, uniforms(Purpose.AGENT_TYPE))
     heading = sample_heading(simulator, details, agent_type, uniforms)
@@ -196,13 +199,16 @@ def _sample_agents(
 
 
 def _sample_cell(
-    simulator: Simulator, query: PositionOutputs, uniforms: UniformNumbers
+    simulator: Simulator,
+    query: PositionOutputs,
+    taken: Bool[np.ndarray, "rollout cell"],
+    uniforms: UniformNumbers,
 ) -> tuple[Tensor, Tensor | None]:
     """Sample a cell per rollout, or take those of regressed positions, returned as well."""
     settings, grid = simulator.settings, simulator.grid
     if query.position_logits is not None:
         cell = choose(
-            query.position_logits,
+            query.position_logits.masked_fill(simulator.tensor(taken), float("-inf")),
             uniforms(Purpose.CELL),
             settings.position_top_k,
             nucleus=settings.position_top_p,

@@ -58,8 +58,6 @@ class TurnNumbers:
         block: Block of four attempts whose numbers are held.
         places: Rollouts, among these, that numbers are held of, in order.
         numbers: The numbers [purpose, place, attempt].
-        asked: Rollouts that were asked for last ...
-        held: ... and where their numbers are held.
     """
 
     streams: Streams
@@ -68,22 +66,18 @@ class TurnNumbers:
     block: int = -1
     places: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     numbers: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, WORDS)))
-    asked: np.ndarray | None = None
-    held: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def of(
         self, purpose: Purpose, places: Int64[np.ndarray, " asked"], attempt: int = 0
     ) -> Float64[np.ndarray, " asked"]:
         """Return the numbers of one attempt; later ones may ask for fewer rollouts only."""
         if attempt // WORDS != self.block:
-            self.asked = None
             self.block, self.places = attempt // WORDS, places
             self.numbers = self.streams.take(places).uniform_block(
                 self.token, TURN_PURPOSES, self.block, self.turn
             )
-        if self.asked is not places:  # The same for all purposes of an attempt.
-            self.asked, self.held = places, np.searchsorted(self.places, places)
-        return self.numbers[TURN_PURPOSES.index(purpose), self.held, attempt % WORDS]
+        held = np.searchsorted(self.places, places)
+        return self.numbers[TURN_PURPOSES.index(purpose), held, attempt % WORDS]
 
 
 @dataclass(slots=True)

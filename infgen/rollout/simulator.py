@@ -89,7 +89,7 @@ class Simulator:
         """Number the chosen rows in order, as ``Rows.where``, without waiting."""
         at = np.flatnonzero(chosen)
         number = np.zeros(chosen.shape, dtype=np.int64)
-        number.reshape(-1)[at] = np.arange(len(at))
+        number.flat[at] = np.arange(len(at))
         return Rows(self.tensor(at), self.tensor(number))
 
     def token_step(

@@ -8,9 +8,10 @@ import torch
 
 from infgen.config import ModelSettings, TokenSettings, TrainSettings
 from infgen.model.batching.batch import collate
+from infgen.model.batching.supervision import pattern_mask
 from infgen.model.neighbours import cell_pose, grid_place
 from infgen.model.network import Network
-from infgen.model.training.losses import figures, losses, pattern_mask, total
+from infgen.model.training.losses import figures, losses, total
 from infgen.tokens.scene_tokens import Presence
 
 TRAIN = TrainSettings(label_smoothing=0.0)

@@ -8,9 +8,9 @@ captured as a graph, and so is one launch and one wait.
 import pytest
 
 MOST = {
-    ("motion-only", "mask"): (717, 1),
-    ("long", "mask"): (3224, 3),
-    ("long", "rules"): (3366, 10),
+    ("motion-only", "mask"): (645, 1),
+    ("long", "mask"): (3008, 3),
+    ("long", "rules"): (3150, 10),
 }
 
 

@@ -11,9 +11,9 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from infgen.model.batching.batch import Batch
+from infgen.model.batching.supervision import Supervision
 from infgen.model.batching.tensors import map_tensors
 from infgen.model.device.index import BatchIndex
-from infgen.model.training.loss_weights import Supervision
 
 ALIGNED_BYTES = 16
 """Tensors begin at multiples of this, as products on GPUs want them to."""

@@ -6,8 +6,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from infgen.model.batching.batch import Batch
+from infgen.model.batching.supervision import motion_mask, stay_mask
 from infgen.model.logits import Outputs
-from infgen.model.training.losses import Chosen, motion_mask, stay_mask
+from infgen.model.training.losses import Chosen
 from infgen.tokens.scene_tokens import Presence
 
 BIN_EDGES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from infgen.model.batching.batch import Agents, Batch
+from infgen.model.batching.supervision import OF_ROLLOUTS, AgentMasks, following
 from infgen.model.logits import (
     DetailOutputs,
     InsertionOutputs,
@@ -70,33 +71,11 @@ class Term:
 Terms = dict[str, Term]
 CONTROLS = ("keep", "add")
 """Terms of binary control tokens."""
-OF_ROLLOUTS = ("policy", "divergence")
-"""Terms of simulated rollouts (``policy_gradient``)."""
 MEASURED = (
     *("size", "offset", "position_regression", "heading_regression"),
     *OF_ROLLOUTS,
 )
 """Terms of which nothing is right or wrong."""
-
-
-@dataclass(frozen=True, slots=True)
-class AgentMasks:
-    """Which tokens of agents are supervised; it follows from a batch alone.
-
-    Attributes:
-        motion: ``motion_mask`` [scene, token, agent].
-        stay: ``stay_mask`` [scene, token, agent].
-        pattern: ``pattern_mask`` [scene, token, agent].
-    """
-
-    motion: Tensor
-    stay: Tensor
-    pattern: Tensor
-
-    @classmethod
-    def of(cls, agents: Agents) -> "AgentMasks":
-        """Find them."""
-        return cls(motion_mask(agents), stay_mask(agents), pattern_mask(agents))
 
 
 def losses(
@@ -154,47 +133,6 @@ def figures(terms: Mapping[str, Term]) -> dict[str, float]:
     return found
 
 
-def motion_mask(agents: Agents) -> Tensor:
-    """Tell which tokens [scene, token, agent] have a supervised next one (SPEC 3.5).
-
-    The next motion token must be known. An inserted agent's first one is always supervised.
-    Later ones ask for the token before and the one itself to be observed, so that nothing
-    is learned at the edges of a gap; entering counts as observed for the token that follows
-    it.
-    """
-    entering = agents.presence == int(Presence.INSERTED)
-    there = agents.observed
-    known = _next(agents.label, -1) >= 0
-    mask = known & _next(there, False)
-    mask &= entering | (there & _before(there | entering))
-    return mask & agents.near[:, None]
-
-
-def stay_mask(agents: Agents) -> Tensor:
-    """Tell which tokens [scene, token, agent] decide between staying and leaving.
-
-    All from entering to the last but one at which the agent is seen. Not the ego: it never
-    leaves. Nor at a log's end, where who is lost for a moment does not come back.
-    """
-    return pattern_mask(agents) & _next(agents.told, False)
-
-
-def pattern_mask(agents: Agents) -> Tensor:
-    """Tell which tokens [scene, token, agent] the agent goes on living after."""
-    following = _next(agents.presence, int(Presence.ABSENT))
-    goes_on = (following == int(Presence.PRESENT)) | (following == int(Presence.REMOVED))
-    return agents.visible & (agents.presence != int(Presence.REMOVED)) & goes_on
-
-
-def _next(values: Tensor, last: int | bool) -> Tensor:
-    """Shift values by one token, so that each stands where it is predicted from."""
-    return torch.cat([values[:, 1:], torch.full_like(values[:, :1], last)], dim=1)
-
-
-def _before(values: Tensor) -> Tensor:
-    return torch.cat([torch.zeros_like(values[:, :1]), values[:, :-1]], dim=1)
-
-
 def _motion(
     outputs: MotionOutputs, agents: Agents, settings: TrainSettings, mask: Tensor
 ) -> Term:
@@ -205,7 +143,7 @@ def _motion(
     entering = agents.presence[:, 1:] == int(Presence.INSERTED)
     # At token 0 nobody comes in.
     weight[:, 1:].masked_fill_(entering, settings.first_motion_weight)
-    target = rows.pack(_next(agents.label, -1))
+    target = rows.pack(following(agents.label, -1))
     chosen = Chosen.of(mask)
     return _choice(
         chosen,
@@ -218,12 +156,12 @@ def _motion(
 
 def _stay(rows: Rows, remove_logit: Tensor, agents: Agents, mask: Tensor) -> Term:
     chosen = Chosen.of(rows.pack(mask))
-    leaves = chosen.take(rows.pack(_next(agents.removal, False)))
+    leaves = chosen.take(rows.pack(following(agents.removal, False)))
     return _event(chosen, chosen.take(remove_logit), leaves)
 
 
 def _pattern(rows: Rows, pattern_logits: Tensor, agents: Agents, mask: Tensor) -> Term:
-    target = rows.pack(_next(agents.pattern, 0))
+    target = rows.pack(following(agents.pattern, 0))
     chosen = Chosen.of(rows.pack(mask))
     return _choice(chosen, chosen.take(pattern_logits), chosen.take(target), 0.0)
 

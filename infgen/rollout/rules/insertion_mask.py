@@ -101,8 +101,9 @@ class InsertionMask:
         pose = insertion_pose(population.pose[rollouts, EGO_ROW], inserted)
         allowed = ~self._overlaps(population, inserted, rollouts, pose, circles)
         vehicle = inserted.agent_type == AgentType.VEHICLE
+        has_lanes = np.array([len(start_m) > 0 for start_m, _ in self.lanes])
         scene = self.scene[rollouts]
-        asked = np.flatnonzero(allowed & vehicle & self.squares.has_any[scene])
+        asked = np.flatnonzero(allowed & vehicle & has_lanes[scene])
         allowed[asked] = self.squares.has_lane(pose[asked, :2], scene[asked])
         return allowed
 

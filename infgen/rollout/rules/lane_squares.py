@@ -28,7 +28,6 @@ class LaneSquares:
         start_m: First point of the segments, by square.
         along_m: Vector from there to their last point.
         reach_m: The distance.
-        has_any: Which maps have lanes.
     """
 
     corner_m: Float32[np.ndarray, "scene 2"]
@@ -38,7 +37,6 @@ class LaneSquares:
     start_m: Float32[np.ndarray, "listed 2"]
     along_m: Float32[np.ndarray, "listed 2"]
     reach_m: float
-    has_any: Bool[np.ndarray, " scene"]
 
     @classmethod
     def of(cls, maps: Sequence[Lanes], reach_m: float) -> "LaneSquares":
@@ -68,9 +66,7 @@ class LaneSquares:
             )
             for k in (0, 1)
         )
-        has_any = np.array([len(low_m) > 0 for low_m, _ in boxes], dtype=bool)
-        size = (columns, rows)
-        return cls(corner_m, side_m, size, begin, start_m, along_m, reach_m, has_any)
+        return cls(corner_m, side_m, (columns, rows), begin, start_m, along_m, reach_m)
 
     def has_lane(
         self, xy_m: Float32[np.ndarray, "point 2"], scene: Int64[np.ndarray, " point"]

@@ -8,12 +8,12 @@ from torch import Tensor
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import Batch
+from infgen.model.batching.supervision import Supervision, supervised_choices
 from infgen.model.device.packed import IndexedBatch, PackedBatch, prepared
 from infgen.model.network import Network
 from infgen.model.training.closed_loop import close_loop
 from infgen.model.training.closed_loop_population import close_population_loop
 from infgen.model.training.diagnostics import motion_surprise
-from infgen.model.training.loss_weights import Supervision, supervised_choices
 from infgen.model.training.losses import Terms, losses
 from infgen.model.training.policy_gradient.lessons import PolicyLessons, simulate_lessons
 from infgen.model.training.policy_gradient.terms import policy_terms

@@ -2,7 +2,7 @@
 
 A batch may be cut into parts, done one after the other and by several processes. Every
 loss term is its sum over all parts divided by the sum of its weights over all parts; the
-latter are known beforehand (``supervised``), so gradients simply add up.
+latter are known beforehand (``Supervision``), so gradients simply add up.
 """
 
 import hashlib
@@ -15,8 +15,8 @@ from torch import Tensor
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import Batch
+from infgen.model.batching.supervision import TERMS
 from infgen.model.device.packed import PackedBatch
-from infgen.model.training.loss_weights import TERMS
 from infgen.model.training.losses import Term, Terms
 from infgen.model.training.policy_gradient.lessons import SUMS
 from pipeline.stages.train.lessons import Lessons, each_terms, prepare_lessons

@@ -8,11 +8,12 @@ import torch
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
 from infgen.model.batching.insertion_targets import OUTSIDE
+from infgen.model.batching.supervision import stay_mask
 from infgen.model.training.closed_loop_population import (
     CORRECTION_TOKENS,
     close_population_loop,
 )
-from infgen.model.training.losses import losses, stay_mask, total
+from infgen.model.training.losses import losses, total
 from infgen.model.training.own_choices import UniformNumbers, choose_among
 from infgen.model.training.simulation import FREE_ROWS
 from infgen.tokens.grid import from_grid, make_grid

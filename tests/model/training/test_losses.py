@@ -9,7 +9,8 @@ import torch
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
-from infgen.model.training.losses import figures, losses, motion_mask, stay_mask, total
+from infgen.model.batching.supervision import motion_mask, stay_mask
+from infgen.model.training.losses import figures, losses, total
 from infgen.tokens.scene_tokens import FIRST_MOTION_TOKEN, NO_MOTION_TOKEN, Presence
 
 LETTERS = {
