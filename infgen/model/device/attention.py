@@ -23,6 +23,7 @@ from torch.nn import functional
 
 from infgen.model.layers import Attention, AttentionSources
 from infgen.model.neighbour_attention import HIDDEN_SCORE, Shared
+from infgen.model.rotary.turns import turned, turned_back
 
 ALIGNED = 8
 """Columns that hold the sum of the weights, and zeros."""
@@ -148,6 +149,9 @@ def _look(
     kind = query.dtype
     by_both = torch.bmm(query.transpose(0, 1), folded.query.to(kind))
     by_both = by_both.transpose(0, 1).reshape(targets, slots * block.heads, -1)
+    if seen.turn is not None:
+        asked, beside = by_both.tensor_split((width,), dim=-1)
+        by_both = torch.cat([turned(asked, seen.turn[:, None]), beside], dim=-1)
     score, blind = _cover(seen, slots * block.heads, block.heads)
     share = round(block.dropout * 256) / 256 if block.training else 0.0
     relation: Shared = seen.relation
@@ -156,6 +160,9 @@ def _look(
         *(relation.of_kind(kind), relation.ticket, relation.pulled),
         *(score, blind, share),
     )
+    if seen.turn is not None:
+        saw, beside = looked.tensor_split((width,), dim=-1)
+        looked = torch.cat([turned_back(saw, seen.turn[:, None]), beside], dim=-1)
     looked = looked.view(targets * slots, block.heads, -1).transpose(0, 1)
     value = torch.bmm(looked, folded.value.to(kind))
     return value.transpose(0, 1).reshape(targets, slots, width)
