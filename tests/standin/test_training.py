@@ -8,6 +8,7 @@ import pytest
 MOST = {
     "paper": (2800, 1),
     "features": (3250, 1),
+    "rotary": (3250, 1),
     "closed-loop": (14780, 75),
     "accumulated": (5580, 1),
     "smart": (1620, 1),

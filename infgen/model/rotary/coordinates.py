@@ -10,7 +10,7 @@ positions is then exact to a float far from the origin too.
 """
 
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float
 from torch import Tensor
 
 UNIT_M = 20.0
@@ -23,10 +23,10 @@ NUM_COORDINATES = 12
 
 @torch.no_grad()
 def coordinates(
-    target_pose: Float32[Tensor, "target 3"],
-    source_pose: Float32[Tensor, "target neighbour 3"],
-    ago: Float32[Tensor, "target neighbour"] | None = None,
-) -> Float32[Tensor, "target neighbour 12"]:
+    target_pose: Float[Tensor, "target 3"],
+    source_pose: Float[Tensor, "target neighbour 3"],
+    ago: Float[Tensor, "target neighbour"] | None = None,
+) -> Float[Tensor, "target neighbour 12"]:
     """Describe neighbours to their target.
 
     Args:

@@ -47,7 +47,9 @@ def turned(features: Tensor, turn: Tensor | None) -> Tensor:
     """Turn features [..., D] by ``turn_of`` [..., P]; None leaves them as they are."""
     if turn is None:
         return features
-    pairs = torch.view_as_complex(_full(features).view(*features.shape[:-1], turn.shape[-1], 2))
+    pairs = torch.view_as_complex(
+        _full(features).view(*features.shape[:-1], turn.shape[-1], 2)
+    )
     return torch.view_as_real(pairs * turn).view_as(features).to(features.dtype)
 
 
