@@ -5,8 +5,10 @@ from typing import Literal
 from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
-from infgen.model.rotary.coordinates import NUM_COORDINATES
 from infgen.settings import RULES, AtLeastOne, Bool, Count, NonNegative, Share
+
+NUM_COORDINATES = 12
+"""Numbers that tell the relative pose of a pair with ``relations=rotary``."""
 
 
 @dataclass(frozen=True, slots=True, config=RULES)

@@ -11,7 +11,7 @@ from infgen.model.layers import AttentionSources
 from infgen.model.long_memory import AVERAGED_TOKENS, Standing, next_averages
 from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import MapFeatures
-from infgen.model.rotary.turns import turn_of, turned
+from infgen.model.rotary.turns import multiples, turn_of, turned
 from infgen.model.settings import ModelSettings
 from infgen.model.token_step import TokenStep
 
@@ -114,9 +114,10 @@ class StepMemory:
         """Features of others, turned as if their last columns were the last ones here."""
         if not self.rotary:
             return others.features
-        later = float(self.columns - others.columns)
-        still = others.features.new_zeros(3, dtype=torch.float32)
-        return turned(others.features, turn_of(still, others.features.shape[-1], later))
+        later, features = float(self.columns - others.columns), others.features
+        still = features.new_zeros(3, dtype=torch.float32)
+        of_each = multiples(features.shape[-1]).to(still.device)
+        return turned(features, turn_of(still, of_each, later))
 
     def with_rows(self, rows: int) -> "StepMemory":
         """Append free rows, up to so many."""

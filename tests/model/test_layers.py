@@ -18,7 +18,7 @@ from infgen.model.layers import (
     normed,
 )
 from infgen.model.neighbour_attention import Shared
-from infgen.model.rotary.turns import turn_of, turned_back
+from infgen.model.rotary.turns import multiples, turn_of, turned_back
 from infgen.model.settings import ModelSettings
 
 WIDTH, HEADS, SOURCES = 16, 2, 9
@@ -87,7 +87,7 @@ def test_factorised_attention_is_the_plain_one_and_so_are_its_gradients(
     layer = make_layer(bipartite, relation_width)
     seen, relation = make_seen(5, slots, 7, relation_width)
     if rotary:
-        seen = replace(seen, turn=turn_of(torch.randn(5, 3), WIDTH, token=3.0))
+        seen = replace(seen, turn=turn_of(torch.randn(5, 3), multiples(WIDTH), 3.0))
     target = torch.randn(5, slots, WIDTH, requires_grad=True)
     inputs = [target, seen.features, relation, *layer.parameters()]
 

@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-UNIT_M = 20.0
-"""Lengths are in units of this ..."""
+UNIT_M = 4.0
+"""Lengths are in units of this: small enough that fractions of a lane count ..."""
+SQUARES_UNIT_M = 15.0
+"""... those in products of this, so that those of a whole radius are not too large ..."""
 UNIT_TOKENS = 8.0
 """... and time differences of this."""
-NUM_COORDINATES = 12
-"""Numbers of a pair."""
 
 
 @torch.no_grad()
@@ -40,17 +40,21 @@ def coordinates(
         left: from the tokens of a lane, how far the target is off its centre), the cosine
         and sine of the relative heading, and the time difference with its square.
     """
-    away = (source_pose[..., :2] - target_pose[:, None, :2]) / UNIT_M
+    away_m = source_pose[..., :2] - target_pose[:, None, :2]
     heading_rad = target_pose[:, None, 2]
-    ahead, left = _seen_from(heading_rad.cos(), heading_rad.sin(), *away.unbind(-1))
+    away = (away_m / UNIT_M).unbind(-1)
+    ahead, left = _seen_from(heading_rad.cos(), heading_rad.sin(), *away)
     turned_rad = source_pose[..., 2] - heading_rad
     cos, sin = turned_rad.cos(), turned_rad.sin()
     before, beside = _seen_from(cos, sin, -ahead, -left)
     gap = torch.zeros_like(ahead) if ago is None else ago / UNIT_TOKENS
+    wide, broad, aside = (
+        each * (UNIT_M / SQUARES_UNIT_M) for each in (ahead, left, beside)
+    )
     return torch.stack(
         [
-            *(ahead, left, ahead * ahead, left * left, ahead * left),
-            *(before, beside, beside * beside),
+            *(ahead, left, wide * wide, broad * broad, wide * broad),
+            *(before, beside, aside * aside),
             *(cos, sin, gap, gap * gap),
         ],
         dim=-1,

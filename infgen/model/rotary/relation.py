@@ -3,15 +3,17 @@
 import torch
 from torch import Tensor, nn
 
-from infgen.model.rotary.turns import turn_of
+from infgen.model.rotary.turns import multiples, turn_of
 
 
 class RotaryRelation(nn.Module):
     """Relative poses by turns of features and by coordinates: nothing is learned here."""
 
+    of_each: Tensor
+
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.width = width
+        self.register_buffer("of_each", multiples(width), persistent=False)
 
     def table(self) -> Tensor:
         """Return an empty table: there is nothing to look up."""
@@ -19,5 +21,5 @@ class RotaryRelation(nn.Module):
 
     def turn(self, pose: Tensor, token: Tensor | float = 0.0) -> Tensor:
         """Return by what the features of poses [..., 3] at token steps are turned."""
-        turn: Tensor = turn_of(pose, self.width, token)
+        turn: Tensor = turn_of(pose, self.of_each, token)
         return turn
