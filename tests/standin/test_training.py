@@ -70,7 +70,6 @@ def test_training_resumes_where_it_was(case, shards, tmp_path):
         "benchmark",
         "smart",
         "paper,no-remove-token,no-position-token,no-heading-token",
-        "benchmark,rotary",
     ],
 )
 def test_a_traced_network_says_what_the_network_says(case, shards, profile):
