@@ -30,12 +30,14 @@ _TINY = ModelSettings(
 SIZES = {
     "paper": ModelSettings(),
     "paper-narrow": ModelSettings(relation_width=32),
+    "paper-rotary": ModelSettings(relations="rotary"),
     "small": _SMALL,
     "small-narrow": replace(_SMALL, relation_width=16),
+    "small-rotary": replace(_SMALL, relations="rotary"),
     "tiny": _TINY,
 }
-"""Sizes of the network by name; the narrow ones have narrow features of relative poses, and
-the tiny one is for tests."""
+"""Sizes of the network by name; the narrow ones have narrow features of relative poses,
+the rotary ones none, and the tiny one is for tests."""
 PEAK_SIDE = 2048
 
 

@@ -110,6 +110,8 @@ def test_windows_are_whole_token_steps(name, value, near):
     [
         ("model", {"width": 15, "heads": 2}, "model: width is 15; expected a multiple of"),
         ("model", {"signal_ahead_m": 40}, "needs signals_each_step=true"),
+        ("model", {"relations": "rotary", "relation_width": 16}, "expected 0 and False"),
+        ("model", {"relations": "rotary", "width": 9, "heads": 3}, "an even number"),
         ("train", {"gradient_accumulation": 17}, "more than the 16 scenes of a batch"),
         ("train", {"closed_loop_top_k": 5, "lateral_drift_share": 0.5}, "set one of them"),
         ("train", {"policy_gradient_rollouts": 2}, "expected 0, or 3 or more"),

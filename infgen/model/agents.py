@@ -29,6 +29,7 @@ from infgen.model.motion_head import MotionHead
 from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import MapFeatures, NeighbourRows, NeighbourSpec
 from infgen.model.relations import Rows, direction, relation_embedding
+from infgen.model.rotary.turns import turned
 from infgen.model.settings import ModelSettings
 from infgen.model.signal_features import SignalAhead
 from infgen.scene import AgentType
@@ -184,6 +185,7 @@ class AgentContext:
     Attributes:
         past_relation: Relations to their own past [N, K, D] ...
         past_present: ... and which of it there is [N, K].
+        past_turn: By what features are turned by heading and time [N, P], if they are.
         roads: Map tokens around them.
         agents: Rows of the agents around them.
         light: Features of the signals ahead [N, D], if they are used.
@@ -192,6 +194,7 @@ class AgentContext:
 
     past_relation: Shared
     past_present: Tensor
+    past_turn: Tensor | None
     roads: AttentionSources
     agents: NeighbourRows
     light: Tensor | None
@@ -211,7 +214,8 @@ class MotionBlock(nn.Module):
         """Update agents; ``past`` are they themselves at earlier tokens."""
         x_ND = self.past(x_ND, past)
         x_ND = self.roads(x_ND, sight.roads)
-        updated: Tensor = self.agents(x_ND, sight.agents.seen(normed(x_ND)))
+        shown = turned(normed(x_ND), sight.agents.turn)
+        updated: Tensor = self.agents(x_ND, sight.agents.seen(shown))
         return updated
 
 
@@ -280,7 +284,11 @@ class MotionStack(nn.Module):
         x_ND = x_ND if sight.light is None else x_ND + sight.light
         for block in self.blocks:
             past = AttentionSources(
-                normed(x_ND), past_index, sight.past_relation, sight.past_present
+                turned(normed(x_ND), sight.past_turn),
+                past_index,
+                sight.past_relation,
+                sight.past_present,
+                sight.past_turn,
             )
             x_ND = block(x_ND, past, sight)
         return x_ND

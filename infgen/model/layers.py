@@ -128,12 +128,15 @@ class AttentionSources:
         index: Row of each neighbour among them [N, K].
         relation: Normed features of how neighbours stand to their target [N, K, R].
         present: Which neighbours there are: [N, K], or [N, S, K] if slots differ.
+        turn: By what features are turned at the targets [N, P], if those of the sources are
+            turned (``rotary.turns``).
     """
 
     features: Tensor
     index: Tensor
     relation: Shared
     present: Tensor
+    turn: Tensor | None = None
 
     @classmethod
     def own(
@@ -147,8 +150,9 @@ class AttentionSources:
     def take(self, targets: Tensor) -> "AttentionSources":
         """Go on with some targets only; gradients end here."""
         relation = Shared.of(self.relation.values[targets])
+        turn = None if self.turn is None else self.turn[targets]
         return AttentionSources(
-            self.features, self.index[targets], relation, self.present[targets]
+            self.features, self.index[targets], relation, self.present[targets], turn
         )
 
 
@@ -223,6 +227,7 @@ class Attention(nn.Module):
             seen.relation,
             ~seen.present,
             self._kept(query, seen.index.shape[-1]),
+            seen.turn,
         )
         return looked.flatten(2)
 

@@ -10,7 +10,8 @@ from infgen.model.device.index import MapIndex
 from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.map_grid import MapGrid
 from infgen.model.neighbours import MapFeatures, NeighbourRows, NeighbourSpec, SignalStates
-from infgen.model.relations import Rows, relation_embedding
+from infgen.model.relations import Rows, relation_embedding, turn_of_rows
+from infgen.model.rotary.turns import turned
 from infgen.model.settings import ModelSettings
 from infgen.model.signal_features import StopLines
 from infgen.tokens.map import PointType, PolylineType
@@ -85,6 +86,7 @@ class MapEncoder(nn.Module):
             relation=reach.describe(pose, roads.pose[scene[:, None], place]),
             present=present,
             place=place,
+            turn=self.relation.turn(pose),
         )
         return MapContext(rows, neighbours, grid, index)
 
@@ -97,7 +99,8 @@ class MapEncoder(nn.Module):
         """Return what every map token is among its neighbours [row, D]."""
         x = self._embed(roads, sight.rows)
         for block in self.blocks:
-            x = block(x, sight.neighbours.seen(normed(x)))
+            shown = turned(normed(x), sight.neighbours.turn)
+            x = block(x, sight.neighbours.seen(shown))
         return x
 
     def lay_out(
@@ -118,14 +121,26 @@ class MapEncoder(nn.Module):
             index: Places among them, if they are known already.
         """
         features, signal_states = normed(x), None
+        turn = turn_of_rows(self.relation, rows, roads.pose)
         if self.signals_each_step:
-            looks, signal_states = self._signal_states(roads, rows, x, index)
-            features = torch.cat([features, looks])
+            lit = rows.pack(roads.light).nonzero()[:, 0] if index is None else index.lit
+            looks = normed(x[lit, None] + self.signal.weight)  # [lit, class, D]
+            features = torch.cat([features, looks.flatten(0, 1)])
+            signal_states = _signal_states(roads, len(x), lit, looks.shape[1])
+            if turn is not None:
+                turn = torch.cat([turn, turn[lit].repeat_interleave(looks.shape[1], dim=0)])
         lines = None
         if self.stop_lines:
             lines = StopLines.of(roads) if index is None else index.lines
         return MapFeatures(
-            rows, features, roads.pose, roads.real, grid, signal_states, lines
+            rows,
+            features,
+            turned(features, turn),
+            roads.pose,
+            roads.real,
+            grid,
+            signal_states,
+            lines,
         )
 
     def predict_hidden(
@@ -160,13 +175,9 @@ class MapEncoder(nn.Module):
             return embedded
         return embedded + self.signal(rows.pack(roads.signal))
 
-    def _signal_states(
-        self, roads: MapTokens, rows: Rows, x: Tensor, index: MapIndex | None
-    ) -> tuple[Tensor, SignalStates]:
-        """Say what map tokens with a light look like under each class of it."""
-        lit = rows.pack(roads.light).nonzero()[:, 0] if index is None else index.lit
-        looks = normed(x[lit, None] + self.signal.weight)  # [lit, class, D]
-        first = torch.zeros_like(rows.at)
-        behind = torch.arange(len(lit), device=x.device) * looks.shape[1]
-        first[lit] = len(x) + behind
-        return looks.flatten(0, 1), SignalStates(first, roads.light, roads.shown)
+
+def _signal_states(roads: MapTokens, rows: int, lit: Tensor, classes: int) -> SignalStates:
+    """Say where the looks of map tokens with a light [lit] are: behind all rows."""
+    first = torch.zeros(rows, dtype=torch.int64, device=lit.device)
+    first[lit] = rows + torch.arange(len(lit), device=lit.device) * classes
+    return SignalStates(first, roads.light, roads.shown)

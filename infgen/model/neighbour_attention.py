@@ -20,6 +20,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from infgen.model.rotary.turns import turned, turned_back
+
 HIDDEN_SCORE = -1e9
 """Score of what a target does not see: its weight is exactly zero beside any other."""
 CACHED_NUMBERS = 1 << 19
@@ -110,6 +112,7 @@ def attend_to_pairs(
     relation: Shared,
     hidden: Tensor,
     kept: Tensor | None,
+    turn: Tensor | None = None,
 ) -> Tensor:
     """Weigh the values of neighbours by the softmax of their scores, and sum them.
 
@@ -121,6 +124,8 @@ def attend_to_pairs(
         relation: Of the neighbours [N, K, R].
         hidden: Which neighbours a slot does not see [N, S, K].
         kept: Factor on each weight for dropout [N, S, H, K], or None.
+        turn: By what features are turned at the targets [N, P], if those of the sources are
+            turned: queries are turned as the sources are, and sums turned back.
 
     Returns:
         Sums [N, S, H, C]; zero for a slot that sees nobody.
@@ -132,7 +137,7 @@ def attend_to_pairs(
     shared = relation.ticket, relation.pulled
     with torch.autocast(query.device.type, enabled=False):
         summed: Tensor = _Attend.apply(  # type: ignore[no-untyped-call]
-            query.contiguous(), *weights, *sources, *shared, hidden, kept
+            query.contiguous(), *weights, *sources, *shared, hidden, kept, turn
         )
     return summed
 
@@ -154,6 +159,7 @@ class _Attend(torch.autograd.Function):
         pulled: _Sum,
         hidden: Tensor,
         kept: Tensor | None,
+        turn: Tensor | None,
     ) -> Tensor:
         learns = any(ctx.needs_input_grad)
         queries = query.shape[1] * query.shape[2]
@@ -164,8 +170,12 @@ class _Attend(torch.autograd.Function):
         summed = torch.empty_like(query)
         blind = _blind(hidden)
         for part, near in _parts(query, features, index):
+            turns = None if turn is None else turn[part, None]
             used = _scores(
-                (_widen(query[part], key), _widen(query[part], relation_key)),
+                (
+                    turned(_widen(query[part], key), turns),
+                    _widen(query[part], relation_key),
+                ),
                 (near, relation[part]),
                 hidden[part],
             )
@@ -176,7 +186,8 @@ class _Attend(torch.autograd.Function):
                 weight[part] = used
             if kept is not None:
                 used = used * kept[part].flatten(1, 2)
-            looked, beside = torch.bmm(used, near), torch.bmm(used, relation[part])
+            looked = turned_back(torch.bmm(used, near), turns)
+            beside = torch.bmm(used, relation[part])
             if learns:
                 saw[part], related[part] = looked, beside
             found = torch.bmm(_by_head(looked, key), value.mT)
@@ -186,7 +197,7 @@ class _Attend(torch.autograd.Function):
             summed[part].addcmul_(total, value_bias)
         ctx.save_for_backward(
             query, key, value, relation_key, relation_value, value_bias,
-            features, index, relation, weight, saw, related, kept,
+            features, index, relation, weight, saw, related, kept, turn,
         )  # fmt: skip
         ctx.pulled = pulled
         return summed
@@ -196,7 +207,7 @@ class _Attend(torch.autograd.Function):
     def backward(ctx: Any, pull: Tensor) -> tuple[Tensor | None, ...]:
         (
             query, key, value, relation_key, relation_value, value_bias,
-            features, index, relation, weight, saw, related, kept,
+            features, index, relation, weight, saw, related, kept, turn,
         ) = ctx.saved_tensors  # fmt: skip
         pull = pull.contiguous()
         to_query, to_features = torch.empty_like(query), torch.zeros_like(features)
@@ -209,10 +220,9 @@ class _Attend(torch.autograd.Function):
         if shared and first:
             ctx.pulled.tensor = torch.empty_like(relation, dtype=torch.float32)
         for part, near in _parts(query, features, index):
-            to_saw, to_related = (
-                _widen(pull[part], value),
-                _widen(pull[part], relation_value),
-            )
+            turns = None if turn is None else turn[part, None]
+            to_saw = turned(_widen(pull[part], value), turns)
+            to_related = _widen(pull[part], relation_value)
             used, factor = weight[part], 1.0
             if kept is not None:
                 factor = kept[part].flatten(1, 2)
@@ -223,7 +233,10 @@ class _Attend(torch.autograd.Function):
             to_score.add_(to_total[..., None]).mul_(factor)
             to_score.sub_((to_score * used).sum(dim=-1, keepdim=True)).mul_(used)
 
-            asked = torch.bmm(to_score, near), torch.bmm(to_score, relation[part])
+            asked = (
+                turned_back(torch.bmm(to_score, near), turns),
+                torch.bmm(to_score, relation[part]),
+            )
             pulled = torch.bmm(_by_head(asked[0], key), key.mT)
             pulled.baddbmm_(_by_head(asked[1], key), relation_key.mT)
             to_query[part] = pulled.transpose(0, 1).view_as(to_query[part])
@@ -238,14 +251,14 @@ class _Attend(torch.autograd.Function):
             to_bias += (pull[part] * total).sum(dim=(0, 1))
 
             both = torch.cat([to_score, dropped], dim=1).mT  # [N, K, 2 Q]
-            widened = torch.cat([_widen(query[part], key), to_saw], dim=1)
+            widened = torch.cat([turned(_widen(query[part], key), turns), to_saw], dim=1)
             _add_rows(to_features, index[part], torch.bmm(both, widened))
             if shared:
                 widened = torch.cat([_widen(query[part], relation_key), to_related], dim=1)
                 _add_product(ctx.pulled.tensor[part], both, widened, first=first)
         return (
             to_query, to_key, to_value, to_relation_key, to_relation_value, to_bias,
-            to_features, None, None, None, None, None, None,
+            to_features, None, None, None, None, None, None, None,
         )  # fmt: skip
 
 

@@ -14,8 +14,7 @@ from torch import Tensor
 from infgen.model.layers import AttentionSources
 from infgen.model.map_grid import MapGrid
 from infgen.model.neighbour_attention import Shared
-from infgen.model.relation_tables import RelationEmbedding
-from infgen.model.relations import Rows, across, nearest, relations
+from infgen.model.relations import Relation, Rows, describe_pairs, nearest
 from infgen.model.signal_features import StopLines
 
 
@@ -26,7 +25,7 @@ class NeighbourSpec:
     Attributes:
         radius_m: Radius.
         count: Nearest sources that are seen.
-        relation: Embedding of how sources stand to targets.
+        relation: How it is told how sources stand to targets.
         table: Its table.
         ahead_m: How far ahead of a target the point is that they are nearest to.
         across: Whether relations end in ``relations.across``.
@@ -34,7 +33,7 @@ class NeighbourSpec:
 
     radius_m: float
     count: int
-    relation: RelationEmbedding
+    relation: Relation
     table: Tensor
     ahead_m: float
     across: bool
@@ -44,7 +43,7 @@ class NeighbourSpec:
         cls,
         radius_m: float,
         count: int,
-        relation: RelationEmbedding,
+        relation: Relation,
         *,
         ahead_m: float = 0.0,
         across: bool = False,
@@ -66,10 +65,11 @@ class NeighbourSpec:
         source_pose: Float32[Tensor, "target neighbour 3"],
     ) -> Shared:
         """Normed features of how sources stand to their targets."""
-        described = relations(target_pose, source_pose)
-        if self.across:
-            described = torch.cat([described, across(target_pose, source_pose)], dim=-1)
-        return Shared.of(self.relation.look_up(described, self.table))
+        return Shared.of(
+            describe_pairs(
+                self.relation, self.table, target_pose, source_pose, lateral=self.across
+            )
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,16 +81,20 @@ class NeighbourRows:
         relation: Normed features of how they stand to it [N, K, D].
         present: Which of them there are [N, K].
         place: Position of each neighbour among its group's sources [N, K].
+        turn: By what the features of the row itself are turned [N, P], if they are.
     """
 
     index: Tensor
     relation: Shared
     present: Tensor
     place: Tensor
+    turn: Tensor | None
 
     def seen(self, features: Tensor) -> AttentionSources:
-        """Join with the features of all rows [row, D]."""
-        return AttentionSources(features, self.index, self.relation, self.present)
+        """Join with the features of all rows [row, D], which are turned if any are."""
+        return AttentionSources(
+            features, self.index, self.relation, self.present, self.turn
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +104,7 @@ class MapFeatures:
     Attributes:
         rows: Which places of the padded maps they are.
         features: Normed features [row, D].
+        turned: The same as attention sees them: turned, if they are.
         pose: Poses of the padded maps [scene, road, 3].
         real: Which places of the padded maps hold a map token [scene, road].
         grid: The same tokens by where they are.
@@ -110,6 +115,7 @@ class MapFeatures:
 
     rows: Rows
     features: Tensor
+    turned: Tensor
     pose: Tensor
     real: Tensor
     grid: MapGrid
@@ -176,11 +182,13 @@ def find_neighbours(
     )
     place, present = targets.pack(found.index), targets.pack(found.present)
     group = (targets.at // found.index.shape[1])[:, None]
+    pose = targets.pack(target_pose)
     return NeighbourRows(
         index=source_row[group, place],
-        relation=reach.describe(targets.pack(target_pose), source_pose[group, place]),
+        relation=reach.describe(pose, source_pose[group, place]),
         present=present,
         place=place,
+        turn=reach.relation.turn(pose),
     )
 
 
@@ -206,10 +214,11 @@ def find_map_neighbours(
     found = roads.grid.nearest(reach.centre_m(pose), on, reach.radius_m, reach.count)
     place, present = found.index[0], found.present[0]
     return AttentionSources(
-        roads.features,
+        roads.turned,
         roads.at(on, place, token),
         reach.describe(pose, roads.pose[on[:, None], place]),
         present,
+        reach.relation.turn(pose),
     )
 
 

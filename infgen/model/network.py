@@ -39,7 +39,8 @@ from infgen.model.neighbours import (
     find_map_neighbours,
     find_neighbours,
 )
-from infgen.model.relations import Rows, relations
+from infgen.model.relations import Rows, describe_pairs
+from infgen.model.rotary.turns import turned
 from infgen.model.settings import ModelSettings
 from infgen.tokens.grid import Grid, make_grid
 from infgen.tokens.scene_tokens import Presence
@@ -144,8 +145,10 @@ class Network(nn.Module):
         standing = None
         if self.settings.standing_features:
             standing = _standing(agents).take(rows.at)
-        x = self.embed(_agent_rows(agents, rows, standing), self.embed.tables())
+        given = _agent_rows(agents, rows, standing)
+        x = self.embed(given, self.embed.tables())
         raw, cells, details = normed(x), self.cells, self.details
+        shown = turned(raw, self.motion.agents_relation.turn(given.pose))
         hidden = None
         if hidden_roads:
             known = roads if self.training else self.roads(batch.roads, covered)
@@ -156,10 +159,10 @@ class Network(nn.Module):
             motion=self._motion(agents, rows, x, roads, density, as_logged),
             entries=None
             if cells is None
-            else _entries(cells, batch, asked, rows, raw, roads, density),
+            else _entries(cells, batch, asked, rows, raw, shown, roads, density),
             details=None
             if details is None
-            else _details(details, batch, told, rows, raw, roads),
+            else _details(details, batch, told, rows, shown, roads),
             roads=None if hidden is None else MapOutputs(*hidden),
         )
 
@@ -188,11 +191,13 @@ class Network(nn.Module):
         pose = agents.pose.flatten(0, 1)  # [scene token, agent, 3]
         visible = visible.flatten(0, 1)
         others = ~torch.eye(visible.shape[1], dtype=torch.bool, device=visible.device)
+        own_pose = rows.pack(agents.pose)
         past_index, past_present, past_relation = self._past(agents, rows, as_logged)
         reach, token = self.motion.map_reach(), _tokens(agents, rows)
         sight = AgentContext(
             past_relation,
             past_present,
+            self.motion.past_relation.turn(own_pose, token),
             find_map_neighbours(
                 reach, by_scene, agents.pose.flatten(1, 2), roads, scene, token
             ),
@@ -205,7 +210,7 @@ class Network(nn.Module):
                 visible[:, None] & visible[:, :, None] & others,
             ),
             self.motion.lights_ahead(
-                roads, rows.pack(agents.pose), rows.at // agents.visible[0].numel(), token
+                roads, own_pose, rows.at // agents.visible[0].numel(), token
             ),
             None if density is None else density.take(rows.at // visible.shape[1]),
         )
@@ -231,10 +236,10 @@ class Network(nn.Module):
             present &= past(life) == rows.pack(life)[:, None]
         pose = rows.pack(agents.pose)
         ago = torch.arange(-window, 0, device=pose.device, dtype=pose.dtype)
-        ago = ago.expand(len(index), window)[..., None]
-        described = torch.cat([relations(pose, pose[index]), ago], dim=-1)
+        ago = ago.expand(len(index), window)
         relation = self.motion.past_relation
-        return index, present, Shared.of(relation.look_up(described, relation.table()))
+        told = describe_pairs(relation, relation.table(), pose, pose[index], ago=ago)
+        return index, present, Shared.of(told)
 
 
 def _entries(
@@ -243,10 +248,14 @@ def _entries(
     asked: Rows,
     rows: Rows,
     raw: Tensor,
+    shown: Tensor,
     roads: MapFeatures,
     density: Density | None,
 ) -> InsertionOutputs:
-    """Ask for the inserted agents of every token, each slot seeing those before it."""
+    """Ask for the inserted agents of every token, each slot seeing those before it.
+
+    Attention sees the features ``shown``: the raw ones, turned if features are.
+    """
     agents, entries = batch.agents, batch.entries
     alone = Rows(asked.at, asked.number.flatten()[:, None])
     ego_pose = agents.pose[:, :, EGO]
@@ -261,7 +270,7 @@ def _entries(
     slot = torch.arange(entries.agent.shape[2], device=raw.device)[:, None]
     turn = asked.pack(agents.turn).gather(1, around.place)[:, None]  # [N, 1, K]
     cell = asked.pack(agents.cell).gather(1, around.place)[:, None]
-    seen = around.seen(raw)
+    seen = around.seen(shown)
     seen = replace(seen, present=seen.present[:, None] & (turn < slot))
     occupied = stack.occupied(cell.expand_as(seen.present), seen.present)
     reach, scene = stack.map_reach(), _count(agents.agent_type)
@@ -288,7 +297,7 @@ def _details(
     batch: Batch,
     wanted: Rows,
     rows: Rows,
-    raw: Tensor,
+    shown: Tensor,
     roads: MapFeatures,
 ) -> DetailOutputs:
     """Describe agents where they enter, without seeing them."""
@@ -299,7 +308,7 @@ def _details(
     pose = cell_pose(ego_pose, stack.query_pose(cell, wanted.pack(details.offset_m)))
     each = Rows(_count(pose), _count(pose)[:, None])
 
-    place = torch.arange(agents.agent_type.shape[1], device=raw.device)
+    place = torch.arange(agents.agent_type.shape[1], device=shown.device)
     turn = wanted.pack(details.turn)[:, None]
     allowed = agents.visible[scene, token] & (agents.turn[scene, token] < turn)
     allowed &= place != wanted.pack(details.agent)[:, None]
@@ -313,7 +322,7 @@ def _details(
     )
     reach = stack.map_reach()
     map_seen = find_map_neighbours(reach, each, pose[:, None], roads, scene)
-    x = stack(cell, map_seen, around.seen(raw))
+    x = stack(cell, map_seen, around.seen(shown))
     agent_type = wanted.pack(details.agent_type)
     return stack.answer(wanted, x, agent_type, pose, CellSources.near(roads, map_seen))
 

@@ -83,6 +83,9 @@ class RelationEmbedding(FourierEmbedding):
         with torch.autocast(self.frequency.weight.device.type, enabled=False):
             return torch.cat([self._nodes(i, span) for i, span in enumerate(self.spans)])
 
+    def turn(self, pose: Tensor, token: Tensor | float = 0.0) -> None:
+        """Return by what features are turned: by nothing, unlike ``RotaryRelation``."""
+
     def _nodes(self, number: int, span: Span) -> Tensor:
         device = self.frequency.weight.device
         at = torch.linspace(span.first, span.last, span.nodes, device=device)

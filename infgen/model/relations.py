@@ -14,6 +14,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from infgen.model.relation_tables import RelationEmbedding, Span
+from infgen.model.rotary.coordinates import coordinates
+from infgen.model.rotary.relation import RotaryRelation
 from infgen.model.settings import ModelSettings
 
 BLOCK_PAIRS = 1 << 17
@@ -25,6 +27,9 @@ SQUARE_PER_M2 = 1024
 INDEX_BITS = 20
 NO_DIRECTION_M = 0.01
 """Nearer points have no direction: rounding would decide it."""
+
+Relation = RelationEmbedding | RotaryRelation
+"""How one family of relative poses is told."""
 
 _NOBODY = 1 << 62
 
@@ -227,14 +232,48 @@ def across(
     return left_m[..., None]
 
 
+def describe_pairs(
+    relation: Relation,
+    table: Tensor,
+    target_pose: Float32[Tensor, "target 3"],
+    source_pose: Float32[Tensor, "target neighbour 3"],
+    *,
+    ago: Float32[Tensor, "target neighbour"] | None = None,
+    lateral: bool = False,
+) -> Float32[Tensor, "target neighbour feature"]:
+    """Describe how neighbours stand to their targets, as attention reads it.
+
+    Args:
+        relation: Of this family of relations ...
+        table: ... and its table.
+        target_pose: Poses of targets.
+        source_pose: Poses of the neighbours of each.
+        ago: Token steps since the neighbours' times, negative, if they differ.
+        lateral: Whether relations end in ``across``.
+    """
+    if isinstance(relation, RotaryRelation):
+        return coordinates(target_pose, source_pose, ago)
+    described = relations(target_pose, source_pose)
+    if ago is not None:
+        described = torch.cat([described, ago[..., None]], dim=-1)
+    if lateral:
+        described = torch.cat([described, across(target_pose, source_pose)], dim=-1)
+    return relation.look_up(described, table)
+
+
+def turn_of_rows(relation: Relation, rows: Rows, pose: Tensor) -> Tensor | None:
+    """By what the features of rows are turned, given padded poses; None if by nothing."""
+    return relation.turn(rows.pack(pose)) if isinstance(relation, RotaryRelation) else None
+
+
 def relation_embedding(
     radius_m: float,
     settings: ModelSettings,
     past_tokens: int = 0,
     *,
     across: bool = False,
-) -> RelationEmbedding:
-    """Make the embedding of one family of relations.
+) -> Relation:
+    """Make what tells one family of relations.
 
     Args:
         radius_m: Largest distance that its table resolves.
@@ -242,6 +281,8 @@ def relation_embedding(
         past_tokens: If not 0, relations end in a time difference of -1 to so many tokens.
         across: Whether they end in ``across``.
     """
+    if settings.relations == "rotary":
+        return RotaryRelation(settings.width)
     turn = Span(-math.pi, math.pi, ANGLE_NODES, closed=True)
     nodes = math.ceil(radius_m / DISTANCE_STEP_M) + 1
     spans = [Span(0.0, radius_m, nodes), turn, turn]

@@ -1,9 +1,14 @@
 """Settings of the network: sizes, radii, and which parts it has."""
 
+from typing import Literal
+
 from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
 from infgen.settings import RULES, AtLeastOne, Bool, Count, NonNegative, Share
+
+NUM_COORDINATES = 12
+"""Numbers that tell the relative pose of a pair with ``relations=rotary``."""
 
 
 @dataclass(frozen=True, slots=True, config=RULES)
@@ -20,6 +25,10 @@ class ModelSettings:
     """Blocks of the motion stack."""
     scene_blocks: Count = 3
     """Blocks of the scene stack."""
+    relations: Literal["features", "rotary"] = "features"
+    """How attention is told relative poses: by features of every pair of neighbours, as in
+    the paper, or by turning the features of both by their headings and times, beside a few
+    coordinates of each pair that are not learned."""
     relation_width: Count = 0
     """Width of the features of relative poses, which cost most of all: there are as many
     as pairs of neighbours; 0 for that of all other features, as in the paper."""
@@ -97,7 +106,9 @@ class ModelSettings:
 
     @property
     def relation_features(self) -> int:
-        """Width of the features of relative poses."""
+        """Numbers that tell the relative pose of a pair of neighbours."""
+        if self.relations == "rotary":
+            return NUM_COORDINATES
         return self.relation_width or self.width
 
     @model_validator(mode="after")
@@ -106,9 +117,25 @@ class ModelSettings:
             raise ValueError(
                 f"width is {self.width}; expected a multiple of heads ({self.heads})"
             )
+        if self.relations == "rotary":
+            self._check_rotary()
         if self.signal_ahead_m and not self.signals_each_step:
             raise ValueError(
                 f"signal_ahead_m is {self.signal_ahead_m:g}, which needs "
                 "signals_each_step=true; set that as well, or signal_ahead_m=0"
             )
         return self
+
+    def _check_rotary(self) -> None:
+        if self.width % 2:
+            raise ValueError(
+                f"width is {self.width}; expected an even number with relations=rotary, "
+                "which turns features two numbers at a time"
+            )
+        if self.relation_width or self.map_agent_lateral_offset:
+            raise ValueError(
+                f"relation_width is {self.relation_width} and map_agent_lateral_offset is "
+                f"{self.map_agent_lateral_offset}; expected 0 and False with "
+                "relations=rotary, whose coordinates have a width of their own and include "
+                "the lateral offset"
+            )

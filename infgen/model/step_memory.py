@@ -11,6 +11,7 @@ from infgen.model.layers import AttentionSources
 from infgen.model.long_memory import AVERAGED_TOKENS, Standing, next_averages
 from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import MapFeatures
+from infgen.model.rotary.turns import multiples, turn_of, turned
 from infgen.model.settings import ModelSettings
 from infgen.model.token_step import TokenStep
 
@@ -29,7 +30,9 @@ class StepMemory:
             rollouts that took the place of others.
         pose: Poses of past columns [rollout, row, place, 3].
         visible: Rows visible in them, with the same agent as now [rollout, row, place].
-        features: Normed features of them before each block [block, rollout, row, place, D].
+        features: Normed features of them before each block, turned by their headings and
+            columns if features are [block, rollout, row, place, D].
+        rotary: Whether they are.
         average: Moving averages of the number of agents around egos [rollout, constant].
         standing: For how long agents have stood [rollout, row], if that is used.
     """
@@ -41,6 +44,7 @@ class StepMemory:
     pose: Tensor
     visible: Tensor
     features: Tensor
+    rotary: bool
     average: Tensor
     standing: Standing | None
 
@@ -60,6 +64,7 @@ class StepMemory:
             pose=pose,
             visible=visible,
             features=pose.new_zeros((settings.motion_blocks, *shape, settings.width)),
+            rotary=settings.relations == "rotary",
             average=pose.new_zeros((len(scene), len(AVERAGED_TOKENS))),
             standing=Standing.unknown(visible[:, :, 0])
             if settings.standing_features
@@ -100,10 +105,19 @@ class StepMemory:
         self.begun[rollouts] = self.columns - others.columns
         self.pose[rollouts] = others.pose.roll(turn, dims=2)
         self.visible[rollouts] = others.visible.roll(turn, dims=2)
-        self.features[:, rollouts] = others.features.roll(turn, dims=3)
+        self.features[:, rollouts] = self._at_own_times(others).roll(turn, dims=3)
         self.average[rollouts] = others.average
         if self.standing is not None and others.standing is not None:
             self.standing.put(rollouts, others.standing)
+
+    def _at_own_times(self, others: "StepMemory") -> Tensor:
+        """Features of others, turned as if their last columns were the last ones here."""
+        if not self.rotary:
+            return others.features
+        later, features = float(self.columns - others.columns), others.features
+        still = features.new_zeros(3, dtype=torch.float32)
+        of_each = multiples(features.shape[-1]).to(still.device)
+        return turned(features, turn_of(still, of_each, later))
 
     def with_rows(self, rows: int) -> "StepMemory":
         """Append free rows, up to so many."""
@@ -137,7 +151,8 @@ class Insertions:
         standing: For how long the agents had stood before it [rollout, row], if that is
             used.
         token_step: The agents so far.
-        raw: Normed embeddings of all rows, zero in free rows [rollout, row, D].
+        raw: Normed embeddings of all rows, turned by their headings if features are, zero
+            in free rows [rollout, row, D].
         relation: How all rows stand to the ego [rollout, row, R].
         within: Which of them the ego's query sees [rollout, row].
         roads: Map tokens around the ego.
@@ -182,8 +197,10 @@ class Insertions:
     def agents(self) -> AttentionSources:
         """Show every ego that goes on the agents around it."""
         relation = Shared.of(self.active(self.relation))
-        within = self.active(self.within)
-        return AttentionSources(self.raw.flatten(0, 1), self.rows(), relation, within)
+        within, turn = self.active(self.within), self.roads.turn  # The ego's, as of roads.
+        turn = None if turn is None else self.active(turn)
+        features = self.raw.flatten(0, 1)
+        return AttentionSources(features, self.rows(), relation, within, turn)
 
     def around(self) -> tuple[AttentionSources, Tensor | None]:
         """Return the map tokens, and the features of cells, around these egos."""

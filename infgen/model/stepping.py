@@ -42,7 +42,8 @@ from infgen.model.neighbours import (
     find_neighbours,
 )
 from infgen.model.network import EGO, Network
-from infgen.model.relations import Rows, relations, within_radius
+from infgen.model.relations import Rows, describe_pairs, within_radius
+from infgen.model.rotary.turns import turned, turned_back
 from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.token_step import InsertionDetails, MotionStep, PositionOutputs, TokenStep
 from infgen.tokens.scene_tokens import Presence
@@ -140,9 +141,13 @@ class Stepper:
         ring = torch.arange(memory.window, device=visible.device)
         past_index = rows.at[:, None] * memory.window + ring
         for block, past in zip(motion.blocks, memory.features, strict=True):
-            before = normed(x)
+            before = turned(normed(x), sight.past_turn)
             own = AttentionSources(
-                past.flatten(0, 2), past_index, sight.past_relation, sight.past_present
+                past.flatten(0, 2),
+                past_index,
+                sight.past_relation,
+                sight.past_present,
+                sight.past_turn,
             )
             x = block(x, own, sight)
             past.flatten(0, 1)[rows.at, place] = before.to(past.dtype)
@@ -228,11 +233,11 @@ class Stepper:
         came = fresh.spread(some)
         before = entries.before, entries.known
         standing = standing_after(entries.standing, *before, token_step)
-        embedded = normed(self._embed(*before, standing, token_step, fresh))
         ego_pose = token_step.pose[:, EGO, None].expand_as(token_step.pose)
-        described = relations(fresh.pack(ego_pose), fresh.pack(token_step.pose)[:, None])
-        reach = self._asked().cell_agents
-        related = reach.relation.look_up(described, reach.table)[:, 0]
+        reach, pose = self._asked().cell_agents, fresh.pack(token_step.pose)
+        related = reach.describe(fresh.pack(ego_pose), pose[:, None]).values[:, 0]
+        embedded = normed(self._embed(*before, standing, token_step, fresh))
+        embedded = turned(embedded, reach.relation.turn(pose))
         within = came & within_radius(ego_pose, token_step.pose, reach.radius_m)
         for kept, new in ((entries.raw, embedded), (entries.relation, related)):
             flat = kept.flatten(0, 1)
@@ -311,7 +316,8 @@ class Stepper:
             return None
         row = torch.arange(token_step.presence.numel(), device=token_step.pose.device)
         there = token_step.visible & (token_step.presence != int(Presence.INSERTED))
-        features = entries.raw.flatten(0, 1)
+        turn = self._asked().cell_agents.relation.turn(token_step.pose)
+        features = turned_back(entries.raw, turn).flatten(0, 1)
         lying = CellSources(
             features, row.view_as(token_step.presence), token_step.pose, there
         )
@@ -382,14 +388,13 @@ class Stepper:
         )
         place = torch.arange(memory.window, device=visible.device)
         ago = (place - memory.columns) % memory.window - memory.window  # -window ... -1
-        described = relations(pose, rows.pack(memory.pose))
-        ago = ago.to(described.dtype).expand(len(rows.at), -1)[..., None]
-        related = self.network.motion.past_relation.look_up(
-            torch.cat([described, ago], dim=-1), self._past_table
-        )
+        relation, past_pose = self.network.motion.past_relation, rows.pack(memory.pose)
+        ago = ago.to(pose.dtype).expand(len(rows.at), -1)
+        related = describe_pairs(relation, self._past_table, pose, past_pose, ago=ago)
+        turn = relation.turn(pose, float(memory.columns))
         past = rows.pack(memory.visible)
         density = None
         if self.network.settings.density_features:
             count = self._count(token_step)
             density = Density(count, memory.averages_before(count)).take(rollout)
-        return AgentContext(Shared.of(related), past, roads, around, light, density)
+        return AgentContext(Shared.of(related), past, turn, roads, around, light, density)

@@ -66,6 +66,7 @@ VARIANTS = {
         "map_agent_lateral_offset": False,
     },
     "narrow relations": {"relation_width": 6},
+    "rotary": {"relations": "rotary", "map_agent_lateral_offset": False},
     "long memory": {"density_features": True, "standing_features": True},
     "smart with patterns": {
         "insertion_and_removal": False,

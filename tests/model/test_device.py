@@ -44,7 +44,9 @@ def learned(network, batch, *, together, bf16=False):
     return loss.detach(), found
 
 
-@pytest.mark.parametrize("variant", ["full", "the paper's", "narrow relations", "smart"])
+@pytest.mark.parametrize(
+    "variant", ["full", "the paper's", "narrow relations", "smart", "rotary"]
+)
 def test_launched_together_a_network_learns_what_it_learns_part_by_part(variant, limits):
     torch.manual_seed(1)
     settings = replace(TINY, **VARIANTS[variant])

@@ -18,6 +18,7 @@ from infgen.model.layers import (
     normed,
 )
 from infgen.model.neighbour_attention import Shared
+from infgen.model.rotary.turns import multiples, turn_of, turned_back
 from infgen.model.settings import ModelSettings
 
 WIDTH, HEADS, SOURCES = 16, 2, 9
@@ -33,7 +34,10 @@ def plain_attention(layer, target, seen, relation):
     def affine(norm, x):
         return x * norm.weight + norm.bias
 
-    x = affine(source, seen.features[seen.index])
+    seen_from_here = seen.features[seen.index]
+    if seen.turn is not None:
+        seen_from_here = turned_back(seen_from_here, seen.turn[:, None])
+    x = affine(source, seen_from_here)
     r = affine(layer.norm_relation, relation)
     key = (layer.key(x) + layer.relation_key(r)).unflatten(-1, split)
     value = (layer.value(x) + layer.relation_value(r)).unflatten(-1, split)
@@ -76,11 +80,14 @@ def make_seen(targets, slots, neighbours, relation_width=WIDTH):
 @pytest.mark.parametrize("bipartite", [False, True])
 @pytest.mark.parametrize("slots", [1, 3])
 @pytest.mark.parametrize("relation_width", [WIDTH, 6])
+@pytest.mark.parametrize("rotary", [False, True])
 def test_factorised_attention_is_the_plain_one_and_so_are_its_gradients(
-    bipartite, slots, relation_width
+    bipartite, slots, relation_width, rotary
 ):
     layer = make_layer(bipartite, relation_width)
     seen, relation = make_seen(5, slots, 7, relation_width)
+    if rotary:
+        seen = replace(seen, turn=turn_of(torch.randn(5, 3), multiples(WIDTH), 3.0))
     target = torch.randn(5, slots, WIDTH, requires_grad=True)
     inputs = [target, seen.features, relation, *layer.parameters()]
 

@@ -48,11 +48,13 @@ def renamed(crossing, start):
     return build
 
 
+@pytest.mark.parametrize("relations", ["features", "rotary"])
 @pytest.mark.parametrize("after", [0, 3])
 def test_a_replaced_rollout_goes_as_it_would_alone(
-    crossing, start, simulator, renamed, after
+    crossing, start, simulator, renamed, after, relations
 ):
-    playing, other = simulator(**LIVELY), renamed("other", speed_mps=8.0)
+    playing = simulator({"relations": relations}, **LIVELY)
+    other = renamed("other", speed_mps=8.0)
     session = Session(playing, [start(crossing(), at) for at in range(3)])
     alone = Session(playing, other)
     for _ in range(after):

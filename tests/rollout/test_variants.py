@@ -25,6 +25,7 @@ VARIANTS = {
     "no heading token": {"heading_token": False},
     "no leave, no cell token": {"remove_token": False, "position_token": False},
     "patterns": {"validity_pattern_tokens": True},
+    "rotary": {"relations": "rotary"},
 }
 FASTEST_M = 20.0
 """The longest move of the vocabulary of these tests."""

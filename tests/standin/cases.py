@@ -243,6 +243,10 @@ SIZES = ("width", "heads", "map_blocks", "motion_blocks", "scene_blocks", "fouri
 VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "paper": ({}, {}),
     "features": (FEATURES, {"motion_noise_neighbours": 5, "map_noise_neighbours": 3}),
+    "rotary": (
+        {**FEATURES, "relations": "rotary", "map_agent_lateral_offset": False},
+        {"motion_noise_neighbours": 5},
+    ),
     "closed-loop": (FEATURES, {"closed_loop_top_k": 4}),
     "closed-loop-population": (
         {**FEATURES, "density_features": True, "standing_features": True},

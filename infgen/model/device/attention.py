@@ -24,6 +24,7 @@ from torch.autograd.function import once_differentiable
 from infgen.model.device.folding import ALIGNED, Folded, fold
 from infgen.model.layers import Attention, AttentionSources, normed
 from infgen.model.neighbour_attention import HIDDEN_SCORE, Shared
+from infgen.model.rotary.turns import turned, turned_back
 
 FULL_BYTES = 4
 """Of a float32; numbers of fewer bytes are products only."""
@@ -50,10 +51,10 @@ def attend(
     """Update targets [N, D] or [N, S, D] as the block does.
 
     A block without a norm for sources is one whose sources are its targets, in one order:
-    these are normed already.
+    these are normed already, unless they are turned as well.
     """
     slots = target if target.dim() == 3 else target[:, None]
-    alike = block.norm_source is None
+    alike = block.norm_source is None and seen.turn is None
     normal = seen.features[:, None] if alike else normed(slots)
     looked = _look(block, folded, normal, seen)
     slots = slots + block.norm_out(block.out(looked).view_as(slots))
@@ -81,7 +82,7 @@ def _look(
         *(normal_NSD.flatten(0, 1).to(kind), *folded[:6]),
         *(seen.features.to(kind), seen.index),
         *(relation.of_kind(kind), relation.ticket, relation.pulled),
-        *(cover, blind, _dropped(block)),
+        *(cover, blind, _dropped(block), seen.turn),
     )
     return looked
 
@@ -122,16 +123,18 @@ class _Look(torch.autograd.Function):
         cover: Tensor,
         blind: Tensor,
         share: float,
+        turn: Tensor | None,
     ) -> Tensor:
         heads, both = len(wide), wide.shape[2]
         with torch.autocast(normal.device.type, enabled=False):
             asked = _heads(torch.addmm(query_bias, normal, query.T), heads)
             by_both = normal.new_empty((*asked.shape[:2], both))
             torch.bmm(asked.transpose(0, 1), wide, out=by_both.transpose(0, 1))
-            by_both = by_both.view(len(index), -1, both)
+            by_both = _turned_first(by_both.view(len(index), -1, both), turn)
             weight, kept, looked = _weigh(
                 by_both, features, index, relation, (cover, blind), share
             )
+            looked = _turned_first(looked, turn, back=True)
             each = looked.view(-1, heads, looked.shape[2]).transpose(0, 1)
             saw = torch.bmm(each, value).transpose(0, 1)
             joined = torch.cat([saw, _heads(normal, heads)], dim=1).flatten(1)
@@ -140,7 +143,7 @@ class _Look(torch.autograd.Function):
             found = torch.addcmul(joined.chunk(2, dim=1)[0], opened, between)
         ctx.save_for_backward(
             query, wide, value, gate, features, index, relation,
-            asked, by_both, weight, kept, looked, joined, opened, between,
+            asked, by_both, weight, kept, looked, joined, opened, between, turn,
         )  # fmt: skip
         ctx.pulled, ctx.share = pulled, share
         return found
@@ -150,7 +153,7 @@ class _Look(torch.autograd.Function):
     def backward(ctx: Any, pull: Tensor) -> tuple[Tensor | None, ...]:
         (
             query, wide, value, gate, features, index, relation,
-            asked, by_both, weight, kept, looked, joined, opened, between,
+            asked, by_both, weight, kept, looked, joined, opened, between, turn,
         ) = ctx.saved_tensors  # fmt: skip
         heads, width = len(wide), pull.shape[1]
         with torch.autocast(pull.device.type, enabled=False):
@@ -167,11 +170,15 @@ class _Look(torch.autograd.Function):
 
             shared = ctx.pulled if ctx.needs_input_grad[10] else None
             to_both, to_features = _pull_pairs(
-                to_looked, by_both, (features, index, relation), (weight, kept), ctx.share,
+                _turned_first(to_looked, turn),
+                by_both,
+                (features, index, relation),
+                (weight, kept),
+                ctx.share,
                 shared,
-            )  # fmt: skip
+            )
             of_heads = (-1, heads, by_both.shape[2])
-            to_both = to_both.view(of_heads).transpose(0, 1)
+            to_both = _turned_first(to_both, turn, back=True).view(of_heads).transpose(0, 1)
             to_asked = torch.empty_like(asked)
             torch.bmm(to_both, wide.mT, out=to_asked.transpose(0, 1))
             to_wide = torch.bmm(asked.permute(1, 2, 0), to_both)
@@ -181,8 +188,20 @@ class _Look(torch.autograd.Function):
                 torch.addmm(to_normal, to_asked, query),
                 *(to_asked.T @ normal, to_asked.sum(dim=0), to_wide, to_value),
                 *(through.T @ joined, through.sum(dim=0), to_features, None),
-                *(None, None, None, None, None, None),
+                *(None, None, None, None, None, None, None),
             )
+
+
+def _turned_first(
+    values_NQE: Tensor, turn_NP: Tensor | None, *, back: bool = False
+) -> Tensor:
+    """Turn the first numbers of values, those of features, in place; or turn them back."""
+    if turn_NP is None:
+        return values_NQE
+    first, turn = values_NQE[..., : 2 * turn_NP.shape[-1]], turn_NP[:, None]
+    turns = turned_back if back else turned
+    first.copy_(turns(first.contiguous(), turn))
+    return values_NQE
 
 
 def _heads(values_TD: Tensor, heads: int) -> Tensor:

@@ -22,6 +22,7 @@ VARIANTS = {
     "regressed positions": ({"position_token": False}, {}),
     "regressed headings": ({"heading_token": False}, {"position_top_p": 0.9}),
     "features": ({"cell_feature_width": 8, "ego_embedding": True}, {}),
+    "rotary": ({"relations": "rotary", "cell_feature_width": 8}, {}),
 }
 
 

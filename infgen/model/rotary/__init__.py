@@ -1,0 +1,1 @@
+"""Relative poses without features of their own: rotary embedding, and coordinates."""
