@@ -23,8 +23,9 @@ from own_process import Usage, measure
 
 STEPS = Path(__file__).with_name("census_steps.py")
 GOALS = {"cpu_s": 10.0, "peak_mib": 1024.0}
-EXEMPT = ("verify", "dask")
-"""``verify`` looks at every file; Dask's tasks are looked at one by one."""
+EXEMPT = ("verify", "dask", "probe")
+"""``verify`` looks at every file, Dask's tasks are looked at one by one, and a probe runs
+every stage of three methods."""
 STEEPER = 1.5
 """A further scene may cost so many times what one of a smaller root cost."""
 NOISE_S = 1.0
@@ -126,6 +127,8 @@ def measure_root(root: Root) -> None:
     records = ("--records", str(root.folder / "records"), "--profile", "tiny")
     at = ("--root", str(root.folder / "root"))
     root.command("plan, nothing made", "plan", *at, *records)
+    for name in ("probe of plan --preset", "plan --preset, probed before"):
+        root.command(name, "plan", "--preset", "paper", *at, *records)
     for stage in GATHERED:
         _make_stage(root, stage, at)
         if stage == "tokenize":

@@ -21,6 +21,7 @@ import polars as pl
 from infgen.scene import Scene
 from infgen.sources.tfrecord import frame
 from infgen.sources.womd_write import encode_scenario
+from pipeline.comparison.probe import RECORDS_EACH
 from pipeline.engine.atomic import MANIFEST
 from pipeline.engine.inputs import FinishedInputs
 from pipeline.engine.layout import RUN
@@ -86,15 +87,19 @@ def scenario_id(split: str, file: int, record: int) -> str:
 def write_records(folder: Path, census: Census, scene: Scene) -> None:
     """Write TFRecords: whole scenes in the first of each split, a few bytes in the others.
 
-    Only those of the first are ever decoded; fingerprints tell all of them apart.
+    Stages only ever decode those of the first, and the probe of ``plan --preset`` the first
+    records of any file; fingerprints tell all of them apart.
     """
     folder.mkdir(parents=True)
-    placed = encode_scenario(replace(scene, scenario_id="x" * ID_DIGITS))
+    blank = b"x" * ID_DIGITS
+    placed = encode_scenario(replace(scene, scenario_id=blank.decode()))
     for split, files in census.files.items():
         for file in range(files):
-            body = placed if file == 0 else b"x" * ID_DIGITS
+            whole = census.scenes_per_file[split] if file == 0 else RECORDS_EACH
             records = (
-                body.replace(b"x" * ID_DIGITS, scenario_id(split, file, row).encode(), 1)
+                (placed if row < whole else blank).replace(
+                    blank, scenario_id(split, file, row).encode(), 1
+                )
                 for row in range(census.scenes_per_file[split])
             )
             path = folder / f"{split}.tfrecord-{file:05d}-of-{files:05d}"
@@ -114,12 +119,14 @@ def populate(request: Request, plan: Plan, stage: str, scenes_per_unit: int) -> 
     units = planned.stage.plan(FinishedInputs(request.root, planned), planned.settings)
     tasks = make_tasks(request.root, planned, units)
     request.root.units(stage).mkdir(parents=True, exist_ok=True)
-    first: dict[str, _Template] = {}
+    first: dict[tuple[str, bool], _Template] = {}
     for task in tasks:
-        template = first.get(split_of(task.unit.name))
+        # Stage ``score`` has units of whole files, and of some scenes of a file.
+        kind = split_of(task.unit.name), "rollouts" in task.unit.task
+        template = first.get(kind)
         if template is None:
             do(task, _say_nothing)
-            first[split_of(task.unit.name)] = _Template(task, scenes_per_unit)
+            first[kind] = _Template(task, scenes_per_unit)
         else:
             template.copy(task)
     return len(tasks)

@@ -15,8 +15,8 @@ from pathlib import Path
 
 from pipeline.comparison.estimate import S_PER_HOUR, estimate
 from pipeline.comparison.probe import probe
-from pipeline.comparison.runs import ArmRun, Comparison, arm_runs_of
-from pipeline.comparison.workload import workload
+from pipeline.comparison.runs import SCORE, ArmRun, Comparison, arm_runs_of
+from pipeline.comparison.workload import SCORED_LOGS, workload
 from pipeline.engine.events import Events
 from pipeline.engine.layout import Root
 from pipeline.engine.runner import RunOptions, run
@@ -60,7 +60,8 @@ def estimated_s(comparison: Comparison, arm_runs: list[ArmRun]) -> dict[str, flo
     measured = probe(comparison, arm_runs, records, tell=lambda run: None)
     found: dict[str, float] = defaultdict(float)
     for each in estimate(workload(comparison, arm_runs, measured.splits), measured.costs):
-        found[each.stage] += each.hours * S_PER_HOUR
+        stage = SCORE if each.stage == SCORED_LOGS else each.stage
+        found[stage] += each.hours * S_PER_HOUR
     return found
 
 

@@ -2,9 +2,10 @@
 
 Each file is a unit of work with its folder, manifest and syncs. The promise: 1,001 files of
 60 tiny scenes within five minutes on two cores, which is 0.6 seconds of a core for a unit.
-Fewer files are measured, and 1,001 extrapolated in proportion.
+Where fewer files are measured, 1,001 are extrapolated in proportion.
 
     python benchmarks/ingest_files.py [--files 40]
+    python benchmarks/ingest_files.py --files 1001 --dask local:2  # the promise itself
 """
 
 import argparse
@@ -32,13 +33,16 @@ def main() -> None:
     """Measure, print a table, and last one line of JSON."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--files", type=int, default=40)
-    files = parser.parse_args().files
+    parser.add_argument("--dask", default="none", help="Workers, as of infgen run.")
+    asked = parser.parse_args()
+    files = asked.files
     with tempfile.TemporaryDirectory(prefix="infgen-bench-") as name:
         folder = Path(name)
         write_files(folder / "records", files)
-        words = ["-m", "cli", "ingest", str(folder / "records"), "--root"]
-        used = measure([*words, str(folder / "root")], folder)
-        start = measure([*words, str(folder / "root")], folder)  # All is made: only looks.
+        words = ["-m", "cli", "ingest", str(folder / "records")]
+        words += ["--root", str(folder / "root"), "--dask", asked.dask]
+        used = measure(words, folder)
+        start = measure(words, folder)  # All is made: it only looks.
         units = folder / "root" / "store" / "ingest" / "units"
         each = sum(path.is_file() for path in units.rglob("*")) / files
     cpu_s = (used.cpu_s - start.cpu_s) / files
@@ -46,7 +50,11 @@ def main() -> None:
     figures = {
         "files": files,
         "scenes_per_file": SCENES,
-        "files_per_unit": each,
+        "files_per_unit": round(each, 2),
+        "dask": asked.dask,
+        "cpu_s": round(used.cpu_s, 1),
+        "wall_s": round(used.wall_s, 1),
+        "peak_mib": round(used.peak_mib),
         "cpu_s_per_unit": round(cpu_s, 3),
         "wall_s_per_unit": round(wall_s, 3),
         "cpu_s_of_1001": round(WANTED * cpu_s, 1),

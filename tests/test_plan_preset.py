@@ -37,7 +37,8 @@ def test_a_probe_is_made_once_and_leaves_nothing_but_its_figures(infgen):
     assert code == 0, err
     told = json.loads(out)
     assert {each["stage"] for each in told["stages"]} == {
-        *("ingest", "build-vocab", "tokenize", "train", "reference", "rollout", "score")
+        *("ingest", "build-vocab", "tokenize", "train", "reference", "rollout", "score"),
+        "score of logs",
     }
     assert all(each["hours"] > 0 and each["files"] > 0 for each in told["stages"])
     assert told["probe"]["splits"]["training"]["scenes"] == 24

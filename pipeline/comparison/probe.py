@@ -18,8 +18,13 @@ from typing import Any
 
 from infgen.clock import CLOCK
 from infgen.sources.tfrecord import Record, frame
-from pipeline.comparison.runs import ROLLOUT, TRAIN, ArmRun, Comparison
-from pipeline.comparison.workload import Split, count_splits, first_records
+from pipeline.comparison.runs import ROLLOUT, SCORE, TRAIN, ArmRun, Comparison
+from pipeline.comparison.workload import (
+    SCORED_LOGS,
+    Split,
+    count_splits,
+    first_records,
+)
 from pipeline.engine import machine
 from pipeline.engine.atomic import StoreError, write_json
 from pipeline.engine.events import Events
@@ -36,7 +41,10 @@ FILES, RECORDS_EACH = 8, 2
 SAMPLE_FILES = 2
 """Files that they are written to: of every stage the first unit, which loads its code, is
 not counted."""
-PLAYED_SCENES, PLAYED_COUNT, PLAYED_S = 3, 4, 4.0
+PLAYED_SCENES, PLAYED_S = 3, 4.0
+MOST_PLAYED = 16
+"""Rollouts of a scene. As many as the settings say, up to this: they are simulated at once,
+and one of several takes less than one alone."""
 FEW_STEPS, MORE_STEPS = 1, 3
 """Training runs whose difference is that of their steps."""
 SETTINGS = {
@@ -48,7 +56,6 @@ SETTINGS = {
     "calibrate.method": "none",
     "rollout.max_scenes": PLAYED_SCENES,
     "rollout.scenes_per_unit": 1,
-    "rollout.count": PLAYED_COUNT,
 }
 WOSAC = "wosac"
 OWN_FILES = 2
@@ -94,10 +101,13 @@ class Probe:
 def kind(arm_run: ArmRun, stage: str) -> str:
     """Name what costs alike: a stage of a method, whatever the seed.
 
-    An ablation leaves out little of its method, and counts as that.
+    An ablation leaves out little of its method, and counts as that. Logs are scored alike
+    whatever is compared with them.
     """
+    if stage == SCORED_LOGS:
+        return stage
     method = arm_run.arm.ablates or arm_run.arm.name
-    played = stage in (ROLLOUT, "score")
+    played = stage in (ROLLOUT, SCORE)
     return "/".join([stage, method, *([arm_run.rollout_set] if played else [])])
 
 
@@ -126,7 +136,14 @@ def probe(
             "machine": machine.describe(),
             "records": sorted(records.urls),
             "settings": {each.name: _keys(comparison, each) for each in probed},
-            "probe": [FILES, RECORDS_EACH, PLAYED_S, SETTINGS, platform.python_version()],
+            "probe": [
+                FILES,
+                RECORDS_EACH,
+                MOST_PLAYED,
+                PLAYED_S,
+                SETTINGS,
+                platform.python_version(),
+            ],
         }
     )
     known = _read(path, key)
@@ -207,9 +224,22 @@ def _measure(
         whole = replace(_with_steps(sample, MORE_STEPS), targets=comparison.targets)
         _run(whole, arm_run, watched)
         seconds = whole.plan(arm_run)[ROLLOUT].settings.duration_s
-        for name, samples in watched.samples.items():
+        for name, samples in _by_work(watched.samples).items():
             found.setdefault(kind(arm_run, name), _cost(name, samples, seconds))
     return found
+
+
+def _by_work(
+    samples: Mapping[str, Sequence[MeasuredUnit]],
+) -> dict[str, Sequence[MeasuredUnit]]:
+    """Tell the units of stage ``score`` that score logs from those of rollouts."""
+    scored = samples.get(SCORE, ())
+    found = {
+        **samples,
+        SCORE: [sample for sample in scored if "rollouts" in sample.report],
+        SCORED_LOGS: [sample for sample in scored if "logs" in sample.report],
+    }
+    return {name: some for name, some in found.items() if some}
 
 
 def _sample(
@@ -217,9 +247,10 @@ def _sample(
 ) -> Comparison:
     """Let runs be short ones, of the sample."""
     played = comparison.sketch(arm_run)[ROLLOUT].settings
-    # Waymo's protocol fixes the length of its rollouts.
-    short = {} if played.mode == WOSAC else {"rollout.seconds": PLAYED_S}
-    words = (f"{name}={value}" for name, value in (*settings.items(), *short.items()))
+    own = {**settings, "rollout.count": min(played.count, MOST_PLAYED)}
+    if played.mode != WOSAC:  # Waymo's protocol fixes the length of its rollouts.
+        own["rollout.seconds"] = PLAYED_S
+    words = (f"{name}={value}" for name, value in own.items())
     return replace(
         comparison,
         root=Root(folder / "root"),
@@ -304,4 +335,4 @@ def _items(stage: str, report: Mapping[str, Any]) -> int:
     """How many items a unit did."""
     if stage == "build-vocab":
         return int(report["learn"]) + int(report["held-out"])
-    return int(report["rollouts" if stage == "score" else "scenes"])
+    return int(report[{SCORE: "rollouts", SCORED_LOGS: "logs"}.get(stage, "scenes")])

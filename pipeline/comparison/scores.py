@@ -17,10 +17,11 @@ from pipeline.engine.layout import read_json
 from pipeline.engine.manifest import read_manifest
 from pipeline.engine.plan import Plan
 from pipeline.stages.reference_files import read_against, read_binned, read_logged
-from pipeline.stages.score.proper import PROPER, read_proper
+from pipeline.stages.score.gathered import read_means, read_sums
+from pipeline.stages.score.proper import PROPER, proper_numbers, read_parts
 from pipeline.stages.score.summary import Tally
-from pipeline.stages.score.tables import WOSAC
-from pipeline.stages.score.write import read_tally
+from pipeline.stages.score.tables import ROLLOUTS, WOSAC
+from pipeline.stages.score.write import SUMS
 
 REFERENCE = "reference"
 OFFICIAL = "wosac"
@@ -157,18 +158,28 @@ def _plan(ran: ExecutedRun) -> Plan:
 
 def _tally(plan: Plan) -> Tally:
     """Gather what the units of a stage ``score`` tallied, by every protocol."""
-    tally = Tally()
     manifest = read_manifest(plan.root.folder(SCORE, plan[SCORE].key))
-    for unit in finished_units(plan.root, SCORE, manifest):
-        tally.merge(read_tally(unit.path, unit.report["rollouts"]))
-        for one in read_json(unit.path / WOSAC):
+    units = [
+        done
+        for done in finished_units(plan.root, SCORE, manifest)
+        if ROLLOUTS in done.report
+    ]
+    folders = [done.path for done in units]
+    found = read_means(folders)
+    rows = zip(found.scenario_ids, found.values.tolist(), strict=True)
+    means = {scene: dict(zip(found.names, row, strict=True)) for scene, row in rows}
+    for folder in folders:
+        for one in read_json(folder / WOSAC):
             scores = one.get("scores", {})
-            found = {f"{OFFICIAL}/{name}": _or_nan(v) for name, v in scores.items()}
-            tally.means[one["scenario_id"]].update(found)
-        proper = read_proper(unit.path)
-        for scenario_id in proper.parts:
-            tally.means[scenario_id].update(proper.numbers(scenario_id))
-    return tally
+            official = {f"{OFFICIAL}/{name}": _or_nan(v) for name, v in scores.items()}
+            means[one["scenario_id"]].update(official)
+        for scenario_id, parts in read_parts(folder).items():
+            means[scenario_id].update(proper_numbers(parts))
+    return Tally(
+        means=means,
+        rollouts=sum(done.report[ROLLOUTS] for done in units),
+        sums=read_sums(folders, SUMS),
+    )
 
 
 def _numbers(summary: Mapping[str, Any]) -> Iterator[tuple[str, Measured]]:

@@ -1,19 +1,21 @@
 """How much work the runs of a comparison are: scenes, steps, rollouts; nothing is run."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
 from infgen.config import ReferenceSettings, RolloutSettings, TrainSettings, VocabSettings
 from infgen.sources.tfrecord import iter_records
-from pipeline.comparison.runs import TRAIN, ArmRun, Comparison
+from pipeline.comparison.runs import SCORE, TRAIN, ArmRun, Comparison
 from pipeline.engine.plan import PlanError, PlannedStage
 from pipeline.storage.sources.source_files import RawRecords
 from pipeline.storage.splits import split_of
 
 COUNTED_FILES = 2
 """Files of each split whose records are counted; the others count as much as their mean."""
+SCORED_LOGS = "score of logs"
+"""The units of stage ``score`` that score logs; runs with the same settings share them."""
 ITEMS = {
     "ingest": "scenes",
     "build-vocab": "scenes",
@@ -22,7 +24,8 @@ ITEMS = {
     "calibrate": "rollouts",
     "rollout": "rollouts",
     "reference": "scenes",
-    "score": "rollouts",
+    SCORE: "rollouts",
+    SCORED_LOGS: "logs",
 }
 """What the work of a stage is counted in."""
 
@@ -121,6 +124,12 @@ def workload(
                 known.add(key)
                 work = _work(arm_run, plan.stages, planned, splits)
                 found += [work] if work.amount else []
+        if SCORE in plan.stages:
+            key = (SCORED_LOGS, f"{plan['reference'].key} {plan[SCORE].settings}")
+            if key not in known:
+                known.add(key)
+                logs = _work(arm_run, plan.stages, plan["reference"], splits)
+                found.append(replace(logs, stage=SCORED_LOGS))
     return found
 
 

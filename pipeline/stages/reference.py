@@ -1,7 +1,7 @@
 """Stage ``reference``: the logs of a split to what rollouts are scored against.
 
 A unit counts the logs of one ingested file and keeps their bins; ``finish`` adds the counts
-up, and scores the logs themselves under them: the ceiling for any rollout.
+up. Stage ``score`` scores the logs themselves under them: the ceiling for any rollout.
 """
 
 from collections.abc import Mapping, Sequence
@@ -107,17 +107,20 @@ def finish(
     settings: Mapping[str, Any],
     progress: Progress,
 ) -> Report:
-    """Add up the counts of the split, and score its logs under them."""
+    """Add up the counts of the split."""
     from pipeline.stages.reference_tables import gather  # noqa: PLC0415
 
     target.mkdir(parents=True, exist_ok=True)
-    logs = gather([done.path for done in units], target, settings["reference"], progress)
-    return {"logs": logs, "skipped": sum(len(done.report["skipped"]) for done in units)}
+    gather([done.path for done in units], target, settings["reference"])
+    return {
+        "logs": sum(done.report["scenes"] for done in units),
+        "skipped": sum(len(done.report["skipped"]) for done in units),
+    }
 
 
 STAGE = Stage(
     name="reference",
-    version=4,
+    version=5,
     settings={"tokenize": TokenSettings, "reference": ReferenceSettings},
     plan=plan,
     work=work,
@@ -127,6 +130,5 @@ STAGE = Stage(
         "pipeline.stages.reference",
         "pipeline.stages.reference_files",
         "pipeline.stages.reference_tables",
-        "pipeline.stages.score.write",
     ),
 )

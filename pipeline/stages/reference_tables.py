@@ -1,4 +1,4 @@
-"""From the logs of a split to its counts, and to the logs' own scores under them."""
+"""From the counts of each file's logs to those of a split."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -8,45 +8,17 @@ import numpy as np
 from infgen.config import ReferenceSettings
 from infgen.metrics.agent_count import mean_counts
 from infgen.metrics.long_term.reference import add_up
-from infgen.metrics.long_term.table import LogCounts, make_row
+from infgen.metrics.long_term.table import LogCounts
 from infgen.metrics.proper.retrieval import LogCourse, sample_logs
 from infgen.metrics.windows import cut_windows
-from pipeline.engine.stage import Progress
 from pipeline.stages import reference_files as files
-from pipeline.stages.score.summary import Tally
-from pipeline.stages.score.write import ROWS, join_parts, rows_of, write_part, write_tally
-
-LOG_PREFIX = "log/"
-"""Before the metrics of a log that is scored as if it were a rollout."""
 
 
-def gather(
-    units: Sequence[Path], target: Path, settings: ReferenceSettings, progress: Progress
-) -> int:
-    """Add up the units' counts, score their logs, and write both; returns the logs."""
+def gather(units: Sequence[Path], target: Path, settings: ReferenceSettings) -> None:
+    """Add up the units' counts, and write them, mean numbers of agents and a sample."""
     files.write_counts(target, add_up(files.read_counts(unit) for unit in units))
     files.write_means(target, *_means(units, settings))
     files.write_courses(target, sample_logs(_courses(units)))
-    parts = target / "parts"
-    parts.mkdir()
-    tally, paths = Tally(), []
-    for at, unit in enumerate(units):
-        progress(at, len(units), "units scored")
-        against = files.read_against(target, files.read_logged(unit), settings)
-        rows = []
-        for binned in files.read_binned(unit):
-            row = make_row(binned, against)
-            tally.add(binned.scenario_id, row)
-            rows += rows_of(binned.scenario_id, None, row.numbers, LOG_PREFIX)
-        tally.close_unit()
-        paths.append(parts / f"{at:06d}.parquet")
-        write_part(paths[-1], rows)
-    join_parts(paths, target / ROWS)
-    for path in paths:
-        path.unlink()
-    parts.rmdir()
-    write_tally(target, tally)
-    return len(tally.means)
 
 
 def _courses(units: Sequence[Path]) -> Iterator[LogCourse]:

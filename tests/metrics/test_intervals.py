@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from infgen.metrics.intervals import bootstrap, scene_mean
+from infgen.metrics import intervals
+from infgen.metrics.intervals import Bootstrap, bootstrap, scene_mean
 
 
 def same(means):
@@ -47,7 +48,39 @@ def test_hardly_any_scenes_have_no_interval(scenes):
     assert np.isnan(found.mean).all() == (scenes == 0)
 
 
+@pytest.mark.parametrize("scenes", [0, 1, 5])
+def test_no_metrics_have_no_intervals(scenes):
+    found = bootstrap(np.empty((scenes, 0)), same, 50, seed=0)
+
+    assert [len(part) for part in found] == [0, 0, 0]
+
+
 def test_a_metric_that_no_scene_has_stays_without_value():
     found = bootstrap(np.array([[1.0, np.nan]] * 5), same, 50, seed=0)
 
     assert np.isnan([found.mean[1], found.low[1], found.high[1]]).all()
+
+
+def test_intervals_are_those_of_scenes_drawn_again(monkeypatch):
+    monkeypatch.setattr(intervals, "METRICS_AT_ONCE", 2)
+    monkeypatch.setattr(intervals, "DRAWN_AT_ONCE", 40)  # Blocks of few resamples.
+    values = np.random.default_rng(0).normal(size=(12, 5))
+    values[:4, 1], values[3:, 3] = np.nan, np.nan
+    found = bootstrap(values, same, 50, seed=3)
+
+    drawn = np.random.default_rng(3).multinomial(12, np.full(12, 1 / 12), size=50)
+    means = scene_mean(values, drawn.astype(float))
+    low, high = np.nanpercentile(means, [2.5, 97.5], axis=0)
+    np.testing.assert_allclose(found.mean, np.nanmean(values, axis=0))
+    np.testing.assert_allclose(found.low, low)
+    np.testing.assert_allclose(found.high, high)
+
+
+def test_tables_of_as_many_scenes_share_their_draws():
+    values = np.random.default_rng(0).normal(size=(20, 3))
+    shared = Bootstrap(100, seed=7)
+
+    for table in (values, values[:9], values[:, :1]):
+        one, two = shared.interval(table, same), bootstrap(table, same, 100, seed=7)
+        np.testing.assert_array_equal(one.low, two.low)
+        np.testing.assert_array_equal(one.high, two.high)

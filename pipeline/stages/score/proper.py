@@ -26,14 +26,13 @@ from infgen.metrics.proper.scene import (
     SceneScores,
     score_scene,
 )
-from infgen.metrics.proper.split import flatten, part_sizes
 from infgen.metrics.traffic import Traffic, logged_rows, observe_log
 from infgen.metrics.windows import cut_windows
 from infgen.rollout.rollout import Rollout
 from infgen.scene import Scene
 from infgen.spatial.road_edges import RoadEdges
 from pipeline.stages.score.summary import add_sums
-from pipeline.stages.score.write import SUM_SCHEMA, read_sums
+from pipeline.stages.score.write import write_sums
 
 PARTS, SUMS = "proper.parquet", "proper_sums.parquet"
 CURVES = "proper_curves.parquet"
@@ -135,32 +134,16 @@ class ProperTally:
             sums = np.stack([np.where(known, values, 0.0), known.astype(np.float64)])
             self.sums[name] = add_sums(self.sums.get(name, sums[:, :0]), sums)
 
-    def merge(self, other: "ProperTally") -> None:
-        """Take what another unit has tallied."""
-        self.parts |= other.parts
-        for name, sums in other.sums.items():
-            self.sums[name] = add_sums(self.sums.get(name, sums[:, :0]), sums)
 
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Number of values of each part."""
-        ranks = [len(parts["rank/entries"]) for parts in self.parts.values()]
-        return part_sizes(max(ranks, default=1))
-
-    def matrix(self) -> np.ndarray:
-        """Lay all parts side by side [scene, column]."""
-        return flatten(list(self.parts.values()), self.sizes)
-
-    def numbers(self, scenario_id: str) -> dict[str, float]:
-        """Numbers of one scene: those whose mean over scenes means something."""
-        parts = self.parts[scenario_id]
-        found = {f"{PROPER}/{n}": v for n, v in zip(SCORES, parts[MODEL], strict=True)}
-        for part in (PERSISTENCE, CLIMATOLOGY, CONTEXT):
-            values = zip(SCORES, parts[part], strict=True)
-            found |= {f"{PROPER}/{part}/{name}": value for name, value in values}
-        for feature, value in zip(FEATURES, parts[LOG_LIKELIHOOD], strict=True):
-            found[f"{PROPER}/{LOG_LIKELIHOOD}/{feature.name}"] = value
-        return {name: float(value) for name, value in found.items()}
+def proper_numbers(parts: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Numbers of one scene whose mean over scenes means something, from its parts."""
+    found = {f"{PROPER}/{n}": v for n, v in zip(SCORES, parts[MODEL], strict=True)}
+    for part in (PERSISTENCE, CLIMATOLOGY, CONTEXT):
+        values = zip(SCORES, parts[part], strict=True)
+        found |= {f"{PROPER}/{part}/{name}": value for name, value in values}
+    for feature, value in zip(FEATURES, parts[LOG_LIKELIHOOD], strict=True):
+        found[f"{PROPER}/{LOG_LIKELIHOOD}/{feature.name}"] = value
+    return {name: float(value) for name, value in found.items()}
 
 
 def write_proper(folder: Path, tally: ProperTally) -> None:
@@ -171,17 +154,12 @@ def write_proper(folder: Path, tally: ProperTally) -> None:
         for name, values in parts.items()
     ]
     pl.DataFrame(rows, schema=PARTS_SCHEMA, orient="row").write_parquet(folder / PARTS)
-    sums = [
-        (metric, window, float(total), float(count))
-        for metric, values in tally.sums.items()
-        for window, (total, count) in enumerate(values.T)
-    ]
-    pl.DataFrame(sums, schema=SUM_SCHEMA, orient="row").write_parquet(folder / SUMS)
+    write_sums(folder / SUMS, tally.sums)
 
 
-def read_proper(folder: Path) -> ProperTally:
-    """Read what one unit has tallied."""
-    table = pl.read_parquet(folder / PARTS)
+def read_parts(path: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Read the parts of each scene of a unit."""
+    table = pl.read_parquet(path / PARTS)
     values = table["values"].explode().drop_nulls().to_numpy()
     ends = np.cumsum(table["values"].list.len().to_numpy())
     found: dict[str, dict[str, np.ndarray]] = {}
@@ -189,14 +167,14 @@ def read_proper(folder: Path) -> ProperTally:
     names = zip(table["scenario_id"].to_list(), table["part"].to_list(), strict=True)
     for (scenario_id, name), part in zip(names, parts, strict=True):
         found.setdefault(scenario_id, {})[name] = part.astype(np.float64)
-    return ProperTally(parts={**found}, sums=read_sums(folder / SUMS))
+    return found
 
 
-def write_proper_curves(target: Path, tally: ProperTally) -> None:
+def write_proper_curves(target: Path, found: Mapping[str, np.ndarray]) -> None:
     """Write the mean over scenes of every score in every window."""
     rows = [
         (metric, window, float(total / count), int(count))
-        for metric, values in tally.sums.items()
+        for metric, values in found.items()
         for window, (total, count) in enumerate(values.T)
         if count
     ]

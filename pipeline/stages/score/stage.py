@@ -1,7 +1,8 @@
 """Stage ``score``: rollouts to a table of scores, against the reference of their split.
 
-A unit scores the rollouts of one rollout unit, window by window and by the official metric;
-``finish`` only joins what the units wrote.
+A unit scores the rollouts of one rollout unit, window by window and by the official
+metric, or the logs of one file of the split as if they were rollouts; ``finish`` only joins
+what the units wrote.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
-    """One unit per rollout unit.
+    """One unit per file of logs, and one per rollout unit.
 
     Raises:
         ConfigError: if the rollouts are not of the reference's split, or if there is no
@@ -47,7 +48,14 @@ def plan(inputs: Inputs, settings: Mapping[str, Any]) -> list[Unit]:
     logs = {done.name: done for done in inputs.units("reference")}
     identity = inputs.content("reference", "counts.zarr", "means.json", "courses.zarr")
     folder = str(inputs.folder("reference"))
-    units = []
+    units = [
+        Unit(
+            done.name,
+            {"logs": done.key, "reference": identity},
+            {"logs": str(done.path), "reference": folder},
+        )
+        for done in logs.values()
+    ]
     for done in inputs.units("rollout"):
         source = done.name.rsplit("-", 1)[0]
         reads = {"rollouts": done, "scenes": scenes.get(source), "logs": logs.get(source)}
@@ -76,7 +84,19 @@ def _check_split(rollouts: Sequence[FinishedUnit], split: str) -> None:
 def work(
     unit: Unit, target: Path, settings: Mapping[str, Any], progress: Progress
 ) -> Report:
-    """Score all rollouts of some scenes."""
+    """Score all rollouts of some scenes, or some logs."""
+    target.mkdir(parents=True, exist_ok=True)
+    if "rollouts" in unit.task:
+        return _score_rollouts(unit, target, settings, progress)
+    from pipeline.stages.score.logs import score_logs  # noqa: PLC0415
+
+    logs, reference = Path(unit.task["logs"]), Path(unit.task["reference"])
+    return {"logs": score_logs(logs, reference, target, settings["reference"])}
+
+
+def _score_rollouts(
+    unit: Unit, target: Path, settings: Mapping[str, Any], progress: Progress
+) -> Report:
     from pipeline.engine.atomic import write_json  # noqa: PLC0415
     from pipeline.stages.reference_files import (  # noqa: PLC0415
         read_against,
@@ -89,7 +109,6 @@ def work(
     from pipeline.stages.score.write import ROWS, write_part, write_tally  # noqa: PLC0415
     from pipeline.storage.rollouts import read_lights, read_rollouts  # noqa: PLC0415
 
-    target.mkdir(parents=True, exist_ok=True)
     folder, logs = Path(unit.task["rollouts"]), unit.task["logs"]
     logged = read_logged(Path(logs)) if logs else {}
     against = read_against(Path(unit.task["reference"]), logged, settings["reference"])
@@ -179,11 +198,12 @@ class _Scorer:
 
     def rows(self) -> "list[ScoreRow]":
         """Rows of the rollouts, of protocol ``proper``, and of the official metric."""
+        from pipeline.stages.score.proper import proper_numbers  # noqa: PLC0415
         from pipeline.stages.score.write import rows_of  # noqa: PLC0415
 
         found = list(self._rows)
-        for scenario_id in self.proper.parts:
-            found += rows_of(scenario_id, None, self.proper.numbers(scenario_id), "")
+        for scenario_id, parts in self.proper.parts.items():
+            found += rows_of(scenario_id, None, proper_numbers(parts), "")
         for one in self.official:
             prefix = f"{self._settings.wosac_version}/"
             scores = one.get("scores", {})
@@ -293,13 +313,15 @@ def finish(
 
 STAGE = Stage(
     name="score",
-    version=5,
+    version=6,
     settings={"reference": ReferenceSettings, "score": ScoreSettings},
     plan=plan,
     work=work,
     finish=finish,
     modules=(
         "pipeline.stages.reference_files",
+        "pipeline.stages.score.gathered",
+        "pipeline.stages.score.logs",
         "pipeline.stages.score.stage",
         "pipeline.stages.score.proper",
         "pipeline.stages.score.proper_summary",

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from infgen.config import ReferenceSettings, ScoreSettings
-from infgen.metrics.intervals import Interval, bootstrap, scene_mean
+from infgen.metrics.intervals import Bootstrap, Interval, scene_mean
 from infgen.metrics.long_term.protocols import FEATURES, PROTOCOLS
 from infgen.metrics.long_term.table import COMPOSITE, Row, named
 
@@ -80,37 +80,50 @@ class Tally:
             self.means[scenario_id] = dict(zip(rows[0], mean.tolist(), strict=True))
         self._open.clear()
 
-    def merge(self, other: "Tally") -> None:
-        """Take what another unit has tallied."""
-        self.means |= other.means
-        self.rollouts += other.rollouts
-        for name, sums in other.sums.items():
-            self.sums[name] = add_sums(self.sums.get(name, sums[:, :0]), sums)
+    def curves(self) -> dict[str, Curve]:
+        """Mean curves."""
+        return mean_curves(self.sums)
 
-    def names(self) -> list[str]:
-        """All metrics."""
-        return list(next(iter(self.means.values()), {}))
+
+def mean_curves(sums: Mapping[str, np.ndarray]) -> dict[str, Curve]:
+    """Mean curves; buckets and composites follow from the features' curves.
+
+    Args:
+        sums: Sums and counts [value or count, window] by metric.
+    """
+    found = {}
+    for name, (total, count) in sums.items():
+        mean = np.where(count > 0, total / np.where(count > 0, count, 1), np.nan)
+        found[name] = Curve(mean, count)
+    for protocol in PROTOCOLS if found else ():
+        names = [f"{protocol.name}/{feature.name}" for feature in FEATURES]
+        features = np.stack([found[name].value for name in names], axis=-1)
+        rollouts = found[f"{protocol.name}/num_entries"].rollouts
+        for label, value in named(features):
+            name = f"{protocol.name}/{label}"
+            if name not in names:
+                found[name] = Curve(value, ~np.isnan(value) * rollouts)
+    return found
+
+
+class Means(NamedTuple):
+    """Means of scenes.
+
+    Attributes:
+        scenario_ids: Of the scenes.
+        names: Of the metrics.
+        values: Mean over a scene's rollouts [scene, metric]; NaN where it has no value.
+    """
+
+    scenario_ids: list[str]
+    names: list[str]
+    values: np.ndarray
 
     def matrix(self, names: Sequence[str]) -> np.ndarray:
-        """Means [scene, metric], scenes in the order they came."""
-        rows = [[means[name] for name in names] for means in self.means.values()]
-        return np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
-
-    def curves(self) -> dict[str, Curve]:
-        """Mean curves; buckets and composites follow from the features' curves."""
-        found = {}
-        for name, (total, count) in self.sums.items():
-            mean = np.where(count > 0, total / np.where(count > 0, count, 1), np.nan)
-            found[name] = Curve(mean, count)
-        for protocol in PROTOCOLS if found else ():
-            names = [f"{protocol.name}/{feature.name}" for feature in FEATURES]
-            features = np.stack([found[name].value for name in names], axis=-1)
-            rollouts = found[f"{protocol.name}/num_entries"].rollouts
-            for label, value in named(features):
-                name = f"{protocol.name}/{label}"
-                if name not in names:
-                    found[name] = Curve(value, ~np.isnan(value) * rollouts)
-        return found
+        """Means of some metrics [scene, metric]; one scene without any if there is none."""
+        if not self.scenario_ids:
+            return np.full((1, len(names)), np.nan)
+        return self.values[:, [self.names.index(name) for name in names]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,27 +133,32 @@ class Summary:
     Attributes:
         settings: Of the stage.
         reference: How logs and rollouts were measured.
-        tally: Of the rollouts.
-        log_tally: Of the logs, scored as if they were rollouts.
+        draws: How scenes are drawn again.
+        means: Of the rollouts.
+        rollouts: How many there are.
+        log_means: Of the logs, scored as if they were rollouts.
         divergence: Jensen-Shannon, [protocol, feature].
         wosac: Official scores, or why there are none, by scenario id.
     """
 
     settings: ScoreSettings
     reference: ReferenceSettings
-    tally: Tally
-    log_tally: Tally
+    draws: Bootstrap
+    means: Means
+    rollouts: int
+    log_means: Means
     divergence: np.ndarray
     wosac: Mapping[str, Mapping[str, Any]]
 
     def build(self, missing: Sequence[str], skipped: Sequence[str]) -> dict[str, Any]:
         """Everything, JSON-able; a number without a value is null."""
-        names = [n for n in self.tally.names() if n.split("/")[0] not in _PROTOCOL_NAMES]
-        names += [n for n in self.tally.names() if n.endswith("_rate")]
+        every = self.means.names
+        names = [name for name in every if name.split("/")[0] not in _PROTOCOL_NAMES]
+        names += [name for name in every if name.endswith("_rate")]
         return {
-            "scenes": len(self.tally.means),
-            "rollouts": self.tally.rollouts,
-            "logs": len(self.log_tally.means),
+            "scenes": len(self.means.scenario_ids),
+            "rollouts": self.rollouts,
+            "logs": len(self.log_means.scenario_ids),
             "missing_scenes": _some(missing),
             "skipped_logs": _some(skipped),
             "window_s": self.reference.window_s,
@@ -153,31 +171,11 @@ class Summary:
             "wosac": self._official(),
         }
 
-    def report(self, missing: Sequence[str]) -> Gathered:
-        """The few figures that the engine shows."""
-        summary = self.build(missing, ())
-        metametric = summary["wosac"]["scores"].get("metametric", {}).get("mean")
-        ace = summary["numbers"].get("ace/own_near", {}).get("mean")
-        composite = {
-            name: protocol["scores"][COMPOSITE]["mean"]
-            for name, protocol in summary["protocols"].items()
-        }
-        return Gathered(
-            scenes=summary["scenes"],
-            rollouts=summary["rollouts"],
-            logs=summary["logs"],
-            missing=list(missing),
-            composite_paper=composite["paper"],
-            composite_corrected=composite["corrected"],
-            mean_ace=ace,
-            wosac_metametric=metametric,
-        )
-
     def _protocol(self, at: int) -> dict[str, Any]:
         """Scores with intervals and the log's own, and each feature's divergence."""
         protocol = PROTOCOLS[at].name
         names = [f"{protocol}/{feature.name}" for feature in FEATURES]
-        played, logged = (self._bootstrap(t, names, _follow) for t in self._both())
+        played, logged = self._intervals(names, _follow)
         labels = [name for name, _ in named(np.zeros((1, len(FEATURES))))]
         divergence = dict(
             zip([f.name for f in FEATURES], map(_number, self.divergence[at]), strict=True)
@@ -185,7 +183,7 @@ class Summary:
         return {"scores": _entries(labels, played, logged), "divergence": divergence}
 
     def _numbers(self, names: Sequence[str]) -> dict[str, Any]:
-        played, logged = (self._bootstrap(t, names, _same) for t in self._both())
+        played, logged = self._intervals(names, _same)
         return _entries(names, played, logged)
 
     def _official(self) -> dict[str, Any]:
@@ -195,9 +193,7 @@ class Summary:
         names = list(scored[0]) if scored else []
         values = np.array([[s[name] for name in names] for s in scored], dtype=np.float64)
         values = values.reshape(len(scored), len(names))
-        interval = bootstrap(
-            values, _same, self.settings.bootstrap_resamples, self.settings.seed
-        )
+        interval = self.draws.interval(values, _same)
         return {
             "version": self.settings.wosac_version,
             "scenes": len(scored),
@@ -212,15 +208,33 @@ class Summary:
             "scores": _entries(names, interval, None),
         }
 
-    def _both(self) -> tuple[Tally, Tally]:
-        return self.tally, self.log_tally
-
-    def _bootstrap(self, tally: Tally, names: Sequence[str], follow: Any) -> Interval:
-        known = names if tally.means else []
-        values = tally.matrix(known) if known else np.full((1, len(names)), np.nan)
-        return bootstrap(
-            values, follow, self.settings.bootstrap_resamples, self.settings.seed
+    def _intervals(self, names: Sequence[str], follow: Any) -> tuple[Interval, Interval]:
+        """Intervals of what follows from some metrics: of the rollouts and of the logs."""
+        played, logged = (
+            self.draws.interval(means.matrix(names), follow)
+            for means in (self.means, self.log_means)
         )
+        return played, logged
+
+
+def figures(summary: Mapping[str, Any], missing: Sequence[str]) -> Gathered:
+    """The few figures that the engine shows."""
+    metametric = summary["wosac"]["scores"].get("metametric", {}).get("mean")
+    ace = summary["numbers"].get("ace/own_near", {}).get("mean")
+    composite = {
+        name: protocol["scores"][COMPOSITE]["mean"]
+        for name, protocol in summary["protocols"].items()
+    }
+    return Gathered(
+        scenes=summary["scenes"],
+        rollouts=summary["rollouts"],
+        logs=summary["logs"],
+        missing=list(missing),
+        composite_paper=composite["paper"],
+        composite_corrected=composite["corrected"],
+        mean_ace=ace,
+        wosac_metametric=metametric,
+    )
 
 
 _PROTOCOL_NAMES = tuple(protocol.name for protocol in PROTOCOLS)

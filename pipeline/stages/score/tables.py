@@ -1,21 +1,27 @@
-"""From scored units to the tables of the ``score`` stage: small rows, no scoring."""
+"""From scored units to the tables of the ``score`` stage: they are only joined."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from infgen.metrics.intervals import Bootstrap
 from infgen.metrics.long_term.reference import add_up, divergence
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import read_json
 from pipeline.engine.stage import FinishedUnit, Inputs, Progress
 from pipeline.stages.reference_files import read_counts, write_counts
+from pipeline.stages.score.gathered import read_means, read_proper_table, read_sums
 from pipeline.stages.score.proper import CURVES as PROPER_CURVES
-from pipeline.stages.score.proper import ProperTally, read_proper, write_proper_curves
+from pipeline.stages.score.proper import SUMS as PROPER_SUMS
+from pipeline.stages.score.proper import write_proper_curves
 from pipeline.stages.score.proper_summary import summarize
-from pipeline.stages.score.summary import Gathered, Summary, Tally
-from pipeline.stages.score.write import ROWS, join_parts, read_tally, write_curves
+from pipeline.stages.score.summary import Gathered, Summary, figures
+from pipeline.stages.score.write import ROWS, SUMS, join_parts, write_curves
 
+LOGS, ROLLOUTS = "logs", "rollouts"
+"""What a unit scored, in its report."""
 WOSAC = "wosac.json"
+STEPS = 5
 
 
 def gather(
@@ -26,34 +32,40 @@ def gather(
     progress: Progress,
 ) -> Gathered:
     """Join all units, and write the tables of scores and curves, and the summary."""
-    reference = inputs.folder("reference")
-    counts = add_up(read_counts(done.path) for done in units)
+    logs = [done.path for done in units if LOGS in done.report]
+    played = [done for done in units if ROLLOUTS in done.report]
+    folders = [done.path for done in played]
+    join_parts([folder / ROWS for folder in (*logs, *folders)], target / "scores.parquet")
+    progress(1, STEPS, "scores joined")
+    counts = add_up(read_counts(folder) for folder in folders)
     write_counts(target, counts)
-    parts = [folder / ROWS for folder in (reference, *(done.path for done in units))]
-    join_parts(parts, target / "scores.parquet")
-    tally, proper = Tally(), ProperTally()
-    wosac: dict[str, dict[str, Any]] = {}
-    for at, done in enumerate(units):
-        progress(at, len(units), "units gathered")
-        tally.merge(read_tally(done.path, done.report["rollouts"]))
-        proper.merge(read_proper(done.path))
-        wosac |= {one["scenario_id"]: one for one in read_json(done.path / WOSAC)}
-    write_curves(target / "curves.parquet", tally)
-    write_proper_curves(target / PROPER_CURVES, proper)
+    progress(2, STEPS, "counts added up")
+    write_curves(target / "curves.parquet", read_sums(folders, SUMS))
+    proper_sums = read_sums(folders, PROPER_SUMS)
+    write_proper_curves(target / PROPER_CURVES, proper_sums)
+    progress(3, STEPS, "curves added up")
+    draws = Bootstrap(settings["score"].bootstrap_resamples, settings["score"].seed)
     summary = Summary(
         settings=settings["score"],
         reference=settings["reference"],
-        tally=tally,
-        log_tally=read_tally(reference, 0),
-        divergence=divergence(read_counts(reference), counts),
-        wosac=wosac,
+        draws=draws,
+        means=read_means(folders),
+        rollouts=sum(done.report[ROLLOUTS] for done in played),
+        log_means=read_means(logs),
+        divergence=divergence(read_counts(inputs.folder("reference")), counts),
+        wosac={
+            one["scenario_id"]: one
+            for folder in folders
+            for one in read_json(folder / WOSAC)
+        },
     )
-    missing = sorted({scene for done in units for scene in done.report["missing"]})
-    skipped = _skipped(inputs.units("reference"))
-    told = summary.build(missing, skipped)
-    told["proper"] = summarize(proper, settings["score"], settings["reference"])
+    missing = sorted({scene for done in played for scene in done.report["missing"]})
+    told = summary.build(missing, _skipped(inputs.units("reference")))
+    progress(4, STEPS, "intervals of scores")
+    proper = read_proper_table(folders)
+    told["proper"] = summarize(proper, proper_sums, draws, settings["reference"])
     write_json(target / "summary.json", told)
-    return summary.report(missing)
+    return figures(told, missing)
 
 
 def _skipped(logs: Sequence[FinishedUnit]) -> list[str]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.stages.score.summary import Tally
+from pipeline.stages.score.summary import Tally, mean_curves
 
 SCHEMA = {
     "scenario_id": pl.String,
@@ -21,6 +21,7 @@ CURVE_SCHEMA = {
     "value": pl.Float64,
     "rollouts": pl.Int64,
 }
+MEAN_SCHEMA = {"scenario_id": pl.String, "metric": pl.String, "value": pl.Float64}
 SUM_SCHEMA = {**CURVE_SCHEMA, "rollouts": pl.Float64}
 ROWS, SCENES, SUMS = "rows.parquet", "scenes.parquet", "sums.parquet"
 
@@ -52,52 +53,42 @@ def write_part(path: Path, rows: Sequence[ScoreRow]) -> None:
 
 def join_parts(parts: Sequence[Path], target: Path) -> None:
     """Join parts in their order."""
-    empty = pl.LazyFrame(schema=SCHEMA)
-    frames = [pl.scan_parquet(path) for path in parts]
-    pl.concat([empty, *frames]).sink_parquet(target, maintain_order=True)
+    if not parts:
+        pl.DataFrame(schema=SCHEMA).write_parquet(target)
+        return
+    pl.scan_parquet(list(parts)).sink_parquet(target, maintain_order=True)
 
 
 def write_tally(folder: Path, tally: Tally) -> None:
-    """Write the means of each scene (a column per metric) and the sums of each window."""
-    names = tally.names()
-    schema = {"scenario_id": pl.String, **dict.fromkeys(names, pl.Float64)}
+    """Write the means of each scene and the sums of each window.
+
+    All scenes have the same metrics, in the same order.
+    """
     scenes = [
-        (scene, *(means[name] for name in names)) for scene, means in tally.means.items()
+        (scene, name, value)
+        for scene, means in tally.means.items()
+        for name, value in means.items()
     ]
+    schema = MEAN_SCHEMA
     pl.DataFrame(scenes, schema=schema, orient="row").write_parquet(folder / SCENES)
-    sums = [
+    write_sums(folder / SUMS, tally.sums)
+
+
+def write_sums(target: Path, sums: Mapping[str, np.ndarray]) -> None:
+    """Write sums [value or count, window] by metric."""
+    rows = [
         (metric, window, float(total), float(count))
-        for metric, values in tally.sums.items()
+        for metric, values in sums.items()
         for window, (total, count) in enumerate(values.T)
     ]
-    pl.DataFrame(sums, schema=SUM_SCHEMA, orient="row").write_parquet(folder / SUMS)
+    pl.DataFrame(rows, schema=SUM_SCHEMA, orient="row").write_parquet(target)
 
 
-def read_tally(folder: Path, rollouts: int) -> Tally:
-    """Read what one unit has tallied of so many rollouts."""
-    scenes = pl.read_parquet(folder / SCENES)
-    return Tally(
-        means={row.pop("scenario_id"): row for row in scenes.iter_rows(named=True)},
-        rollouts=rollouts,
-        sums=read_sums(folder / SUMS),
-    )
-
-
-def read_sums(path: Path) -> dict[str, np.ndarray]:
-    """Read sums [value or count, window] by metric; the rows of a metric lie together."""
-    table = pl.read_parquet(path)
-    values = table.select("value", "rollouts").to_numpy().T
-    metrics = table["metric"]
-    starts = np.flatnonzero((metrics != metrics.shift()).fill_null(value=True).to_numpy())
-    parts = np.split(values, starts[1:], axis=1) if len(starts) else []
-    return dict(zip(metrics.gather(starts).to_list(), parts, strict=True))
-
-
-def write_curves(target: Path, tally: Tally) -> None:
+def write_curves(target: Path, sums: Mapping[str, np.ndarray]) -> None:
     """Write the mean over rollouts of every metric in every window."""
     rows = [
         (metric, window, float(value), int(count))
-        for metric, curve in tally.curves().items()
+        for metric, curve in mean_curves(sums).items()
         for window, (value, count) in enumerate(zip(*curve, strict=True))
         if count
     ]

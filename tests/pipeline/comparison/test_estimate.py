@@ -10,7 +10,7 @@ from pipeline.commands.estimates import hours_of, num_workers
 from pipeline.comparison.estimate import Budget, Estimated, clock_hours, estimate, fit
 from pipeline.comparison.probe import Cost, kind
 from pipeline.comparison.runs import Comparison, arm_runs_of
-from pipeline.comparison.workload import Split, count_splits, workload
+from pipeline.comparison.workload import SCORED_LOGS, Split, count_splits, workload
 from pipeline.engine.layout import Root
 from pipeline.engine.plan import PlanError
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
@@ -68,6 +68,14 @@ def test_a_stage_that_runs_share_is_counted_once(tmp_path):
     ):
         (only,) = [each for each in found if each.stage == stage]
         assert (only.amount, only.units) == (scenes, units)
+
+
+def test_logs_are_scored_once_for_all_runs_that_score_alike(tmp_path):
+    found = work_of(comparison(tmp_path))
+
+    # All but the long rollouts of SMART and CatK, whose agents are present within 75 m.
+    logs = [each for each in found if each.stage == SCORED_LOGS]
+    assert [(each.amount, each.units) for each in logs] == [(44_000, 150)] * 2
 
 
 def test_limits_of_scenes_reach_all_that_follows(tmp_path):

@@ -2,7 +2,6 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import polars as pl
 import pytest
 
 from infgen.config import ReferenceSettings, TokenSettings
@@ -93,16 +92,6 @@ def test_the_split_s_means_are_over_the_logs_first_windows(inputs):
     assert against.split_near == pytest.approx(np.mean(near))
 
 
-def test_the_logs_own_scores_are_its_ceiling(inputs):
-    rows = pl.read_parquet(inputs.reference / "rows.parquet")
-    own = rows.filter(pl.col("metric") == "log/corrected/composite")
-
-    assert own["scenario_id"].to_list() == ["crossing", "parked", "slow"]
-    assert own["rollout"].is_null().all()
-    assert own["value"].is_between(0, 1).all()
-    assert not (inputs.reference / "parts").exists()
-
-
 def test_a_log_too_short_for_a_window_is_skipped_by_name(tmp_path, scenes, crossing):
     short = replace(crossing(steps=50), scenario_id="short")
     inputs = Inputs([ingested(tmp_path / "l", [*scenes, short])], [])
@@ -128,7 +117,7 @@ def test_the_same_logs_give_the_same_bytes(tmp_path, inputs):
     inputs.refer(tmp_path / "again")
 
     files = [path for path in sorted(first.rglob("*")) if path.is_file()]
-    assert len(files) > 4
+    assert len(files) == 3
     for path in files:
         other = inputs.reference / path.relative_to(first)
         assert path.read_bytes() == other.read_bytes(), path

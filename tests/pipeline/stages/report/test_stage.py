@@ -410,7 +410,7 @@ def test_histograms_are_read_from_two_files_whatever_the_number_of_units(inputs)
 
     logs, rollouts = histograms.read_both(none)
 
-    (scored,) = inputs.units("score")
+    _, scored = inputs.units("score")  # The first scored the logs.
     assert rollouts.bins.tolist() == read_counts(scored.path).bins.tolist()
     assert logs.bins.sum() > 0
 

@@ -154,8 +154,10 @@ def test_a_unit_is_made_again_only_if_its_rollouts_or_logs_or_the_reference_chan
     tmp_path, inputs
 ):
     inputs.refer(tmp_path / "reference")
-    (unit,) = score.plan(inputs, SETTINGS)
+    logs, unit = score.plan(inputs, SETTINGS)
 
+    assert logs.name == SOURCE
+    assert logs.inputs == {"logs": SOURCE, "reference": "content of reference"}
     assert unit.name == f"{SOURCE}-00000"
     assert unit.inputs == {
         "rollouts": f"key of {SOURCE}-00000",
@@ -201,6 +203,16 @@ def test_how_rollouts_are_cut_into_units_changes_no_number(tmp_path, scenes, res
     )
     assert one.drop("value").equals(cut.drop("value"))
     np.testing.assert_allclose(one["value"], cut["value"], rtol=1e-12)
+
+
+def test_the_logs_own_scores_come_first(result):
+    _, scores, _ = result
+    own = scores.filter(pl.col("metric") == "log/corrected/composite")
+
+    assert scores["metric"].str.starts_with("log/").head(len(own)).all()
+    assert own["scenario_id"].to_list() == ["crossing", "parked", "slow"]
+    assert own["rollout"].is_null().all()
+    assert own["value"].is_between(0, 1).all()
 
 
 def test_every_rollout_gets_a_row_for_every_number_that_it_has(result):
