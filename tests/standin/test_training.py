@@ -7,7 +7,7 @@ import pytest
 
 MOST = {
     "paper": (2210, 1),
-    "features": (2650, 1),
+    "features": (2660, 1),
     "rotary": (2650, 1),
     "closed-loop": (13330, 75),
     "accumulated": (4380, 1),
