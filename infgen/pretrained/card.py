@@ -35,7 +35,7 @@ def facts(folder: Path) -> str:
         "sees lights change": _yes(model["signals_each_step"]),
         "grid": f"{tokens['grid_radius_m']:g} m around the ego in cells of "
         f"{tokens['grid_cell_m']:g} m",
-        "training steps": f"{about['step']:,}",
+        "steps of the last training": f"{about['step']:,}",
         "fingerprint of the weights": f"`{about['weights'][:16]}`",
         "fingerprint of the vocabularies": f"`{about['vocabulary'][:16]}`",
         "schema": f"`{about['schema']}`",

@@ -20,7 +20,7 @@ def test_the_facts_of_the_card_are_those_of_the_weights():
     assert with_facts(builtin_card(), facts(folder)) == builtin_card()
     about = json.loads((folder / "model.json").read_text())
     assert f"| parameters | {about['parameters']:,} |" in section("Facts")
-    assert f"| training steps | {about['step']:,} |" in section("Facts")
+    assert f"| steps of the last training | {about['step']:,} |" in section("Facts")
     assert about["weights"].startswith(re.search(r"weights \| `(\w+)`", builtin_card())[1])
 
 
@@ -38,7 +38,7 @@ def test_other_weights_give_other_facts(tmp_path):
 
     table = facts(tmp_path)
 
-    assert "| training steps | 12,345 |" in table
+    assert "| steps of the last training | 12,345 |" in table
     assert "| size | 2.5 MB |" in table
 
 

@@ -49,7 +49,7 @@ def test_without_a_root_the_package_has_all_that_is_needed(tmp_path):
     assert garage.scenes.ids[number] == SCENE
     assert garage.scenes.sources[SCENE] == "training.tfrecord-00000-of-00002.gz"
     settings = garage.simulator.settings
-    assert (settings.count, settings.rules, settings.add_bias) == (1, "safe", 0.185)
+    assert (settings.count, settings.rules, settings.add_bias) == (1, "safe", 0)
     assert garage.folder.name == "drives"
 
 
