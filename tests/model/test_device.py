@@ -80,7 +80,8 @@ def of_double(*shapes):
 
 @pytest.mark.parametrize("share", [0.0, 0.25])
 @pytest.mark.parametrize("slots", [1, 2])
-def test_a_look_is_differentiated_as_it_is_computed(slots, share):
+@pytest.mark.parametrize("rotary", [False, True])
+def test_a_look_is_differentiated_as_it_is_computed(rotary, slots, share):
     torch.manual_seed(2)
     width, related, heads, targets = 6, 4, 3, 3
     each = width // heads
@@ -97,11 +98,13 @@ def test_a_look_is_differentiated_as_it_is_computed(slots, share):
     hidden = torch.rand(targets, 1, 6) < 0.3
     hidden[1] = True  # Nobody is there.
     cover = torch.zeros(targets, 1, 6, dtype=torch.float64).masked_fill_(hidden, -1e9)
+    angle_rad = torch.rand(targets, width // 2, dtype=torch.float64)
+    turn = torch.polar(torch.ones_like(angle_rad), angle_rad) if rotary else None
 
     def look(*given):
         torch.manual_seed(3)  # Drops the same weights each time.
         shared = Shared.of(given[-1])
-        more = cover, hidden.all(dim=-1, keepdim=True), share
+        more = cover, hidden.all(dim=-1, keepdim=True), share, turn
         shared = shared.values, shared.ticket, shared.pulled
         return _Look.apply(*given[:-1], index, *shared, *more)
 

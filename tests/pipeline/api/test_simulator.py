@@ -186,7 +186,7 @@ def test_calibrated_biases_are_added_where_their_decision_is_taken(root, tmp_pat
 
     settings = infgen.load(copy).settings
 
-    assert (settings.add_bias, settings.remove_bias) == pytest.approx((0.435, 0.0))
+    assert (settings.add_bias, settings.remove_bias) == pytest.approx((0.25, 0.0))
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from infgen.config import ModelSettings, TokenSettings, VocabSettings
 from infgen.errors import ConfigError
 from infgen.model.network import Network
 from infgen.pretrained import builtin_weights
+from infgen.pretrained.card import CARD
 from infgen.scene import Scene
 from pipeline.engine.atomic import StoreError, write_json
 from pipeline.engine.layout import Root
@@ -68,7 +69,7 @@ def test_the_packages_weights_are_small_and_load():
     network = load_network(builtin_weights())
 
     files = {path.name: path.stat().st_size for path in builtin_weights().iterdir()}
-    assert set(files) == {WEIGHTS, DESCRIPTION}
+    assert set(files) == {WEIGHTS, DESCRIPTION, CARD}
     assert sum(files.values()) <= LARGEST_BYTES
     assert network.settings.insertion_and_removal
     assert sum(p.numel() for p in network.parameters()) > 800_000
