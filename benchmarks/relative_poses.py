@@ -90,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     found = measure(asked.size, asked.steps, asked.repeats)
     show_table(
         f"relative poses, {asked.size}, {AT_ONCE} rollouts at once",
-        ("told by", *(f"{name}, {unit}" for name, unit in COLUMNS.items())),
+        ("relative poses", *(f"{name}, {unit}" for name, unit in COLUMNS.items())),
         [(way, *(f"{found[name][way]:.3f}" for name in COLUMNS)) for way in WAYS],
     )
     print(json.dumps({"size": asked.size, **found}))

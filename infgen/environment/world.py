@@ -20,7 +20,7 @@ from infgen.clock import CLOCK
 from infgen.rollout.begun_step import BegunStep, logged_step
 from infgen.rollout.maps import RolloutMaps
 from infgen.rollout.population import EGO_ROW
-from infgen.rollout.recording import NOBODY, RolloutStart
+from infgen.rollout.recording import NO_AGENT, RolloutStart
 from infgen.rollout.session import Session
 from infgen.rollout.simulator import Simulator
 
@@ -111,7 +111,7 @@ class World:
         if self.phase < CLOCK.steps_per_token or self._begun is None:
             return
         frame = self._session.end_step(self._begun, self._driven)
-        new = frame.inserted_number != NOBODY
+        new = frame.inserted_number != NO_AGENT
         self.inserted += new.sum(axis=1)
         self.removed += frame.removed.sum(axis=1)
         population, now = self._session.population, self.agents

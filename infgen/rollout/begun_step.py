@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, Int64
 
 from infgen.clock import CLOCK
 from infgen.rollout.population import Population, place_logged_agents
-from infgen.rollout.recording import NOBODY, RolloutStart
+from infgen.rollout.recording import NO_AGENT, RolloutStart
 from infgen.tokens.scene_tokens import Presence
 
 
@@ -35,7 +35,7 @@ class BegunStep:
     @property
     def there(self) -> Bool[np.ndarray, "rollout row"]:
         """Rows that hold an agent."""
-        return self.moved.agent_number != NOBODY
+        return self.moved.agent_number != NO_AGENT
 
     @property
     def removed(self) -> Bool[np.ndarray, "rollout row"]:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int16, Int32, Int64
 
 from infgen.geometry import to_world, wrap_angle
-from infgen.rollout.recording import NOBODY, RolloutStart
+from infgen.rollout.recording import NO_AGENT, RolloutStart
 from infgen.tokens.grid import Grid, encode_cell, from_grid, to_grid
 from infgen.tokens.scene_tokens import (
     FIRST_MOTION_TOKEN,
@@ -31,7 +31,7 @@ class Population:
     """All agents of all rollouts of a batch at the end of one token step.
 
     Attributes:
-        agent_number: Number of the agent in its rollout, or ``NOBODY`` in a free row.
+        agent_number: Number of the agent in its rollout, or ``NO_AGENT`` in a free row.
         num_agents_so_far: Agent numbers given so far in each rollout.
         agent_type: ``AgentType``.
         size_lwh_m: Boxes.
@@ -54,7 +54,7 @@ class Population:
     @property
     def num_agents(self) -> Int64[np.ndarray, " rollout"]:
         """Agents of each rollout."""
-        return (self.agent_number != NOBODY).sum(axis=1)
+        return (self.agent_number != NO_AGENT).sum(axis=1)
 
     @property
     def visible(self) -> Bool[np.ndarray, "rollout row"]:
@@ -78,7 +78,7 @@ class Population:
 
     def without_free_rows(self) -> "Population":
         """Drop the last rows that are free in every rollout."""
-        used = (self.agent_number != NOBODY).any(axis=0)
+        used = (self.agent_number != NO_AGENT).any(axis=0)
         rows = len(used) - int(used[::-1].argmax())
         cut = {f.name: getattr(self, f.name) for f in fields(self)}
         return Population(
@@ -208,7 +208,7 @@ def _near_to_far(start: RolloutStart) -> Int64[np.ndarray, " agent"]:
 def _empty(rollouts: int, rows: int) -> Population:
     shape = (rollouts, rows)
     return Population(
-        agent_number=np.full(shape, NOBODY, dtype=np.int32),
+        agent_number=np.full(shape, NO_AGENT, dtype=np.int32),
         num_agents_so_far=np.zeros(rollouts, dtype=np.int32),
         agent_type=np.zeros(shape, dtype=np.int8),
         size_lwh_m=np.zeros((*shape, 3), dtype=np.float32),
@@ -249,7 +249,7 @@ def advance_agents(
     presence = np.where(remove, Presence.REMOVED, Presence.PRESENT) * there
     moved = replace(
         population,
-        agent_number=np.where(there, population.agent_number, NOBODY).astype(np.int32),
+        agent_number=np.where(there, population.agent_number, NO_AGENT).astype(np.int32),
         pose=path[:, :, -1],
         motion_token=np.where(there, motion_token, NO_MOTION_TOKEN).astype(np.int16),
         presence=presence.astype(np.int8),
@@ -309,7 +309,7 @@ def place_inserted(
     Returns:
         The row that each agent got: the first free one; -1 in a full rollout.
     """
-    free = population.agent_number[rollouts] == NOBODY
+    free = population.agent_number[rollouts] == NO_AGENT
     row, fits = free.argmax(axis=1), free.any(axis=1)
     pose = insertion_pose(population.pose[rollouts, EGO_ROW], inserted)[fits]
     rollout, at = rollouts[fits], (rollouts[fits], row[fits])

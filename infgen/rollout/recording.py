@@ -17,7 +17,7 @@ from infgen.scene import Scene
 from infgen.tokens.scene_tokens import SceneTokens
 from infgen.tokens.signals import LoggedSignals
 
-NOBODY = -1
+NO_AGENT = -1
 """Agent number of a free row."""
 
 
@@ -27,12 +27,12 @@ class Frame:
 
     Attributes:
         token: The token step: steps ``5 token + 1`` to ``5 token + 5``.
-        agent_number: Number of the agent in each row, or ``NOBODY``.
+        agent_number: Number of the agent in each row, or ``NO_AGENT``.
         path: x, y, heading of every row at its five steps.
         shown: At which of them it is observed: all, but for weights with validity patterns.
         removed: Rows whose agent is present for the last time.
         inserted_number: Number of the agent inserted at the end of this token step, else
-            ``NOBODY``; its row is free in ``agent_number``.
+            ``NO_AGENT``; its row is free in ``agent_number``.
         agent_type: ``AgentType`` of every row after this token step.
         size_lwh_m: Box of every row after this token step.
     """
@@ -159,7 +159,7 @@ def _write_frame(recorded: _RecordedAgents, frame: Frame, at: int) -> None:
     end = CLOCK.end_step(frame.token)
     span = slice(CLOCK.start_step(frame.token) + 1, end + 1)
     agent_number, inserted_number = frame.agent_number[at], frame.inserted_number[at]
-    there, new = agent_number != NOBODY, inserted_number != NOBODY
+    there, new = agent_number != NO_AGENT, inserted_number != NO_AGENT
     recorded.pose[agent_number[there], span] = frame.path[at][there]
     recorded.there[agent_number[there], span] = True
     recorded.valid[agent_number[there], span] = frame.shown[at][there]

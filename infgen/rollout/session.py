@@ -37,7 +37,7 @@ from infgen.rollout.population import (
     remove_beyond,
 )
 from infgen.rollout.random_streams import Streams
-from infgen.rollout.recording import NOBODY, Frame, RolloutStart
+from infgen.rollout.recording import NO_AGENT, Frame, RolloutStart
 from infgen.rollout.rules.density import DensityControl
 from infgen.rollout.simulator import Simulator
 from infgen.tokens.motion_tokens import follow, make_match_table
@@ -271,7 +271,7 @@ class Session:
             inserted_number=np.where(
                 after.agent_number != moved.agent_number,
                 after.agent_number,
-                np.int32(NOBODY),
+                np.int32(NO_AGENT),
             ),
             agent_type=after.agent_type,
             size_lwh_m=after.size_lwh_m,

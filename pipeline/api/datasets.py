@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _STATES = ("x_m", "y_m", "z_m", "heading_rad")
-NOBODY = -1
+NO_AGENT = -1
 """Track id of a row that no agent has."""
 
 
@@ -36,7 +36,7 @@ def to_dataset(rollouts: Sequence[Rollout], scene: Scene) -> "xr.Dataset":
     values = np.full((len(_STATES), len(rollouts), agents, steps), np.nan)
     valid = np.zeros((len(rollouts), agents, steps), dtype=bool)
     size_m = np.full((len(rollouts), agents, 3), np.nan, dtype=np.float32)
-    about = np.full((3, len(rollouts), agents), NOBODY, dtype=np.int32)
+    about = np.full((3, len(rollouts), agents), NO_AGENT, dtype=np.int32)
     for at, one in enumerate(rollouts):
         rows, span = slice(0, len(one.id)), slice(0, one.num_steps)
         world_m = one.xyz_m.astype(np.float64) + one.origin_xyz_m

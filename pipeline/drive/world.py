@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, Int32
 
 from infgen.rollout.begun_step import BegunStep
 from infgen.rollout.population import Population
-from infgen.rollout.recording import NOBODY, Frame, RolloutStart
+from infgen.rollout.recording import NO_AGENT, Frame, RolloutStart
 from infgen.rollout.session import Session
 from infgen.rollout.simulator import Simulator
 
@@ -54,7 +54,7 @@ class WorldStep:
         """Agents that entered at its beginning."""
         if self.ended is None:
             return 0
-        return int((self.ended.inserted_number[0] != NOBODY).sum())
+        return int((self.ended.inserted_number[0] != NO_AGENT).sum())
 
 
 class World:

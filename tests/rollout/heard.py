@@ -18,7 +18,7 @@ from infgen.model.logits import DetailOutputs, InsertionOutputs, MotionOutputs
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import InsertionDetails, MotionStep, PositionOutputs, TokenStep
 from infgen.rollout.population import place_logged_agents
-from infgen.rollout.recording import NOBODY
+from infgen.rollout.recording import NO_AGENT
 from infgen.rollout.session import Session
 from infgen.tokens.scene_tokens import NO_CELL, NO_MOTION_TOKEN, Presence
 
@@ -137,10 +137,10 @@ def _agents_of(starts, lives):
     settled = place_logged_agents(starts, lives.shape[2])[-1].agent_number
     agent = lives.copy()
     for at, start in enumerate(starts):
-        logged = np.flatnonzero(settled[at] != NOBODY)
+        logged = np.flatnonzero(settled[at] != NO_AGENT)
         number = np.arange(max(lives[:, at].max() + 1, start.history.num_agents))
         number[settled[at, logged]] = logged
-        agent[:, at] = np.where(lives[:, at] == NOBODY, -1, number[lives[:, at]])
+        agent[:, at] = np.where(lives[:, at] == NO_AGENT, -1, number[lives[:, at]])
     return agent
 
 
@@ -202,7 +202,7 @@ def _entries(played):
     """Ask for as many inserted agents at every token step as the engine ever did."""
     shape = (len(played.starts), played.tokens)
     slots = 1 + max((int(one.turn.max()) for one in played.queries), default=0)
-    nobody = torch.full((*shape, slots), NOBODY)
+    nobody = torch.full((*shape, slots), NO_AGENT)
     return Insertions(
         asked=(torch.arange(played.tokens) > played.now).expand(shape),
         count=torch.zeros(shape, dtype=torch.int64),
@@ -233,7 +233,7 @@ def _details(network, played):
     return Details(
         present=present,
         inserted=torch.zeros_like(present),
-        agent=torch.full_like(token, NOBODY),
+        agent=torch.full_like(token, NO_AGENT),
         token=token,
         turn=spread("turn", torch.int64),
         cell=cell,

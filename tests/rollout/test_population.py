@@ -4,7 +4,7 @@ import pytest
 from infgen.config import TokenSettings
 from infgen.rollout.population import (
     EGO_ROW,
-    NOBODY,
+    NO_AGENT,
     InsertedAgents,
     add_inserted,
     advance_agents,
@@ -42,7 +42,7 @@ def test_the_ego_sits_in_row_zero_and_the_others_from_near_to_far(parked, start)
     now = place_logged_agents([start(scene)], min_rows=6)[-1]
 
     np.testing.assert_allclose(now.pose[0, :4, 0], [16, 8, 24, 0], atol=1e-4)
-    np.testing.assert_array_equal(now.agent_number[0], [2, 1, 3, 0, NOBODY, NOBODY])
+    np.testing.assert_array_equal(now.agent_number[0], [2, 1, 3, 0, NO_AGENT, NO_AGENT])
     assert now.num_agents_so_far[0] == 4
 
 
@@ -113,7 +113,7 @@ def test_whoever_leaves_is_there_once_more_and_then_gone_for_good(
 
     np.testing.assert_array_equal(removed.presence[0], [PRESENT, REMOVED])
     assert path[0, 1].any()
-    assert gone.agent_number[0, 1] == NOBODY
+    assert gone.agent_number[0, 1] == NO_AGENT
     assert gone.presence[0, 1] == Presence.ABSENT
     assert not after[0, 1].any()
 
@@ -151,12 +151,12 @@ def test_a_newcomer_takes_the_first_free_row_with_a_life_of_its_own(parked, star
     after, row = add_inserted(population, inserted([True, False], grid.ego_cell - 5))
 
     np.testing.assert_array_equal(row, [2, -1])
-    np.testing.assert_array_equal(after.agent_number[0], [0, 1, 2, NOBODY])
+    np.testing.assert_array_equal(after.agent_number[0], [0, 1, 2, NO_AGENT])
     np.testing.assert_array_equal(after.num_agents_so_far, [3, 3])
     assert after.presence[0, 2] == Presence.INSERTED
     assert after.motion_token[0, 2] == FIRST_MOTION_TOKEN
     assert not after.observed[0, 2]
-    assert population.agent_number[0, 2] == NOBODY, (
+    assert population.agent_number[0, 2] == NO_AGENT, (
         "the population it came from stays as it was"
     )
 

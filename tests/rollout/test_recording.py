@@ -7,7 +7,7 @@ from infgen.rollout.population import (
     advance_agents,
     place_logged_agents,
 )
-from infgen.rollout.recording import NOBODY, Frame, collect
+from infgen.rollout.recording import NO_AGENT, Frame, collect
 from infgen.rollout.rollout import NEVER
 from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence
@@ -34,7 +34,7 @@ def play(begin, vocabulary, grid, seconds, speed=5, leave_at=None, add_at=None):
             inserted_number=np.where(
                 population.agent_number != moved.agent_number,
                 population.agent_number,
-                np.int32(NOBODY),
+                np.int32(NO_AGENT),
             ),
             agent_type=population.agent_type,
             size_lwh_m=population.size_lwh_m,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from infgen.rollout.begun_step import logged_step
-from infgen.rollout.recording import NOBODY
+from infgen.rollout.recording import NO_AGENT
 from infgen.rollout.session import Session
 from tests.rollout.single_rules import only
 
@@ -63,7 +63,7 @@ def test_a_replaced_rollout_goes_as_it_would_alone(
     frame = replaced_at(session, 1, other, logged_step([other], 24))
 
     # The history of the one is over now: from here on both go on alike.
-    assert (frame.inserted_number[1] == NOBODY).all()
+    assert (frame.inserted_number[1] == NO_AGENT).all()
     np.testing.assert_array_equal(session.own_token, [after + 2, 1, after + 2])
     np.testing.assert_allclose(
         session.population.pose[1], alone.population.pose[0], atol=1e-5

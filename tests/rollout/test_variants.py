@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from infgen.geometry import boxes_overlap
 from infgen.metrics.long_term.radius import present_within_radius
 from infgen.rollout.population import EGO_ROW
-from infgen.rollout.recording import NOBODY, collect
+from infgen.rollout.recording import NO_AGENT, collect
 from infgen.rollout.rollout import NEVER
 from infgen.rollout.session import Session
 from infgen.rollout.simulate import simulate
@@ -43,19 +43,21 @@ def check_session(session, frames, grid):
         frame = session.step()
         after = session.population
         lives = {
-            (r, n) for r, row in enumerate(frame.agent_number) for n in row if n != NOBODY
+            (r, n) for r, row in enumerate(frame.agent_number) for n in row if n != NO_AGENT
         }
-        rows = (frame.agent_number != NOBODY).sum()
+        rows = (frame.agent_number != NO_AGENT).sum()
         assert len(lives) == rows, "an agent has one row"
         assert not lives & gone, "who has left never returns"
-        same = (before.agent_number == frame.agent_number) & (frame.agent_number != NOBODY)
+        same = (before.agent_number == frame.agent_number) & (
+            frame.agent_number != NO_AGENT
+        )
         assert same.sum() == rows, "who is there was there, in the same row"
         gap_m = np.linalg.norm(frame.path[:, :, -1, :2] - before.pose[..., :2], axis=-1)
         assert gap_m[same].max() <= FASTEST_M + 1e-3
         gone |= {(r, frame.agent_number[r, row]) for r, row in np.argwhere(frame.removed)}
         inserted_number = {
             (r, frame.inserted_number[r, row])
-            for r, row in np.argwhere(frame.inserted_number != NOBODY)
+            for r, row in np.argwhere(frame.inserted_number != NO_AGENT)
         }
         assert not inserted_number & (ids | lives), "every newcomer is a new agent"
         ids |= lives | inserted_number

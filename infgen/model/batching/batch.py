@@ -149,7 +149,7 @@ class Insertions:
             slot; the decisions to learn are so many and one.
         add: Whether an agent is to be inserted at each turn. Where the network inserts
             agents, that is not always known to be one that ``agent`` could name.
-        agent: The agent to be inserted at each turn, or ``NOBODY``.
+        agent: The agent to be inserted at each turn, or ``NO_AGENT``.
         cell: Its cell; 0 in unused slots.
     """
 

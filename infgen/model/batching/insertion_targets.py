@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float32, Int16, Integer
 
 from infgen.model.batching.crop import SceneWindow
-from infgen.model.batching.padding import NOBODY, Arrays
+from infgen.model.batching.padding import NO_AGENT, Arrays
 from infgen.tokens.grid import Grid, encode_heading, to_grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence
 
@@ -49,7 +49,7 @@ def insertion_arrays(window: SceneWindow, turn: np.ndarray, limit: int) -> Array
     asked[tokens - 1 :] &= window.after > 0
     count = inside.sum(axis=0)
     slots = 1 + min(limit, int(count[1:].max(initial=0)))
-    agent = np.full((tokens, slots), NOBODY, dtype=np.int64)
+    agent = np.full((tokens, slots), NO_AGENT, dtype=np.int64)
     row, token = np.nonzero(inside & (turn < slots) & asked)
     agent[token, turn[row, token]] = row
     cell = np.where(agent >= 0, window.cell[agent, np.arange(tokens)[:, None]], 0)

@@ -12,7 +12,7 @@ T = TypeVar("T")
 Arrays = dict[str, np.ndarray]
 """Arrays of one scene, by the names of the fields they become."""
 
-NOBODY = -1
+NO_AGENT = -1
 """Agent of an empty slot."""
 
 _PADDING = {
@@ -20,7 +20,7 @@ _PADDING = {
     "label": NO_MOTION_TOKEN,
     "cell": NO_CELL,
     "turn": -1,
-    "agent": NOBODY,
+    "agent": NO_AGENT,
 }
 
 

@@ -1,8 +1,9 @@
 """Rotary embedding of headings and times.
 
 Features are turned, two numbers at a time, by angles that follow from the heading and the
-token step of whoever they belong to. A product of two turned features depends only on how
-the two headings, and the two times, differ: on nothing of the frame that both are given in.
+token step of the agent or map token they belong to. A product of two turned features
+depends only on how the two headings, and the two times, differ: on nothing of the frame
+that both are given in.
 Every angle is a whole multiple of the heading, so that a full turn changes nothing (DRoPE,
 arXiv 2503.15029), and a multiple of the time that repeats after ``CYCLE_TOKENS``.
 

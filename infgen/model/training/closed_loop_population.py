@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from infgen.model.batching.batch import Batch
-from infgen.model.batching.padding import NOBODY
+from infgen.model.batching.padding import NO_AGENT
 from infgen.model.long_memory import count_around
 from infgen.model.network import EGO, Network
 from infgen.model.training.closed_loop import move_near_log
@@ -153,7 +153,7 @@ class _PopulationLoop(Simulation):
         following = missing[active, min(turn, missing.shape[1] - 1)]
         fresh = left & (self.fresh_until[active, following] >= token)
         self.turns.add[active, token, turn] = left
-        self.turns.agent[active, token, turn] = torch.where(fresh, following, NOBODY)
+        self.turns.agent[active, token, turn] = torch.where(fresh, following, NO_AGENT)
         used = self.used[active]
         room = left | (used < self.played.presence.shape[2])
         return NextInsertions(torch.where(left, following, used), left, room)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Agents, Batch, Details, Insertions
 from infgen.model.batching.insertion_targets import describe
-from infgen.model.batching.padding import NOBODY
+from infgen.model.batching.padding import NO_AGENT
 from infgen.model.network import EGO
 from infgen.tokens.grid import Grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence
@@ -22,7 +22,7 @@ class InsertionTurns:
             learned. Those after it would teach how often so many more are inserted, where
             the network is to know it of the steps that insert so many at all.
         add: Whether an agent is to be inserted at each turn [scene, token, slot].
-        agent: That agent, if it is fresh, or ``NOBODY`` [scene, token, slot].
+        agent: That agent, if it is fresh, or ``NO_AGENT`` [scene, token, slot].
     """
 
     count: Tensor
@@ -34,7 +34,7 @@ class InsertionTurns:
         cls, scenes: int, tokens: int, slots: int, device: torch.device
     ) -> "InsertionTurns":
         """Return no insertions, and none to learn."""
-        agent = torch.full((scenes, tokens, slots), NOBODY, device=device)
+        agent = torch.full((scenes, tokens, slots), NO_AGENT, device=device)
         add = torch.zeros_like(agent, dtype=torch.bool)
         return cls(torch.zeros_like(agent[..., 0]), add, agent)
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float32, Int64
 from infgen.geometry import wrap_angle
 from infgen.model.signal_features import StopLines
 from infgen.rollout.population import Population
-from infgen.rollout.recording import NOBODY
+from infgen.rollout.recording import NO_AGENT
 from infgen.rollout.rules.off_road import lane_segments
 from infgen.scene import AgentType, Scene
 from infgen.spatial.lanes import lanes_distance_m
@@ -82,7 +82,7 @@ class StallRule:
             begun: Token step of the batch that is the first of each rollout's own.
         """
         self._agent_number = other._agent_number.copy()
-        self._agent_number[replaced] = NOBODY
+        self._agent_number[replaced] = NO_AGENT
         self._from_m, self._since = other._from_m, other._since
         self._in_lane, self._begun = other._in_lane, begun
 
@@ -98,7 +98,7 @@ class StallRule:
         self._remember(everyone, token)
         stood = token - self._since
         vehicle = (everyone.agent_type == AgentType.VEHICLE) & (
-            everyone.agent_number != NOBODY
+            everyone.agent_number != NO_AGENT
         )
         vehicle &= everyone.presence != Presence.REMOVED
         new = vehicle & (stood == self._tokens)
@@ -115,12 +115,12 @@ class StallRule:
         more = everyone.agent_number.shape[1] - self._agent_number.shape[1]
         if more:
             rows = ((0, 0), (0, more))
-            self._agent_number = np.pad(self._agent_number, rows, constant_values=NOBODY)
+            self._agent_number = np.pad(self._agent_number, rows, constant_values=NO_AGENT)
             self._from_m = np.pad(self._from_m, (*rows, (0, 0)))
             self._since = np.pad(self._since, rows)
             self._in_lane = np.pad(self._in_lane, rows)
         stays = (everyone.agent_number == self._agent_number) & (
-            everyone.agent_number != NOBODY
+            everyone.agent_number != NO_AGENT
         )
         stays &= np.linalg.norm(xy_m - self._from_m, axis=-1) < AWAY_M
         self._agent_number = everyone.agent_number.copy()

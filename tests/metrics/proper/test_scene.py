@@ -16,7 +16,7 @@ from infgen.spatial.road_edges import scene_road_edges
 from tests.metrics.proper.test_retrieval import log as known_log
 
 RADIUS_M = 75.0
-NOBODY = References([], [])
+NO_REFERENCES = References([], [])
 
 
 def sample(scene, seen=None, *, logged=False):
@@ -44,7 +44,7 @@ def emptied(scene):
 def scores(crossing):
     """The log twice, as its own rollouts."""
     scene = crossing()
-    return score_scene(sample(scene, logged=True), [sample(scene)] * 2, NOBODY)
+    return score_scene(sample(scene, logged=True), [sample(scene)] * 2, NO_REFERENCES)
 
 
 def test_the_log_is_a_perfect_forecast_of_itself(scores):
@@ -58,7 +58,7 @@ def test_the_log_is_a_perfect_forecast_of_itself(scores):
 def test_what_never_changes_is_as_likely_as_its_pool_is_large(parked):
     scene = parked()
 
-    found = score_scene(sample(scene, logged=True), [sample(scene)] * 2, NOBODY)
+    found = score_scene(sample(scene, logged=True), [sample(scene)] * 2, NO_REFERENCES)
 
     # 2 x 20 equal outcomes of 11: ten bins, and being gone. Of events 2 equal ones of 3.
     likelihood = found.parts["log_likelihood"]
@@ -90,7 +90,7 @@ def test_an_emptied_street_is_worse_in_every_measured_part(crossing):
     scene = crossing()
     log, empty = sample(scene, logged=True), sample(scene, emptied(scene))
 
-    found = score_scene(log, [empty] * 2, NOBODY)
+    found = score_scene(log, [empty] * 2, NO_REFERENCES)
 
     counted = dict(zip(SCORES, found.parts["model"], strict=True))
     assert counted["vehicles"] == 1

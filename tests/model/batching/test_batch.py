@@ -10,7 +10,7 @@ from infgen.config import TokenSettings, TrainSettings
 from infgen.model.batching.batch import collate, collate_maps, to_device
 from infgen.model.batching.crop import cut_window, hide_until_near
 from infgen.model.batching.insertion_targets import OUTSIDE
-from infgen.model.batching.padding import NOBODY
+from infgen.model.batching.padding import NO_AGENT
 from infgen.model.batching.perturbation import make_perturbation
 from infgen.tokens.grid import decode_cell, encode_cell, from_grid, make_grid, to_grid
 from infgen.tokens.motion_tokens import advance, make_match_table, nearest_motion_tokens
@@ -133,7 +133,7 @@ def test_newcomers_take_turns_from_near_to_far(record, limits):
     assert away_m[first] < away_m[second]
     assert agents.turn[0, 2, [first, second]].tolist() == [0, 1]
     assert entries.cell[0, 2, 0] == agents.cell[0, 2, first]
-    assert entries.agent[0, 1].tolist() == [NOBODY] * entries.agent.shape[2]
+    assert entries.agent[0, 1].tolist() == [NO_AGENT] * entries.agent.shape[2]
 
 
 def test_all_others_have_no_turn_and_those_outside_the_grid_an_endless_one(record, limits):
@@ -268,7 +268,7 @@ def test_noise_loses_no_newcomer_and_puts_each_in_its_cell_of_the_ego_as_it_is(
     pair, grid_settings
 ):
     plain, noisy = pair
-    came = noisy.entries.agent != NOBODY
+    came = noisy.entries.agent != NO_AGENT
     scene, token, _ = came.nonzero(as_tuple=True)
     agent = noisy.entries.agent[came]
     pose, ego_pose = (noisy.agents.pose[scene, token, row] for row in (agent, 0))

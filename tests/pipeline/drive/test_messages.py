@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infgen.rollout.recording import NOBODY
+from infgen.rollout.recording import NO_AGENT
 from infgen.views.player.payload import unpack
 from infgen.views.scene.view_model import Role
 from pipeline.drive import messages
@@ -153,7 +153,7 @@ def test_a_frame_names_all_but_the_ego(begin):
 def test_a_frame_without_other_agents_is_empty(begin):
     drive = begin()
     begun = drive.shown.begun
-    numbers = np.full_like(begun.moved.agent_number, NOBODY)
+    numbers = np.full_like(begun.moved.agent_number, NO_AGENT)
     numbers[0, 0] = begun.moved.agent_number[0, 0]
     moved = dataclasses.replace(begun.moved, agent_number=numbers)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from infgen.model.signal_features import StopLines
-from infgen.rollout.recording import NOBODY
+from infgen.rollout.recording import NO_AGENT
 from infgen.rollout.rules.stalls import AWAY_M, IN_LANE_M, WAITS_M, StallRule
 from infgen.rollout.session import Session
 from infgen.scene import AgentType
@@ -85,7 +85,7 @@ def test_who_has_taken_the_place_of_another_begins_anew():
 
 def test_who_leaves_and_who_is_not_there_do_not():
     nobody = everyone((0, 0, 0), (20, 0, 0))
-    nobody.agent_number[0, 0], nobody.presence[0, 1] = NOBODY, Presence.REMOVED
+    nobody.agent_number[0, 0], nobody.presence[0, 1] = NO_AGENT, Presence.REMOVED
 
     assert ask(stall_rule(), nobody, range(LONG + 1))[-1] == [False, False]
 

@@ -114,9 +114,9 @@ def find_overlaps(
 ) -> Bool[np.ndarray, "rollout token agent"]:
     """Tell who comes to overlap another agent, at the middle or the end of a token step.
 
-    Of two boxes that come to overlap by moving, whoever has the centre of the other ahead
-    pays; of an inserted agent and one that was there, or of two inserted ones, whoever came
-    last. Two pedestrians do not: groups walk closer than their boxes.
+    Of two boxes that come to overlap by moving, the one that has the centre of the other
+    ahead pays; of an inserted agent and one that was there, or of two inserted ones, the
+    one inserted last. Two pedestrians do not: groups walk closer than their boxes.
     """
     pays = np.zeros(seen.moved.shape, dtype=bool)
     for token in range(1, seen.pose.shape[1]):

@@ -59,7 +59,7 @@ def draw_lines(network: Network, streets: dict[str, Street]) -> Iterator[Line]:
         edge = network.edges[name]
         yield from _between_lanes(edge)
         back = network.edges.get(reverse_of(name))
-        if edge.inner.use is Use.NOBODY:
+        if edge.inner.use is Use.NO_USE:
             xy_m = edge.driven[-1].border(edge.driven[-1].width_m / 2)
             inner = (edge.driven[-1].name,)
             yield Line(RoadLineType.SOLID_SINGLE_YELLOW, xy_m, inner, ())
@@ -93,7 +93,7 @@ def _between_lanes(edge: Edge) -> Iterator[Line]:
 def _nothing_between(right: Lane, left: Lane) -> bool:
     """Whether no line is painted: towards a gutter, and where parking lots cars as well."""
     gutter = right.width_m < NARROWEST_PARKING_M
-    return right.use is Use.NOBODY and (gutter or left.use is Use.DRIVERS)
+    return right.use is Use.NO_USE and (gutter or left.use is Use.DRIVERS)
 
 
 def draw_crosswalks(

@@ -17,7 +17,7 @@ from infgen.sources.towns.streets.curves import Points
 class Use(Enum):
     """Who goes on a lane."""
 
-    NOBODY = "nobody"
+    NO_USE = "none"
     WALKERS = "walkers"
     CYCLISTS = "cyclists"
     DRIVERS = "drivers"
@@ -250,7 +250,7 @@ def _edge(element: Element) -> Edge:
 def _lane(element: Element) -> Lane:
     refused = element.get("disallow", "").split()
     use = _USES.get(element.get("allow", ""), Use.DRIVERS)
-    use = Use.NOBODY if "all" in refused else use
+    use = Use.NO_USE if "all" in refused else use
     shared = use is Use.DRIVERS and "bicycle" not in refused
     return Lane(
         name=element.attrib["id"],

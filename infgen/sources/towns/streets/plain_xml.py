@@ -13,12 +13,12 @@ from infgen.sources.towns.streets.street_types import CURB_M, Rank, Street
 from infgen.sources.towns.sumo import run_program
 from infgen.sources.towns.variety import BASIC, StreetVariety
 
-NOBODY = "nobody"
+NO_USE = "none"
 """User of strips of the road that are no lanes."""
 DRIVERS = "drivers"
 """Users of lanes beside which cyclists have their own."""
 EVERYONE = "everyone"
-_REFUSED = {NOBODY: "all", DRIVERS: "pedestrian bicycle", EVERYONE: "pedestrian"}
+_REFUSED = {NO_USE: "all", DRIVERS: "pedestrian bicycle", EVERYONE: "pedestrian"}
 _BEND_POINTS = 9
 _RING_LIMIT_MPS = 6.0
 _NETCONVERT: dict[str, object] = {
@@ -87,7 +87,7 @@ def _write_node(layout: Layout, node: int, nodes: Element, edges: Element) -> No
         shape_m = layout.skeleton.xy_m[node] + layout.ring_m[node] * _unit(bearings_rad)
         edge = _add_edge(edges, f"{name}r", (name, following), shape_m, 10, _RING_LIMIT_MPS)
         edge.set("spreadType", "center")
-        _add_lanes(edge, [("pedestrian", 2.0), (NOBODY, 1.0), (EVERYONE, 4.4)])
+        _add_lanes(edge, [("pedestrian", 2.0), (NO_USE, 1.0), (EVERYONE, 4.4)])
     ring = SubElement(edges, "roundabout")
     ring.set("nodes", " ".join(names))
     ring.set("edges", " ".join(f"{name}r" for name in names))
@@ -147,12 +147,12 @@ def _lanes(street: Street) -> list[tuple[str, float]]:
     """Who may use the lanes of one direction, from the right, and their widths."""
     drivers = DRIVERS if street.bike_m else EVERYONE
     lanes = [("pedestrian", street.pavement_m)]
-    lanes.append((NOBODY, street.parking_m or CURB_M))
+    lanes.append((NO_USE, street.parking_m or CURB_M))
     if street.bike_m:
         lanes.append(("bicycle", street.bike_m))
     lanes += [(drivers, street.lane_m)] * street.num_lanes
     if street.median_m:
-        lanes.append((NOBODY, street.median_m))
+        lanes.append((NO_USE, street.median_m))
     return lanes
 
 

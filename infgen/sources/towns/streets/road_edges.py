@@ -91,7 +91,7 @@ def _islands(network: Network) -> Iterator[RoadEdge]:
         back = network.edges.get(reverse_of(edge.name))
         if back is None or edge.name > back.name:
             continue
-        if edge.inner.use is Use.NOBODY and edge.inner.width_m > LEAST_ISLAND_M:
+        if edge.inner.use is Use.NO_USE and edge.inner.width_m > LEAST_ISLAND_M:
             sides_m = [each.inner.border(-each.inner.width_m / 2) for each in (edge, back)]
             outline_m = curves.chain(*(side_m[::-1] for side_m in sides_m))
             yield RoadEdge(RoadEdgeType.MEDIAN, np.concatenate([outline_m, outline_m[:1]]))

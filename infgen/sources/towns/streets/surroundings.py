@@ -84,7 +84,7 @@ def _along_kerb(
     """Park cars along a road edge where there is room for them, driveways left free."""
     strip = edge.outer
     length_m = curves.length(strip.xy_m)
-    if street.parking_m <= 0 or strip.use is not Use.NOBODY:
+    if street.parking_m <= 0 or strip.use is not Use.NO_USE:
         return np.empty((0, 6))
     rows, at_m = [], _FREE_ENDS_M + float(rng.uniform(0.0, 6.0))
     heading_rad, known_m = curves.headings(strip.xy_m), curves.arc_lengths(strip.xy_m)

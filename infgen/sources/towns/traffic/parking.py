@@ -83,7 +83,7 @@ def find_spaces(network: Network, streets: Mapping[str, Street]) -> list[Parking
 def _spaces_of(edge: Edge, street: Street) -> list[ParkingSpace]:
     at = next(at for at, lane in enumerate(edge.lanes) if lane.use is Use.DRIVERS)
     lane, strip = edge.lanes[at], edge.outer
-    if strip.use is not Use.NOBODY:
+    if strip.use is not Use.NO_USE:
         return []
     xy_m = curves.resample(lane.xy_m, 1.0)
     known_m, heading_rad = curves.arc_lengths(xy_m), curves.headings(xy_m)

@@ -8,7 +8,7 @@ from infgen.sources.towns.streets.network import Use
 def test_lanes_stand_from_right_to_left_with_their_uses(crossing):
     uses = [lane.use for lane in crossing.edges["e0f"].lanes]
 
-    assert uses == [Use.WALKERS, Use.NOBODY, Use.DRIVERS, Use.DRIVERS, Use.NOBODY]
+    assert uses == [Use.WALKERS, Use.NO_USE, Use.DRIVERS, Use.DRIVERS, Use.NO_USE]
     assert [lane.width_m for lane in crossing.edges["e0f"].lanes] == [2, 0.3, 3.5, 3.5, 1]
     assert len(crossing.edges["e0f"].driven) == 2
 

@@ -183,4 +183,4 @@ def test_all_features_kept_is_the_whole_map(town_map):
 
 
 def test_parking_is_no_lane(crossing):
-    assert all(lane.use is not Use.NOBODY for lane in crossing.lanes.values())
+    assert all(lane.use is not Use.NO_USE for lane in crossing.lanes.values())
