@@ -28,6 +28,7 @@ from infgen.sources.womd import scene_or_bad_record
 from pipeline.engine.layout import Root
 from pipeline.engine.stage import FinishedUnit, Report, Source, Unit
 from pipeline.stages.ingest import STAGE
+from pipeline.storage.sources.fingerprints import fingerprint
 from pipeline.storage.sources.source_files import find_sources
 
 SHARED = Path(__file__).parents[1] / "../shared/data/womd"
@@ -130,7 +131,7 @@ def ingest(urls: Sequence[str]) -> list[Report]:
     with tempfile.TemporaryDirectory(prefix="infgen-bench-") as folder:
         return [
             STAGE.work(
-                Unit(Path(url).name, {}, {"url": url}),
+                Unit(Path(url).name, {"source": fingerprint(Path(url))}, {"url": url}),
                 Path(folder) / str(number),
                 IngestSettings(),
                 no_progress,
