@@ -102,7 +102,8 @@ def next_averages(
     first: Bool[Tensor, " rollout"],
 ) -> Float32[Tensor, "rollout constant"]:
     """Update the averages of ``averages_before`` by one token step."""
-    share = 1 / torch.tensor(AVERAGED_TOKENS, dtype=count.dtype, device=count.device)
+    # Filled one by one, as the host would wait for a copy.
+    share = torch.stack([count.new_full((), 1 / each) for each in AVERAGED_TOKENS])
     moved = average + share * (count[:, None] - average)
     return torch.where(first[:, None], count[:, None], moved)
 
