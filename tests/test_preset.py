@@ -35,7 +35,7 @@ PRESETS = """
     rollout_sets: {long: {}}
     arms:
       infgen: {published: InfGen, rollout_sets: [long]}
-      odd: {label: Odd one, train: {motion_weight: 1e39}, rollout_sets: [long]}
+      odd: {label: Odd one, train: {motion_weight: 1e38}, rollout_sets: [long]}
       odder: {profile: smart, starts_from: odd, rollout_sets: [long]}
   wrong:
     profile: small,benchmark,tiny
