@@ -10,7 +10,7 @@ MOST = {
     "features": (2660, 1),
     "rotary": (2650, 1),
     "closed-loop": (13330, 75),
-    "accumulated": (4380, 1),
+    "accumulated": (4390, 1),
     "smart": (1230, 1),
     "no-remove-token": (2180, 1),
     "no-position-token": (2190, 1),
