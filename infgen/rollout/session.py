@@ -246,8 +246,8 @@ class Session:
         choices = self._sampler.sample(before, said, self.token + 1)
         moved, paths = self._move(before, choices, said, path)
         shown = self._observed_steps(before, moved, choices)
-        nobody = np.zeros(len(self._streams), dtype=bool)
-        return BegunStep(before, moved, paths, shown, nobody, path is not None)
+        none_gone = np.zeros(len(self._streams), dtype=bool)
+        return BegunStep(before, moved, paths, shown, none_gone, path is not None)
 
     def _end(self, begun: BegunStep) -> Frame:
         """Insert agents, and go on to the end of the token step."""
@@ -383,7 +383,7 @@ class Session:
 
 
 def _make_device_insertion(request: InsertionRequest) -> DeviceInsertion | None:
-    """Return what inserts agents on a device, or None where the host does or nobody."""
+    """Return what inserts agents on a device; None where the host does, or nothing."""
     simulator = request.simulator
     on_host = simulator.device.type == "cpu" or not simulator.inserts
     return None if on_host else DeviceInsertion(request)

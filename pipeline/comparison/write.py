@@ -127,7 +127,7 @@ def _write(folder: Path, found: ComparisonResult) -> None:
             ("csv", sheet.for_programs().to_csv()),
         ):
             write_file(folder / TABLES / f"{sheet.name}.{suffix}", text.encode())
-    # Thousands of rows: nobody reads them as they are.
+    # Thousands of rows: too many to be read as they are.
     points = learning_curve_scores(found)
     for curves in [curve_sheet(found), *([points] if points.rows else [])]:
         data = curves.for_programs().to_csv().encode()

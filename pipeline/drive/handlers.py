@@ -111,8 +111,8 @@ class Driver(_Checked, WebSocketHandler):
         """Take the driver's seat, if it is free."""
         self.set_nodelay(True)
         if not self.server.seat(self):
-            self.refuse("somebody drives already")
-            self.close(TRY_AGAIN_LATER, "somebody drives already, in another window")
+            self.refuse("a drive is under way")
+            self.close(TRY_AGAIN_LATER, "a drive is under way in another window")
 
     def on_message(self, message: str | bytes) -> None:
         """Read a message; a page that sends another than ours sends is let go."""

@@ -202,13 +202,13 @@ def _entries(played):
     """Ask for as many inserted agents at every token step as the engine ever did."""
     shape = (len(played.starts), played.tokens)
     slots = 1 + max((int(one.turn.max()) for one in played.queries), default=0)
-    nobody = torch.full((*shape, slots), NO_AGENT)
+    no_agent = torch.full((*shape, slots), NO_AGENT)
     return Insertions(
         asked=(torch.arange(played.tokens) > played.now).expand(shape),
         count=torch.zeros(shape, dtype=torch.int64),
-        add=torch.zeros_like(nobody, dtype=torch.bool),
-        agent=nobody,
-        cell=torch.zeros_like(nobody),
+        add=torch.zeros_like(no_agent, dtype=torch.bool),
+        agent=no_agent,
+        cell=torch.zeros_like(no_agent),
     )
 
 

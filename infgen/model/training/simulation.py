@@ -5,6 +5,7 @@ simulation, one token step of it, and the insertion turns. They differ in who mo
 whose row an inserted agent takes, and in what is learned.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -57,7 +58,7 @@ class NextInsertions:
         return NextInsertions(self.row[places], self.logged[places], self.room[places])
 
 
-class Simulation:
+class Simulation(ABC):
     """A batch of scenes, or several copies of it, in simulation.
 
     Attributes:
@@ -88,13 +89,13 @@ class Simulation:
         slots = network.settings.max_insertions + 1
         self.turns = InsertionTurns.none(rollouts, tokens, slots, device)
 
+    @abstractmethod
     def next_insertions(self, token: int, turn: int, active: Tensor) -> NextInsertions:
         """Say whom the network may insert at a turn, in the scenes ``active``."""
-        raise NotImplementedError
 
+    @abstractmethod
     def is_inserted(self, token: int, turn: int, at: tuple[Tensor, Tensor]) -> None:
         """Count agents that have been inserted, at scenes and rows ``at``."""
-        raise NotImplementedError
 
     def insert(self, token: int) -> None:
         """Insert agents until the network inserts no more."""

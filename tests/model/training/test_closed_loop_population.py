@@ -198,7 +198,7 @@ def test_no_turn_is_learned_that_a_log_would_not_have(new_network, logged, add):
 
 
 def test_a_share_of_the_excess_is_corrected_by_insertions(new_network, record, limits):
-    """Five agents are missing and nobody new comes: one is to be inserted now and then."""
+    """Five agents are missing and no new one comes: one is to be inserted now and then."""
     network = biased(new_network().eval(), add=NEVER, remove=NEVER)
     lives = [(0, 11), *((token, 11) for token in range(2, 7))]
     logged = collate([record(3, tokens=12, lives=lives, spread_m=15.0)], limits, 7)

@@ -73,7 +73,7 @@ def test_one_page_drives_at_a_time(visit):
         second = await visitor.line()
         second.write_message(json.dumps({"type": "press", "button": "pause"}))
         assert await closed(second) == 1013
-        assert "somebody drives already" in visitor.log[0]
+        assert "a drive is under way" in visitor.log[0]
         assert not (await hear(first, "state"))["paused"]
         first.close()
         await asyncio.sleep(0.2)

@@ -44,7 +44,7 @@ def draw_one_way(
 def goes_on_everywhere(skeleton: Skeleton, one_way: Int64[np.ndarray, " link"]) -> bool:
     """Whether every node is reached from every other, and no edge ends without a way on.
 
-    Nobody turns round at a junction; where a street leads out of town it may end.
+    No vehicle turns round at a junction; where a street leads out of town it may end.
     """
     ahead = [tuple(pair) for pair in skeleton.link[one_way >= 0].tolist()]
     edges = ahead + [(end, start) for start, end in skeleton.link[one_way <= 0].tolist()]

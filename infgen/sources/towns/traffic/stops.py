@@ -16,7 +16,7 @@ STAY_SHARE = 0.5
 """Of those who park, stay for good."""
 _FOR_GOOD_S = 1e5
 _COMMON_MPS = 5.0
-"""How fast somebody is on the way to a place, about."""
+"""Rough speed of a vehicle on the way to a place."""
 _LONGEST_M = 6.0
 _WITHIN_STRIP_M = 0.1
 

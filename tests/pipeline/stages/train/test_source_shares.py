@@ -1,4 +1,4 @@
-"""Sources are read as often as their shares say, whoever trains and wherever it goes on."""
+"""Sources are read as often as their shares say, in any process, and after a restart."""
 
 from collections import Counter
 from dataclasses import replace
