@@ -2,7 +2,7 @@
 
 Two clocks meet here. The car moves every tick (0.025 s), so that keys act at once; the
 world moves in token steps of 0.5 s. ``LEAD_TICKS`` before one is over, its end and the
-beginning of the next one are asked for and computed meanwhile, with the controls held as
+beginning of the next one are requested and computed meanwhile, with the controls held as
 they are at that moment: other agents react to what the ego did up to ``LEAD_TICKS`` before
 their token step begins. Where the driver then does otherwise, the network sees it at the
 end of the next token step.

@@ -166,7 +166,8 @@ def test_a_slot_sees_the_newcomers_before_it_and_not_those_after(network, crowde
         .amax(-1)
     )
     assert gap[:2].max() == 0  # Slot 1 is asked for the second inserted agent itself.
-    assert gap[2:].min() > 1e-5
+    # Unlearned coordinates carry less of it before training: 5e-5 here.
+    assert gap[2:].min() > (1e-5 if network.settings.relations == "rotary" else 1e-4)
 
 
 def test_the_details_of_a_newcomer_do_not_show_the_newcomer(network, crowded, limits):

@@ -84,10 +84,10 @@ def test_who_has_taken_the_place_of_another_begins_anew():
 
 
 def test_who_leaves_and_who_is_not_there_do_not():
-    nobody = everyone((0, 0, 0), (20, 0, 0))
-    nobody.agent_number[0, 0], nobody.presence[0, 1] = NO_AGENT, Presence.REMOVED
+    absent = everyone((0, 0, 0), (20, 0, 0))
+    absent.agent_number[0, 0], absent.presence[0, 1] = NO_AGENT, Presence.REMOVED
 
-    assert ask(stall_rule(), nobody, range(LONG + 1))[-1] == [False, False]
+    assert ask(stall_rule(), absent, range(LONG + 1))[-1] == [False, False]
 
 
 @pytest.mark.parametrize(

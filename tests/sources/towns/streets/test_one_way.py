@@ -18,7 +18,7 @@ SQUARE = Skeleton(
         ([0, 0, 0, 0, 0], True),
         ([1, 0, -1, 1, 1], True),  # Round the square, and both ways across it.
         ([1, 0, 1, 0, 0], False),  # Who comes to node 0 across the square is stuck.
-        ([1, 1, 1, 0, 0], False),  # Nobody comes back to node 0.
+        ([1, 1, 1, 0, 0], False),  # No way back to node 0.
         ([1, 0, 0, -1, 0], False),  # Both lead into node 1, and none out of it.
     ],
 )
