@@ -25,7 +25,7 @@ from pipeline.engine.locks import locked
 if TYPE_CHECKING:
     from infgen.sources.towns.variety import Variety
 
-VERSION = 6
+VERSION = 7
 """Raised when the same order would give other bytes."""
 SHORTEST_S, LONGEST_S = 2.1, 600.0
 STEPS_PER_S = 10

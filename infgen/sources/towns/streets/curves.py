@@ -5,6 +5,10 @@ from jaxtyping import Float64
 
 Points = Float64[np.ndarray, "_ 2"]
 
+MOST_HANDLE = 2 / 3
+"""Longest handle of a curve as a share of the way to the corner, as of an arc."""
+_PARALLEL = 0.01
+
 
 def arc_lengths(xy_m: Points) -> Float64[np.ndarray, " point"]:
     """Distance of every point from the first, along the curve."""
@@ -58,7 +62,10 @@ def end_pose(xy_m: Points) -> Float64[np.ndarray, "3"]:
 def join(
     start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"], spacing_m: float
 ) -> Points:
-    """Join two poses smoothly: nearly an arc where an arc would do (a cubic Bézier)."""
+    """Join two poses smoothly: nearly an arc where an arc would do (a cubic Bézier).
+
+    Where one end is nearer to the corner than the other, the curve stays on its side.
+    """
     chord_m = float(np.linalg.norm(end[:2] - start[:2]))
     turn_rad = abs((end[2] - start[2] + np.pi) % (2 * np.pi) - np.pi)
     # The handles with which a Bézier follows an arc of this chord and turn.
@@ -68,8 +75,9 @@ def join(
         else 1 / 3
     )
     out_m, in_m = (
-        chord_m * arc * np.array([np.cos(pose[2]), np.sin(pose[2])])
-        for pose in (start, end)
+        min(chord_m * arc, MOST_HANDLE * corner_m)
+        * np.array([np.cos(pose[2]), np.sin(pose[2])])
+        for pose, corner_m in zip((start, end), _to_corner(start, end), strict=True)
     )
     corners_m = [start[:2], start[:2] + out_m, end[:2] - in_m, end[:2]]
     part = np.linspace(0.0, 1.0, 65)[:, None]
@@ -81,6 +89,23 @@ def join(
     ]
     fine_m = sum(weight * corner for weight, corner in zip(weights, corners_m, strict=True))
     return resample(np.asarray(fine_m), spacing_m)
+
+
+def _to_corner(
+    start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"]
+) -> tuple[float, float]:
+    """Distances to where two straight lines meet that go on from, and back from, two poses.
+
+    Both infinite where they do not.
+    """
+    (out_x, out_y), (in_x, in_y) = ((np.cos(at[2]), np.sin(at[2])) for at in (start, end))
+    x_m, y_m = end[:2] - start[:2]
+    sine = out_x * in_y - out_y * in_x
+    if abs(sine) < _PARALLEL:
+        return np.inf, np.inf
+    ahead_m = (x_m * in_y - y_m * in_x) / sine
+    behind_m = (out_x * y_m - out_y * x_m) / sine
+    return (ahead_m, behind_m) if min(ahead_m, behind_m) > 0 else (np.inf, np.inf)
 
 
 def chain(*parts: Points) -> Points:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float64
 
 from infgen.scene import RoadEdgeType
 from infgen.sources.towns.streets import curves
@@ -16,6 +17,10 @@ from infgen.sources.towns.streets.curves import Points
 from infgen.sources.towns.streets.network import Edge, Network, Use
 
 CORNER_SPACING_M = 0.5
+OUTWARD_M = 20.0
+"""How far from the junction the order of its arms is taken."""
+DIRECTION_OVER_M = 5.0
+"""Over how much of its end the direction of an arm is taken."""
 LEAST_ISLAND_M = 0.5
 """Islands between two directions are at least twice as wide."""
 
@@ -32,7 +37,6 @@ class RoadEdge:
 class _Arm:
     """A street at a junction: its road edge towards the junction, and away from it."""
 
-    bearing_rad: float
     coming_m: Points
     going_m: Points
 
@@ -42,13 +46,12 @@ def draw_road_edges(network: Network) -> Iterator[RoadEdge]:
     arms: dict[str, list[_Arm]] = {name: [] for name in network.places_m}
     for edge in network.edges.values():
         back = network.edges.get(reverse_of(edge.name))
+        arms[edge.start].append(_arm(edge, back))
         if back is None:
-            arms[edge.start].append(_arm(edge, None, network.places_m[edge.start]))
-            arms[edge.end].append(_arm(None, edge, network.places_m[edge.end]))
-        else:
-            arms[edge.start].append(_arm(edge, back, network.places_m[edge.start]))
+            arms[edge.end].append(_arm(None, edge))
     for around in arms.values():
-        yield from _corners(sorted(around, key=lambda arm: arm.bearing_rad))
+        if around:
+            yield from _corners(_counter_clockwise(around))
     yield from _islands(network)
 
 
@@ -57,7 +60,7 @@ def reverse_of(edge: str) -> str:
     return edge[:-1] + {"f": "b", "b": "f"}.get(edge[-1], "")
 
 
-def _arm(going: Edge | None, coming: Edge | None, position_m: tuple[float, float]) -> _Arm:
+def _arm(going: Edge | None, coming: Edge | None) -> _Arm:
     """Make the arm of an edge that goes out, one that comes in, or both."""
     if going is not None and coming is not None:
         out_m, in_m = going.kerb(), coming.kerb()
@@ -66,8 +69,27 @@ def _arm(going: Edge | None, coming: Edge | None, position_m: tuple[float, float
     else:
         assert coming is not None
         out_m, in_m = coming.middle()[::-1], coming.kerb()
-    x_m, y_m = (out_m[0] + in_m[-1]) / 2 - np.array(position_m)
-    return _Arm(float(np.arctan2(y_m, x_m)), in_m, out_m)
+    return _Arm(in_m, out_m)
+
+
+def _counter_clockwise(arms: list[_Arm]) -> list[_Arm]:
+    """Sort the arms of a junction.
+
+    Where they end may lie on either side of its middle, if streets meet at acute angles:
+    what counts is where they come from.
+    """
+    ends_m = np.array([(arm.going_m[0] + arm.coming_m[-1]) / 2 for arm in arms])
+    outward_m = np.array([_outward(arm) for arm in arms]) * OUTWARD_M
+    x_m, y_m = (ends_m + outward_m - ends_m.mean(axis=0)).T
+    return [arms[at] for at in np.argsort(np.arctan2(y_m, x_m), kind="stable")]
+
+
+def _outward(arm: _Arm) -> Float64[np.ndarray, "2"]:
+    """Return the direction of an arm away from its junction."""
+    ends_m = np.array([0.0, DIRECTION_OVER_M])
+    sides = (arm.going_m, arm.coming_m[::-1])
+    x_m, y_m = sum(np.diff(curves.points_at(side_m, ends_m), axis=0)[0] for side_m in sides)
+    return np.array([x_m, y_m]) / np.hypot(x_m, y_m)
 
 
 def _corners(arms: list[_Arm]) -> Iterator[RoadEdge]:

@@ -25,6 +25,15 @@ def test_a_quarter_turn_is_joined_by_nearly_an_arc():
     assert curves.length(xy_m) == pytest.approx(5 * np.pi, rel=1e-3)
 
 
+def test_a_join_near_its_corner_on_one_side_does_not_swing_beyond_it():
+    start, end = np.array([-2.0, 0.0, 0.0]), np.array([0.0, 30.0, np.pi / 2])
+
+    xy_m = curves.join(start, end, 0.5)
+
+    assert xy_m[:, 0].max() <= 1e-9
+    assert xy_m[:, 1].min() >= -1e-9
+
+
 def test_a_parallel_lies_to_the_left():
     line_m = np.column_stack([np.arange(5.0), np.zeros(5)])
 
