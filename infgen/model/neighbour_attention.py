@@ -291,10 +291,12 @@ def _blind(hidden: Tensor) -> Tensor | None:
 
 def _widen(narrow: Tensor, weight_HCD: Tensor) -> Tensor:
     """Bring what each head has [N, S, H, C] to the space of features: [N, Q, D]."""
-    rows = narrow.flatten(0, 1)
-    wide = rows.new_empty((*rows.shape[:2], weight_HCD.shape[2]))
+    rows = narrow.flatten(0, 1).transpose(0, 1)  # [H, T, C]
+    if narrow.shape[1] == 1:  # A view will do: every head's rows stay where they are.
+        return torch.bmm(rows, weight_HCD).transpose(0, 1)
+    wide = narrow.new_empty((rows.shape[1], len(rows), weight_HCD.shape[2]))
     # Written where it belongs: the copy would cost as much as the product.
-    torch.bmm(rows.transpose(0, 1), weight_HCD, out=wide.transpose(0, 1))
+    torch.bmm(rows, weight_HCD, out=wide.transpose(0, 1))
     return wide.view(len(narrow), narrow.shape[1:3].numel(), weight_HCD.shape[2])
 
 

@@ -120,6 +120,13 @@ class PositionOutputs:
             None if place is None else place[rollouts],
         )
 
+    def put(self, rollouts: Int64[Tensor, " replaced"], others: "PositionOutputs") -> None:
+        """Replace those of some rollouts, in place. Inverse of ``take``."""
+        for each in fields(self):
+            own, new = getattr(self, each.name), getattr(others, each.name)
+            if own is not None:
+                own.index_copy_(0, rollouts, new)
+
 
 @dataclass(frozen=True, slots=True)
 class InsertionDetails:

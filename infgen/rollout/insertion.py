@@ -1,7 +1,7 @@
 """Insertion of agents in one token step, one agent per query of the network."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -23,156 +23,158 @@ INSIDE = 0.999
 UniformNumbers = Callable[[Purpose], Tensor]
 
 
-@dataclass(frozen=True, slots=True)
-class _ActiveRollouts:
-    """Rollouts whose insertion turns go on; nothing is computed for the others.
+@dataclass(slots=True)
+class _Turns:
+    """Insertion turns of a batch: every rollout is at a turn and an attempt of its own.
+
+    So no rollout waits for the rejected positions of another, and the network is asked for
+    many at once. Nothing is computed for rollouts that are done. Changes in place.
 
     Attributes:
         batch: All rollouts.
-        entries: The token step of the active ones, as the network sees it.
-        rollout: Indices of these in the batch.
+        entries: The token step as the network sees it, of all rollouts.
+        query: Latest logits of their positions.
+        numbers: Random numbers.
+        turn: Agents that each rollout has inserted.
+        attempt: Positions rejected in this turn ...
+        tried: ... and their cells.
     """
 
     batch: InsertionState
     entries: Insertions
-    rollout: Int64[np.ndarray, " rollout"]
+    query: PositionOutputs | None
+    numbers: TurnNumbers
+    turn: Int64[np.ndarray, " rollout"]
+    attempt: Int64[np.ndarray, " rollout"]
+    tried: Bool[np.ndarray, "rollout cell"]
 
-    def __len__(self) -> int:
-        return len(self.rollout)
+    @classmethod
+    def of(cls, batch: InsertionState, entries: Insertions, token: int) -> "_Turns":
+        """Begin a token step."""
+        streams = batch.request.streams
+        turn = np.zeros(len(streams), dtype=np.int64)
+        numbers = TurnNumbers.of(streams, token)
+        tried = np.zeros_like(batch.occupied)
+        return cls(batch, entries, None, numbers, turn, turn.copy(), tried)
 
-    def take(self, which: Bool[np.ndarray, " rollout"]) -> "_ActiveRollouts":
-        """Keep some of them."""
-        if which.all():
-            return self
-        places = np.flatnonzero(which)
-        return _ActiveRollouts(
-            batch=self.batch,
-            entries=self.entries.take(self.batch.request.simulator.tensor(places)),
-            rollout=self.rollout[places],
-        )
+    def advance(
+        self, rollouts: Int64[np.ndarray, " active"]
+    ) -> Int64[np.ndarray, " active_"]:
+        """Sample one position of every active rollout; return those that go on."""
+        self.numbers.draw(rollouts, self.turn[rollouts], self.attempt[rollouts])
+        fresh = self.attempt[rollouts] == 0
+        if fresh.any():
+            goes_on = ~fresh
+            goes_on[fresh] = self._query(rollouts[fresh])
+            rollouts = rollouts[goes_on]
+        if not len(rollouts):
+            return rollouts
+        inserted, cell = _sample_agents(self, rollouts)
+        batch = self.batch
+        mask, allowed = batch.request.insertion_mask, inserted.who
+        if mask is not None:
+            allowed = mask.allows(batch.population, inserted, rollouts, batch.circles)
+        placed, rejected = rollouts[allowed], rollouts[~allowed]
+        if len(placed):
+            self._add(placed, inserted.take(np.flatnonzero(allowed)))
+        self.turn[placed] += 1
+        self.attempt[placed], self.tried[placed] = 0, False
+        self.attempt[rejected] += 1
+        self.tried[rejected, cell[~allowed]] = True
+        turns = batch.request.simulator.settings.max_insertions
+        ends = (self.turn >= turns) | (self.attempt >= batch.request.attempts)
+        return rollouts[~ends[rollouts]]
 
-    def add_inserted(self, inserted: InsertedAgents) -> "_ActiveRollouts":
+    def positions(self, rollouts: Int64[np.ndarray, " active"]) -> PositionOutputs:
+        """Return the logits of positions of some rollouts."""
+        assert self.query is not None
+        if len(rollouts) == len(self.turn):
+            return self.query
+        return self.query.take(self.batch.request.simulator.tensor(rollouts))
+
+    def uniforms(self, purpose: Purpose, rollouts: Int64[np.ndarray, " active"]) -> Tensor:
+        """Return a uniform number of each of some rollouts."""
+        numbers = self.numbers.get(purpose, rollouts, self.attempt[rollouts])
+        return self.batch.request.simulator.tensor(numbers)
+
+    def some_entries(self, rollouts: Int64[np.ndarray, " active"]) -> Insertions:
+        """Return the token step of some rollouts, as the network sees it."""
+        if len(rollouts) == len(self.turn):
+            return self.entries
+        return self.entries.take(self.batch.request.simulator.tensor(rollouts))
+
+    def _query(self, rollouts: Int64[np.ndarray, " asked"]) -> Bool[np.ndarray, " asked"]:
+        """Ask whether one more agent is inserted; full rollouts insert none."""
+        batch, request = self.batch, self.batch.request
+        simulator = request.simulator
+        query = simulator.stepper.entry_query(self.some_entries(rollouts))
+        asked = simulator.tensor(rollouts)
+        if self.query is None:  # The first query is of all; a copy, as it will change.
+            self.query = query.take(asked)
+        else:
+            self.query.put(asked, query)
+        bias = simulator.tensor(batch.add_bias(rollouts))
+        uniform = self.uniforms(Purpose.ADD, rollouts)
+        add = simulator.fetch(sample_event(query.add_logit, uniform, bias))[0]
+        # A batch has as many rows as its most crowded scene needs: free rows are no limit.
+        free: np.ndarray = batch.num_agents[rollouts] < request.most[rollouts]
+        return free & add
+
+    def _add(
+        self, rollouts: Int64[np.ndarray, " inserted"], inserted: InsertedAgents
+    ) -> None:
         """Add the inserted agents to the population and to the input of the network."""
         batch, simulator = self.batch, self.batch.request.simulator
-        row = batch.add(self.rollout, inserted)
-        at = self.rollout[row >= 0], row[row >= 0]
+        row = batch.add(rollouts, inserted)
+        at = rollouts[row >= 0], row[row >= 0]
         fresh = np.zeros(batch.cells.shape, dtype=bool)
         fresh[at] = True
         rows = simulator.rows(fresh)
         step = simulator.token_step(batch.population, batch.cells, at)
-        entries = simulator.stepper.entry_add(
+        self.entries = simulator.stepper.entry_add(
             self.entries, self.entries.token_step.put(rows.at, step), rows
         )
-        return replace(self, entries=entries)
 
 
 def insert_agents(
     request: InsertionRequest, memory: StepMemory, population: Population, token: int
 ) -> Population:
-    """Insert agents into every rollout until the network samples BEGIN MOTION."""
+    """Insert agents into every rollout until the network samples BEGIN MOTION.
+
+    A position that is not allowed is sampled again in another cell, up to
+    ``max_insertion_attempts`` times: the network chooses among the allowed positions.
+    """
     simulator, batch = request.simulator, InsertionState.of(request, population)
     entries = simulator.stepper.entry_begin(
         memory,
         simulator.token_step(population, batch.cells),
         simulator.rows(population.visible),
     )
-    active = _ActiveRollouts(batch, entries, np.arange(len(request.streams)))
-    for turn in range(simulator.settings.max_insertions):
-        active, inserted = _insert_next(active, token, turn)
-        if inserted is None:
-            break
-        active = active.add_inserted(inserted)
+    turns = _Turns.of(batch, entries, token)
+    inserts = simulator.settings.max_insertions > 0
+    active = np.arange(len(request.streams) if inserts else 0)
+    while len(active):
+        active = turns.advance(active)
     return batch.population
 
 
-def _insert_next(
-    active: _ActiveRollouts, token: int, turn: int
-) -> tuple[_ActiveRollouts, InsertedAgents | None]:
-    """Sample the next insertion of every active rollout that has a free row.
-
-    Returns:
-        The rollouts that insert an agent, and these agents; None if there are none.
-    """
-    batch, asked = active.batch, np.arange(len(active))
-    request, simulator = batch.request, batch.request.simulator
-    numbers = TurnNumbers(request.streams.take(active.rollout), token, turn)
-    query = simulator.stepper.entry_query(active.entries)
-    bias = simulator.tensor(batch.add_bias(active.rollout))
-    uniform = simulator.tensor(numbers.of(Purpose.ADD, asked))
-    add = sample_event(query.add_logit, uniform, bias)
-    # A batch has as many rows as its most crowded scene needs: free rows are no limit.
-    free = batch.num_agents[active.rollout] < request.most[active.rollout]
-    wanted = simulator.fetch(add)[0] & free
-    places = np.flatnonzero(wanted)
-    if not len(places):
-        return active, None
-    active, query = active.take(wanted), query.take(simulator.tensor(places))
-    found = _sample_positions(active, query, numbers, places)
-    if not found.who.any():
-        return active, None
-    return active.take(found.who), found.take(np.flatnonzero(found.who))
-
-
-def _sample_positions(
-    active: _ActiveRollouts,
-    query: PositionOutputs,
-    numbers: TurnNumbers,
-    number: Int64[np.ndarray, " rollout"],
-) -> InsertedAgents:
-    """Sample an inserted agent of every rollout, and whether its position is allowed.
-
-    A rejected position is sampled again in another cell, up to ``max_insertion_attempts``
-    times: the network chooses among the allowed positions.
-
-    Args:
-        active: The rollouts.
-        query: Logits of their positions.
-        numbers: Random numbers of the turn ...
-        number: ... and the place of each rollout among them.
-    """
-    batch, found = active.batch, None
-    simulator, mask = batch.request.simulator, batch.request.insertion_mask
-    taken, left = batch.occupied[active.rollout], np.ones(len(active), dtype=bool)
-    for attempt in range(batch.request.attempts):
-        asked, places = active.take(left), np.flatnonzero(left)
-        inserted, cell = _sample_agents(
-            asked,
-            query if left.all() else query.take(simulator.tensor(places)),
-            taken if left.all() else taken[places],
-            _attempt_numbers(simulator, numbers, number[places], attempt),
-        )
-        if mask is not None:
-            allowed = mask.allows(batch.population, inserted, asked.rollout, batch.circles)
-            inserted = replace(inserted, who=allowed)
-        found = inserted if found is None else found.put(places, inserted)
-        taken[places, cell] = True
-        left = ~found.who
-        if not left.any():
-            break
-    assert found is not None
-    return found
-
-
-def _attempt_numbers(
-    simulator: Simulator, numbers: TurnNumbers, places: np.ndarray, attempt: int
-) -> UniformNumbers:
-    """Return the uniform numbers of one attempt of some rollouts, by purpose."""
-    return lambda purpose: simulator.tensor(numbers.of(purpose, places, attempt))
-
-
 def _sample_agents(
-    active: _ActiveRollouts,
-    query: PositionOutputs,
-    taken: Bool[np.ndarray, "rollout cell"],
-    uniforms: UniformNumbers,
-) -> tuple[InsertedAgents, Int64[np.ndarray, " rollout"]]:
+    turns: _Turns, rollouts: Int64[np.ndarray, " active"]
+) -> tuple[InsertedAgents, Int64[np.ndarray, " active"]]:
     """Sample position, type, size and heading; return them and the cells.
 
     Everything is sampled where the network is, and fetched at once.
     """
-    simulator, grid = active.batch.request.simulator, active.batch.request.simulator.grid
+    batch, simulator = turns.batch, turns.batch.request.simulator
+    grid, query = simulator.grid, turns.positions(rollouts)
+    taken = batch.occupied[rollouts] | turns.tried[rollouts]
+
+    def uniforms(purpose: Purpose) -> Tensor:
+        return turns.uniforms(purpose, rollouts)
+
     cell, regressed_m = _sample_cell(simulator, query, taken, uniforms)
-    details = simulator.stepper.entry_details(active.entries, cell, regressed_m)
+    entries = turns.some_entries(rollouts)
+    details = simulator.stepper.entry_details(entries, cell, regressed_m)
     agent_type = choose(details.agent_type_logits, uniforms(Purpose.AGENT_TYPE))
     heading = sample_heading(simulator, details, agent_type, uniforms)
     offset_m = None if details.offset_m is None else of_type(details.offset_m, agent_type)

@@ -1,6 +1,6 @@
 """State of a batch while agents are inserted, kept on the host."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int16, Int64
@@ -47,37 +47,50 @@ class InsertionRequest:
         return self.simulator.rules.max_insertion_attempts
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class TurnNumbers:
-    """The uniform numbers of one insertion of some rollouts.
+    """The uniform numbers of the insertions of one token step.
 
     Attributes:
-        streams: Random numbers of these rollouts.
+        streams: Random numbers of the rollouts.
         token: Token step.
-        turn: Which insertion of it.
-        block: Block of four attempts whose numbers are held.
-        places: Rollouts, among these, that numbers are held of, in order.
-        numbers: The numbers [purpose, place, attempt].
+        numbers: Those of four attempts, by purpose: of the turn and the attempts that each
+            rollout is at. Changes in place.
     """
 
     streams: Streams
     token: int
-    turn: int
-    block: int = -1
-    places: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    numbers: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, WORDS)))
+    numbers: Float64[np.ndarray, "purpose rollout 4"]
 
-    def of(
-        self, purpose: Purpose, places: Int64[np.ndarray, " asked"], attempt: int = 0
-    ) -> Float64[np.ndarray, " asked"]:
-        """Return the numbers of one attempt; later ones may ask for fewer rollouts only."""
-        if attempt // WORDS != self.block:
-            self.block, self.places = attempt // WORDS, places
-            self.numbers = self.streams.take(places).uniform_block(
-                self.token, TURN_PURPOSES, self.block, self.turn
+    @classmethod
+    def of(cls, streams: Streams, token: int) -> "TurnNumbers":
+        """Begin a token step; no number is drawn yet."""
+        shape = (len(TURN_PURPOSES), len(streams), WORDS)
+        return cls(streams, token, np.zeros(shape))
+
+    def draw(
+        self,
+        rollouts: Int64[np.ndarray, " asked"],
+        turn: Int64[np.ndarray, " asked"],
+        attempt: Int64[np.ndarray, " asked"],
+    ) -> None:
+        """Draw the numbers of rollouts that are at a first attempt, or at the next four."""
+        begins = attempt % WORDS == 0
+        some, block = rollouts[begins], attempt[begins] // WORDS
+        if len(some):
+            self.numbers[:, some] = self.streams.take(some).uniform_block(
+                self.token, TURN_PURPOSES, block, turn[begins]
             )
-        held = np.searchsorted(self.places, places)
-        return self.numbers[TURN_PURPOSES.index(purpose), held, attempt % WORDS]
+
+    def get(
+        self,
+        purpose: Purpose,
+        rollouts: Int64[np.ndarray, " asked"],
+        attempt: Int64[np.ndarray, " asked"],
+    ) -> Float64[np.ndarray, " asked"]:
+        """Return one number of each rollout, at an attempt that was drawn."""
+        number = TURN_PURPOSES.index(purpose)
+        return self.numbers[number, rollouts, attempt % WORDS]
 
 
 @dataclass(slots=True)

@@ -97,15 +97,26 @@ class Streams:
         return _numbers(words.reshape(len(self), -1)[:, :count])
 
     def uniform_block(
-        self, token: int, purposes: Sequence[Purpose], block: int, turn: int = 0
+        self,
+        token: int,
+        purposes: Sequence[Purpose],
+        block: int | Int64[np.ndarray, " stream"],
+        turn: int | Int64[np.ndarray, " stream"] = 0,
     ) -> Float64[np.ndarray, "purpose stream 4"]:
         """Return four consecutive numbers of each purpose's draw: one evaluation each.
 
-        They are ``uniform(...)[:, WORDS * block : WORDS * (block + 1)]`` of each purpose.
+        They are ``uniform(...)[:, WORDS * block : WORDS * (block + 1)]`` of each purpose,
+        for a block and a turn that all streams share or that each has of its own.
         """
         kinds = np.array(purposes, dtype=np.uint64)
-        words = _philox((1 + block, turn, kinds), token - self.begun, self.key)
+        counter = (1 + _by_stream(block), _by_stream(turn), kinds)
+        words = _philox(counter, token - self.begun, self.key)
         return np.moveaxis(_numbers(words), 1, 0)
+
+
+def _by_stream(word: int | np.ndarray) -> UInt64[np.ndarray, "_ 1"]:
+    """Return a word of every stream, or of all of them, for all draws."""
+    return np.asarray(word, dtype=np.uint64).reshape(-1, 1)
 
 
 def _numbers(words: UInt64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
@@ -114,19 +125,20 @@ def _numbers(words: UInt64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape
 
 
 def _philox(
-    counter: tuple[int | UInt64[np.ndarray, " draw"], ...],
+    counter: tuple[int | UInt64[np.ndarray, "..."], ...],
     token: Int64[np.ndarray, " stream"],
     key: UInt64[np.ndarray, "stream 2"],
 ) -> UInt64[np.ndarray, "stream draw 4"]:
     """Evaluate the generator for every key and every value of the counter.
 
     Args:
-        counter: Its words but the third, lowest first: numbers, or one for every draw.
+        counter: Its words but the third, lowest first: numbers, or one for every draw, of
+            all streams [draw] or of each [stream, draw].
         token: Its third word, of every stream.
         key: Keys, their low words first.
     """
-    draws = np.broadcast_shapes(*(np.shape(word) for word in counter), (1,))
-    multiplied = np.empty((2, len(key), *draws), dtype=np.uint64)  # First and third word.
+    shape = np.broadcast_shapes(*(np.shape(word) for word in counter), (len(key), 1))
+    multiplied = np.empty((2, *shape), dtype=np.uint64)  # First and third word.
     others = np.empty_like(multiplied)
     multiplied[0], others[0], others[1] = counter
     multiplied[1] = token.astype(np.uint64)[:, None]

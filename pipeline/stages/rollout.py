@@ -185,7 +185,7 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=9,
+    version=10,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=simulate,

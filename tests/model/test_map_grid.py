@@ -5,6 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from infgen.model import map_grid
 from infgen.model.map_grid import SIDE_M, MapGrid
 from infgen.model.relations import nearest
 
@@ -45,6 +46,41 @@ def test_neighbours_are_those_of_the_whole_map(seed, roads, radius_m, count):
     wanted = by_looking_at_all(pose, real, xy_m, scene, radius_m, count)
     assert torch.equal(found.present[0], wanted.present[:, 0])
     assert torch.equal(found.index[0], wanted.index[:, 0])
+
+
+@pytest.mark.parametrize("kept", [90, 1 << 14])
+@pytest.mark.parametrize("count", [1, 8, 70])
+def test_lists_of_cells_miss_no_neighbour_as_places_move(monkeypatch, kept, count):
+    monkeypatch.setattr(map_grid, "KEPT_CELLS", kept)
+    pose, real = maps(300, 40, 0, extent_m=60.0)
+    scene = torch.arange(3).repeat(40)
+    xy_m = torch.rand(len(scene), 2) * 7 + 20
+    xy_m[0] = -1e7  # As far away as no cell has a number.
+    grid = MapGrid.of(pose, real)
+
+    for _ in range(6):
+        found = grid.nearest(xy_m, scene, 12.0, count)
+
+        wanted = by_looking_at_all(pose, real, xy_m, scene, 12.0, count)
+        assert torch.equal(found.present[0], wanted.present[:, 0])
+        assert torch.equal(found.index[0], wanted.index[:, 0])
+        assert len(grid.lists[12.0, count].cell) <= kept
+        xy_m = xy_m + 1.3
+
+
+def test_a_cell_lists_few_tokens_once():
+    pose, real = maps(5000, extent_m=300.0)
+    grid = MapGrid.of(pose, real)
+    xy_m = torch.full((100, 2), 150.0) + torch.rand(100, 2)
+    scene = torch.zeros(100, dtype=torch.int64)
+
+    grid.nearest(xy_m, scene, 30.0, 16)
+    first = grid.lists[30.0, 16]
+    grid.nearest(xy_m.flip(0), scene, 30.0, 16)
+
+    assert len(first.cell) <= 4  # A metre may lie in two of them, either way.
+    assert 16 <= int(first.length.min()) <= int(first.length.max()) < 60  # Of 157.
+    assert grid.lists[30.0, 16].at is first.at
 
 
 def test_a_token_is_not_its_own_neighbour():

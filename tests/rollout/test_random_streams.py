@@ -56,6 +56,18 @@ def test_draws_of_a_batch_are_those_of_its_members():
     )
 
 
+def test_each_stream_may_be_at_a_block_and_a_turn_of_its_own():
+    streams, purposes = Streams.of([(0, "abc", n) for n in range(3)]), list(Purpose)
+    block, turn = np.array([0, 2, 1]), np.array([5, 0, 3])
+
+    found = streams.uniform_block(4, purposes, block, turn)
+
+    for number in range(3):
+        own = streams.take(np.array([number]))
+        alone = own.uniform_block(4, purposes, int(block[number]), int(turn[number]))
+        np.testing.assert_array_equal(found[:, [number]], alone)
+
+
 @given(
     index=st.integers(0, 2**31),
     token=st.integers(0, 2**31),
