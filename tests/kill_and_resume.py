@@ -255,7 +255,8 @@ def kill_throughout(
     kills = runs = 0
     try:
         cluster.start(workers)
-        for runs in range(1, TRIES + 1):
+        while runs < TRIES:
+            runs += 1
             running = trial.start(ALL_STAGES[-1], root, "--dask", cluster.words)
             while running.poll() is None:
                 time.sleep(draw.uniform(0, 2 * every_s))
@@ -337,7 +338,7 @@ def main(arguments: list[str] | None = None) -> None:
             each = (asked.throughout, asked.every_s, asked.seed)
             kills, runs = kill_throughout(trial, quiet, *each)
             say(
-                f"{asked.throughout} workers killed {kills} times in a whole report, made by "
+                f"{asked.throughout} workers killed {kills} times in a whole report of "
                 f"{runs} run(s): all bytes equal to --dask none"
             )
 
