@@ -6,7 +6,7 @@
         --set ingest.max_scenes_per_file=6 rollout.max_scenes=6 rollout.count=2 \\
         --victims run worker workers scheduler
     python tests/kill_and_resume.py --profile tiny --kills 0 --workers --throughout 8 \\
-        --records '../towns/*.tfrecord*'
+        --every-s 12 --longest-s 7200 --records '../towns/*.tfrecord*'
 
 For each stage and kill: start the stage, wait until it is at work, SIGKILL a victim at a
 random (seeded) moment, check that all that looks whole is whole, run again, check that only
