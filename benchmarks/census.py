@@ -7,6 +7,8 @@ for each further scene grows with their number.
 
     python benchmarks/census.py                       # roots of 5,000 and 10,000 scenes
     python benchmarks/census.py --files 21 210 1000   # up to WOMD's size: an hour
+    python benchmarks/census.py --files 1 --held-out 150               # simulated whole
+    python benchmarks/census.py --files 1750 --last tokenize           # a million scenes
 """
 
 import argparse
@@ -35,6 +37,12 @@ WOMD_FILES = 1000
 VALIDATION_FILES = 150
 GATHERED = ("ingest", "build-vocab", "tokenize", "train", "calibrate", "rollout")
 SCORED = ("reference", "score", "report")
+STEPS_AFTER = {
+    "tokenize": {"train: index and first batch": "index"},
+    "rollout": {"rollout: split into units": "split", "dask": "schedule"},
+    "score": {"score: split into units": "split"},
+}
+"""What is measured besides commands once a stage is made."""
 UNITLESS = ("train", "calibrate", "report")
 """Their units are made by the command that is measured, or there are none."""
 
@@ -94,6 +102,8 @@ def main() -> None:
     """Measure all roots, print a table, and last one line of JSON."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--files", type=int, nargs="+", default=[10, 21])
+    parser.add_argument("--held-out", type=int, help="Of the files, in proportion if none.")
+    parser.add_argument("--last", choices=[*GATHERED, *SCORED], help="No stage after it.")
     parser.add_argument("--scenes", type=int, nargs=2, default=[487, 296])
     parser.add_argument("--scenes-per-unit", type=int, default=8)
     parser.add_argument("--rollouts", type=int, default=32)
@@ -104,7 +114,7 @@ def main() -> None:
     roots = []
     for files in sorted(asked.files):
         folder = Path(tempfile.mkdtemp(prefix="infgen-census-", dir=asked.folder))
-        held_out = math.ceil(files * VALIDATION_FILES / WOMD_FILES)
+        held_out = asked.held_out or math.ceil(files * VALIDATION_FILES / WOMD_FILES)
         census: dict[str, object] = {
             "files": {"training": files, "validation": held_out},
             "scenes_per_file": dict(
@@ -115,29 +125,25 @@ def main() -> None:
             "seconds": asked.seconds,
         }
         roots.append(Root(folder, census))
-        measure_root(roots[-1])
+        measure_root(roots[-1], asked.last or SCORED[-1])
         if not asked.keep:
             shutil.rmtree(folder)
     report(roots)
 
 
-def measure_root(root: Root) -> None:
-    """Make a root, and measure every command on the way."""
+def measure_root(root: Root, last: str) -> None:
+    """Make a root up to a stage, and measure every command on the way."""
     root.make("write")
     records = ("--records", str(root.folder / "records"), "--profile", "tiny")
     at = ("--root", str(root.folder / "root"))
     root.command("plan, nothing made", "plan", *at, *records)
     for name in ("probe of plan --preset", "plan --preset, probed before"):
         root.command(name, "plan", "--preset", "paper", *at, *records)
-    for stage in GATHERED:
+    stages = (*GATHERED, *SCORED)
+    for stage in stages[: stages.index(last) + 1]:
         _make_stage(root, stage, at)
-        if stage == "tokenize":
-            root.step("train: index and first batch", "index")
-    root.step("rollout: split into units", "split", "rollout")
-    root.step("dask", "schedule", "rollout")
-    for stage in SCORED:
-        _make_stage(root, stage, at)
-    root.step("score: split into units", "split", "score")
+        for name, step in STEPS_AFTER.get(stage, {}).items():
+            root.step(name, step, stage)
     for command in ("status", "plan", "gc", "verify"):
         root.command(command, command, *at)
 

@@ -102,6 +102,7 @@ def schedule(folder: Path, census: Census, stage: str) -> Found:
     request, plan = _planned(folder, census, stage)
     tasks, most, done = _tasks(request, plan, stage), 0, 0
     dask = import_module("distributed")
+    task_bytes = len(import_module("distributed.protocol.pickle").dumps(tasks[-1]))
     cluster = dask.LocalCluster(
         2, threads_per_worker=1, host=LOOPBACK, dashboard_address=":0"
     )
@@ -117,7 +118,12 @@ def schedule(folder: Path, census: Census, stage: str) -> Found:
                 done, most = done + 1, max(most, len(cluster.scheduler.tasks))
         spent_s = time.perf_counter() - begun
         pool.close()
-    return {"tasks": done, "ms_per_task": 1e3 * spent_s / done, "graph_size": most}
+    return {
+        "tasks": done,
+        "ms_per_task": 1e3 * spent_s / done,
+        "graph_size": most,
+        "graph_bytes": most * task_bytes,
+    }
 
 
 def _always() -> bool:

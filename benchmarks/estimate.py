@@ -13,9 +13,9 @@ import tempfile
 from collections import defaultdict
 from pathlib import Path
 
-from pipeline.comparison.estimate import S_PER_HOUR, estimate
+from pipeline.comparison.estimate import S_PER_HOUR, TRAINING, estimate
 from pipeline.comparison.probe import probe
-from pipeline.comparison.runs import SCORE, ArmRun, Comparison, arm_runs_of
+from pipeline.comparison.runs import SCORE, TRAIN, ArmRun, Comparison, arm_runs_of
 from pipeline.comparison.workload import SCORED_LOGS, workload
 from pipeline.engine.events import Events
 from pipeline.engine.layout import Root
@@ -25,6 +25,8 @@ from pipeline.storage.sources.source_files import find_records
 from pipeline.workers.measured import MeasuredWorkers
 
 GOAL = 0.25
+PART_OF = {SCORED_LOGS: SCORE, **dict.fromkeys(TRAINING, TRAIN)}
+"""Stages of what is estimated apart."""
 SETTINGS = ("train.steps=40", "rollout.max_scenes=6", "rollout.count=4")
 
 
@@ -60,8 +62,7 @@ def estimated_s(comparison: Comparison, arm_runs: list[ArmRun]) -> dict[str, flo
     measured = probe(comparison, arm_runs, records, tell=lambda run: None)
     found: dict[str, float] = defaultdict(float)
     for each in estimate(workload(comparison, arm_runs, measured.splits), measured.costs):
-        stage = SCORE if each.stage == SCORED_LOGS else each.stage
-        found[stage] += each.hours * S_PER_HOUR
+        found[PART_OF.get(each.stage, each.stage)] += each.hours * S_PER_HOUR
     return found
 
 

@@ -6,7 +6,7 @@
         --set ingest.max_scenes_per_file=6 rollout.max_scenes=6 rollout.count=2 \\
         --victims run worker workers scheduler
     python tests/kill_and_resume.py --profile tiny --kills 0 --workers --throughout 8 \\
-        --records '../towns/*.tfrecord*'
+        --every-s 12 --longest-s 7200 --records '../towns/*.tfrecord*'
 
 For each stage and kill: start the stage, wait until it is at work, SIGKILL a victim at a
 random (seeded) moment, check that all that looks whole is whole, run again, check that only
@@ -62,7 +62,7 @@ POLL_S = 0.005
 TRIES = 4
 """A kill that comes when all is done does not count; the next draws another moment."""
 KILLS_IN_TURN = 5
-LONGEST_S = 600
+LONGEST_S = 600.0
 CLUSTER_WORKERS = 2
 LOST = "the Dask scheduler"
 FAILED = 1
@@ -75,6 +75,7 @@ class Trial:
     words: tuple[str, ...]
     folder: Path
     starter: Callable[[Sequence[str], Path], Run] = StartedRun
+    longest_s: float = LONGEST_S
 
     @property
     def said(self) -> Path:
@@ -88,7 +89,7 @@ class Trial:
 
     def end(self, running: Run) -> str:
         """Wait for the end of the last run; return all it said."""
-        wait(running, LONGEST_S)
+        wait(running, self.longest_s)
         return self.said.read_text(errors="replace")
 
     def make(self, stage: str, root: Path, *more: str) -> None:
@@ -233,7 +234,7 @@ def compare_workers(
 
 def kill_throughout(
     trial: Trial, quiet: Path, workers: int, every_s: float, seed: int
-) -> int:
+) -> tuple[int, int]:
     """Make all stages by workers of which one after the other is killed; compare the bytes.
 
     A run that a unit failed in, because each of its workers was killed, is run again.
@@ -246,15 +247,16 @@ def kill_throughout(
         seed: Of the moments and victims.
 
     Returns:
-        Number of kills.
+        Number of kills, and of runs.
     """
     root, folder = trial.folder / "killed-throughout", trial.folder / "cluster"
     folder.mkdir(exist_ok=True)
     cluster, draw = Cluster(folder, [str(HERE)]), random.Random(seed)
-    kills = 0
+    kills = runs = 0
     try:
         cluster.start(workers)
-        for _ in range(TRIES):
+        while runs < TRIES:
+            runs += 1
             running = trial.start(ALL_STAGES[-1], root, "--dask", cluster.words)
             while running.poll() is None:
                 time.sleep(draw.uniform(0, 2 * every_s))
@@ -270,7 +272,7 @@ def kill_throughout(
         cluster.stop()
     compare(digest(root, ALL_STAGES), digest(quiet, ALL_STAGES), f"{kills} kills")
     shutil.rmtree(root)
-    return kills
+    return kills, runs
 
 
 def say(line: str) -> None:
@@ -315,6 +317,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--victims", nargs="*", default=["run"], choices=VICTIMS)
     parser.add_argument("--throughout", type=int, default=0, help="workers to be killed")
     parser.add_argument("--every-s", type=float, default=5.0, help="of --throughout")
+    parser.add_argument("--longest-s", type=float, default=LONGEST_S, help="of one run")
     parser.add_argument("--set", nargs="*", default=[], help="stage.key=value")
     asked = parser.parse_args(arguments)
     killed = ALL_STAGES if asked.stages == ["all"] else tuple(asked.stages)
@@ -323,7 +326,7 @@ def main(arguments: list[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         words = ("--records", asked.records, "--profile", asked.profile)
         settings = [word for given in asked.set for word in ("-s", given)]
-        trial = Trial((*words, *settings), Path(folder), ForkedRun)
+        trial = Trial((*words, *settings), Path(folder), ForkedRun, asked.longest_s)
         quiet = trial.folder / "quiet"
         trial.make(stages[-1], quiet)
         say(f"quiet run: {len(digest(quiet, stages))} files of {', '.join(stages)}")
@@ -333,10 +336,10 @@ def main(arguments: list[str] | None = None) -> None:
             say(f"--dask {workers}: all bytes equal to --dask none")
         if asked.throughout:
             each = (asked.throughout, asked.every_s, asked.seed)
-            kills = kill_throughout(trial, quiet, *each)
+            kills, runs = kill_throughout(trial, quiet, *each)
             say(
-                f"{asked.throughout} workers killed {kills} times in a whole report: all "
-                "bytes equal to --dask none"
+                f"{asked.throughout} workers killed {kills} times in a whole report of "
+                f"{runs} run(s): all bytes equal to --dask none"
             )
 
 

@@ -9,12 +9,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from infgen.clock import CLOCK
-from pipeline.comparison.probe import Cost, kind
+from pipeline.comparison.costs import Cost
+from pipeline.comparison.probe import kind
 from pipeline.comparison.runs import ROLLOUT, SCORE, TRAIN
-from pipeline.comparison.workload import ITEMS, Work
+from pipeline.comparison.workload import CHECKPOINTS, ITEMS, VALIDATION, Work
 
 S_PER_HOUR = 3600.0
 CALIBRATE = "calibrate"
+TRAINING = (TRAIN, VALIDATION, CHECKPOINTS)
+"""What one process does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +45,7 @@ class Estimated:
     @property
     def is_scaled(self) -> bool:
         """Whether a budget cuts it: the steps, and the scenes that are simulated."""
-        return self.stage in (TRAIN, ROLLOUT, SCORE)
+        return self.stage in (*TRAINING, ROLLOUT, SCORE)
 
 
 def estimate(work: Iterable[Work], costs: Mapping[str, Cost]) -> list[Estimated]:
@@ -53,16 +56,17 @@ def estimate(work: Iterable[Work], costs: Mapping[str, Cost]) -> list[Estimated]
 def _estimated(work: Work, costs: Mapping[str, Cost]) -> Estimated:
     stage = ROLLOUT if work.stage == CALIBRATE else work.stage
     cost = costs[kind(work.arm_run, stage)]
-    tokens = CLOCK.tokens_in(work.seconds) if stage == ROLLOUT else 0
+    tokens = CLOCK.tokens_in(work.seconds) if work.seconds else 0
     each_s = cost.seconds + cost.per_token * tokens
     each_bytes = cost.bytes + cost.bytes_per_s * work.seconds
+    seconds = work.amount * each_s + work.units * cost.per_unit
     kept = work.stage != CALIBRATE  # Its rollouts are only counted.
     return Estimated(
         stage=work.stage,
-        run=work.arm_run.words if work.stage in (TRAIN, ROLLOUT, SCORE) else "",
+        run=work.arm_run.words if work.stage in (*TRAINING, ROLLOUT, SCORE) else "",
         amount=work.amount,
         items=ITEMS[work.stage],
-        hours=work.amount * each_s / S_PER_HOUR,
+        hours=seconds / S_PER_HOUR,
         bytes=work.amount * each_bytes if kept else 0.0,
         files=round(work.units * cost.files),
     )
@@ -92,7 +96,7 @@ class Budget:
 
 def clock_hours(found: Iterable[Estimated], workers: int) -> float:
     """Hours by the clock: units run on all workers at once, training on one process."""
-    hours = (one.hours / (1 if one.stage == TRAIN else workers) for one in found)
+    hours = (one.hours / (1 if one.stage in TRAINING else workers) for one in found)
     return sum(hours, 0.0)
 
 

@@ -14,13 +14,20 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
-from infgen.clock import CLOCK
 from infgen.sources.tfrecord import Record, frame
+from pipeline.comparison.costs import (
+    Cost,
+    cost_of_files,
+    cost_of_rollouts,
+    cost_of_scores,
+    costs_of_training,
+)
 from pipeline.comparison.runs import ROLLOUT, SCORE, TRAIN, ArmRun, Comparison
 from pipeline.comparison.workload import (
+    CHECKPOINTS,
     SCORED_LOGS,
+    VALIDATION,
     Split,
     count_splits,
     first_records,
@@ -29,7 +36,6 @@ from pipeline.engine import machine
 from pipeline.engine.atomic import StoreError, write_json
 from pipeline.engine.events import Events
 from pipeline.engine.layout import Root, read_json
-from pipeline.engine.manifest import read_manifest
 from pipeline.engine.plan import PlanError, digest
 from pipeline.engine.runner import RunOptions, run
 from pipeline.storage.sources.source_files import RawRecords
@@ -38,49 +44,32 @@ from pipeline.workers.measured import MeasuredUnit, MeasuredWorkers
 
 FILES, RECORDS_EACH = 8, 2
 """Records that are read: of so many files of each split, and of each file."""
-SAMPLE_FILES = 2
-"""Files that they are written to: of every stage the first unit, which loads its code, is
-not counted."""
-PLAYED_SCENES, PLAYED_S = 3, 4.0
+SAMPLE_FILES, LARGE_SHARE = 3, 6
+"""Files that they are written to. The last one gets so many of every eight, each other one:
+units of two sizes tell what a unit takes from what a scene does, besides the first, which
+loads code and is not counted."""
+PLAYED_SCENES, PLAYED_TOGETHER = 4, 2
+PLAYED_S, SHORT_S = 6.0, 2.0
+"""Length of the rollouts, and of those whose scores tell what each further second takes."""
 MOST_PLAYED = 16
 """Rollouts of a scene. As many as the settings say, up to this: they are simulated at once,
 and one of several takes less than one alone."""
-FEW_STEPS, MORE_STEPS = 1, 3
-"""Training runs whose difference is that of their steps."""
+FEW_STEPS, MORE_STEPS = 1, 4
+"""Steps of two training runs ..."""
+FEW_VALIDATED, MORE_VALIDATED = 1, 8
+"""... and scenes of the validation that ends each."""
 SETTINGS = {
     "train.warmup_steps": 1,
-    "train.batch_scenes": 1,
     "train.gradient_accumulation": 1,
     "train.checkpoint_every_steps": 0,
-    "train.validation_scenes": 1,
+    "train.validate_every_steps": 0,
     "calibrate.method": "none",
     "rollout.max_scenes": PLAYED_SCENES,
-    "rollout.scenes_per_unit": 1,
+    "rollout.scenes_per_unit": PLAYED_TOGETHER,
 }
-WOSAC = "wosac"
-OWN_FILES = 2
-"""Of a unit, besides those of its stage: its manifest, and what is said of its run."""
-GPU_BATCH = 16
-"""Scenes of a training step on a GPU, where launches cost as much for one."""
-
-
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """What one item of a stage's work takes.
-
-    Attributes:
-        seconds: Of a core, or of a GPU by the clock.
-        per_token: Of these, those of one token step; 0 for stages that are no rollouts.
-        bytes: On disk.
-        bytes_per_s: On disk, for each second of a rollout.
-        files: Of one unit.
-    """
-
-    seconds: float
-    per_token: float = 0.0
-    bytes: float = 0.0
-    bytes_per_s: float = 0.0
-    files: float = 0.0
+LONG, WOSAC = "long", "wosac"
+CPU_BATCH, GPU_BATCH = 4, 16
+"""Most scenes of a training step: some of what it takes is the same for one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +128,12 @@ def probe(
             "probe": [
                 FILES,
                 RECORDS_EACH,
+                LARGE_SHARE,
                 MOST_PLAYED,
-                PLAYED_S,
+                [PLAYED_S, SHORT_S],
+                [CPU_BATCH, GPU_BATCH],
+                MORE_STEPS,
+                MORE_VALIDATED,
                 SETTINGS,
                 platform.python_version(),
             ],
@@ -153,7 +146,8 @@ def probe(
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix="probe-", dir=path.parent))
     try:
-        costs = _measure(comparison, probed, records, folder, tell)
+        _write_sample(records, folder / "records")
+        costs = _measure(comparison, probed, splits, folder, tell)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     found = Probe(costs, splits, time.perf_counter() - begun)
@@ -198,58 +192,84 @@ def _read(path: Path, key: str) -> Probe | None:
 def _measure(
     comparison: Comparison,
     arm_runs: Sequence[ArmRun],
-    records: RawRecords,
+    splits: Mapping[str, Split],
     folder: Path,
     tell: Callable[[str], None],
 ) -> dict[str, Cost]:
-    _write_sample(records, folder / "records")
     by_clock = bool(machine.describe()["gpus"])
-    batch = GPU_BATCH if by_clock else 1
-    settings = SETTINGS | {"train.batch_scenes": batch}
     found: dict[str, Cost] = {}
     for arm_run in arm_runs:
         tell(arm_run.words)
-        sample, watched = (
-            _sample(comparison, arm_run, settings, folder),
-            MeasuredWorkers(by_clock),
-        )
-        trained = kind(arm_run, TRAIN)
-        if trained not in found:
-            loads_code = () if found else (FEW_STEPS + 1,)
-            for steps in (*loads_code, FEW_STEPS, MORE_STEPS):
-                _run(_with_steps(sample, steps), arm_run, watched)
-            few, more = watched.samples.pop(TRAIN)[-2:]
-            per_step = (more.seconds - few.seconds) / (MORE_STEPS - FEW_STEPS)
-            found[trained] = Cost(max(per_step, 0.0) / batch, files=float(_num_files(more)))
-        whole = replace(_with_steps(sample, MORE_STEPS), targets=comparison.targets)
-        _run(whole, arm_run, watched)
-        seconds = whole.plan(arm_run)[ROLLOUT].settings.duration_s
-        for name, samples in _by_work(watched.samples).items():
-            found.setdefault(kind(arm_run, name), _cost(name, samples, seconds))
+        watched = MeasuredWorkers(by_clock)
+        sample = _sample(comparison, arm_run, GPU_BATCH if by_clock else CPU_BATCH, folder)
+        if kind(arm_run, TRAIN) not in found:
+            found |= _train(sample, arm_run, watched, loads_code=not found)
+        sample = replace(_of_length(sample, *_LONGER), targets=comparison.targets)
+        _run(sample, arm_run, watched)
+        played = _take(watched)
+        if sample.plan(arm_run)[ROLLOUT].settings.mode != WOSAC:
+            words = (*sample.overrides, f"rollout.seconds={SHORT_S}")
+            _run(replace(sample, overrides=words), arm_run, watched)
+        short = _take(watched)
+        seconds = sample.plan(arm_run)[ROLLOUT].settings.duration_s
+        for name, samples in played.items():
+            if name == SCORE:
+                cost = cost_of_scores(samples, short.get(SCORE, ()), seconds, SHORT_S)
+            elif name == ROLLOUT:
+                cost = cost_of_rollouts(samples, seconds)
+            else:
+                cost = cost_of_files(name, samples, splits)
+            found.setdefault(kind(arm_run, name), cost)
     return found
 
 
-def _by_work(
-    samples: Mapping[str, Sequence[MeasuredUnit]],
-) -> dict[str, Sequence[MeasuredUnit]]:
-    """Tell the units of stage ``score`` that score logs from those of rollouts."""
-    scored = samples.get(SCORE, ())
-    found = {
-        **samples,
-        SCORE: [sample for sample in scored if "rollouts" in sample.report],
-        SCORED_LOGS: [sample for sample in scored if "logs" in sample.report],
+_SHORTER, _LONGER = (FEW_STEPS, FEW_VALIDATED), (MORE_STEPS, MORE_VALIDATED)
+
+
+def _train(
+    sample: Comparison, arm_run: ArmRun, watched: MeasuredWorkers, *, loads_code: bool
+) -> dict[str, Cost]:
+    """Measure training; with ``loads_code``, after a run that only loads its code."""
+    first = ((FEW_STEPS + 1, FEW_VALIDATED),) if loads_code else ()
+    for length in (*first, _SHORTER, _LONGER):
+        _run(_of_length(sample, *length), arm_run, watched)
+    few, many = watched.samples.pop(TRAIN)[-2:]
+    batch = sample.plan(arm_run)[TRAIN].settings["train"].batch_scenes
+    found = costs_of_training(few, many, batch, (FEW_VALIDATED, MORE_VALIDATED))
+    parts = {
+        TRAIN: found.steps,
+        VALIDATION: found.validation,
+        CHECKPOINTS: found.checkpoint,
     }
+    return {kind(arm_run, name): cost for name, cost in parts.items()}
+
+
+def _take(watched: MeasuredWorkers) -> dict[str, list[MeasuredUnit]]:
+    """Take what was measured, but training; units that score logs are apart."""
+    found = dict(watched.samples)
+    watched.samples.clear()
+    found.pop(TRAIN, None)
+    scored = found.pop(SCORE, [])
+    found[SCORE] = [sample for sample in scored if "rollouts" in sample.report]
+    found[SCORED_LOGS] = [sample for sample in scored if "logs" in sample.report]
     return {name: some for name, some in found.items() if some}
 
 
 def _sample(
-    comparison: Comparison, arm_run: ArmRun, settings: Mapping[str, Any], folder: Path
+    comparison: Comparison, arm_run: ArmRun, most_scenes: int, folder: Path
 ) -> Comparison:
-    """Let runs be short ones, of the sample."""
-    played = comparison.sketch(arm_run)[ROLLOUT].settings
-    own = {**settings, "rollout.count": min(played.count, MOST_PLAYED)}
+    """Let runs be short ones, of the sample, with so many scenes of a step at most."""
+    plan = comparison.sketch(arm_run)
+    played, trained = plan[ROLLOUT].settings, plan[TRAIN].settings["train"]
+    own = {
+        **SETTINGS,
+        "train.batch_scenes": min(trained.batch_scenes, most_scenes),
+        "rollout.count": min(played.count, MOST_PLAYED),
+    }
     if played.mode != WOSAC:  # Waymo's protocol fixes the length of its rollouts.
         own["rollout.seconds"] = PLAYED_S
+    if played.mode == LONG and not played.removal_radius_m:
+        own["rollout.remove"] = "false"  # Untrained weights remove nearly all agents.
     words = (f"{name}={value}" for name, value in own.items())
     return replace(
         comparison,
@@ -259,10 +279,10 @@ def _sample(
     )
 
 
-def _with_steps(sample: Comparison, steps: int) -> Comparison:
-    """Let runs only train, so many steps."""
-    words = (*sample.overrides, f"train.steps={steps}")
-    return replace(sample, overrides=words, targets=(TRAIN,))
+def _of_length(sample: Comparison, steps: int, validated: int) -> Comparison:
+    """Let runs only train, so many steps, and validate so many scenes in the end."""
+    words = (f"train.steps={steps}", f"train.validation_scenes={validated}")
+    return replace(sample, overrides=(*sample.overrides, *words), targets=(TRAIN,))
 
 
 def _run(sample: Comparison, arm_run: ArmRun, watched: MeasuredWorkers) -> None:
@@ -279,60 +299,18 @@ def _run(sample: Comparison, arm_run: ArmRun, watched: MeasuredWorkers) -> None:
 
 
 def _write_sample(records: RawRecords, folder: Path) -> None:
-    """Write the first records of some files of each split."""
+    """Write the first records of some files of each split, as files of two sizes."""
     folder.mkdir()
     splits: dict[str, list[str]] = {}
     for url in records.urls:
         splits.setdefault(split_of(url.rsplit("/", 1)[-1]), []).append(url)
     for split, urls in splits.items():
         found = first_records(urls, FILES, RECORDS_EACH)
-        data = [frame(each.data) for each in found if isinstance(each, Record)]
-        for at in range(SAMPLE_FILES):
-            name = f"{split}.tfrecord-{at:05d}-of-{SAMPLE_FILES:05d}"
-            (folder / name).write_bytes(b"".join(data[at::SAMPLE_FILES]))
-
-
-def _cost(stage: str, samples: Sequence[MeasuredUnit], seconds: float) -> Cost:
-    """Work out what one item takes, from all units but the first."""
-    samples = samples[1:] or samples
-    stored = sum(_num_bytes(sample) for sample in samples)
-    each_unit = sum(_num_files(sample) for sample in samples) / len(samples)
-    if stage == ROLLOUT:
-        return _rollout_cost(samples, seconds, stored, each_unit)
-    items = max(1, sum(_items(stage, sample.report) for sample in samples))
-    spent = sum(sample.seconds for sample in samples)
-    return Cost(spent / items, bytes=stored / items, files=each_unit)
-
-
-def _num_bytes(sample: MeasuredUnit) -> int:
-    return sum(size for size, _ in read_manifest(sample.folder)["files"].values())
-
-
-def _num_files(sample: MeasuredUnit) -> int:
-    return len(read_manifest(sample.folder)["files"]) + OWN_FILES
-
-
-def _rollout_cost(
-    samples: Sequence[MeasuredUnit], seconds: float, stored: int, files: float
-) -> Cost:
-    """Split what a rollout takes in what its scene does and what each token step does."""
-    tokens = CLOCK.tokens_in(seconds)
-    rollouts = max(1, sum(sample.report["rollouts"] for sample in samples))
-    stepping = sum(sample.marks[-1] - sample.marks[0] for sample in samples)
-    steps = sum(len(sample.marks) - 1 for sample in samples)
-    spent = sum(sample.seconds for sample in samples)
-    per_token = stepping / max(1, steps) * tokens
-    share = min(per_token * len(samples), spent) / rollouts
-    return Cost(
-        seconds=max(0.0, spent / rollouts - share),
-        per_token=share / tokens,
-        bytes_per_s=stored / rollouts / seconds,
-        files=files,
-    )
-
-
-def _items(stage: str, report: Mapping[str, Any]) -> int:
-    """How many items a unit did."""
-    if stage == "build-vocab":
-        return int(report["learn"]) + int(report["held-out"])
-    return int(report[{SCORE: "rollouts", SCORED_LOGS: "logs"}.get(stage, "scenes")])
+        files: list[list[bytes]] = [[] for _ in range(SAMPLE_FILES)]
+        for at, record in enumerate(each for each in found if isinstance(each, Record)):
+            turn = at % (SAMPLE_FILES - 1 + LARGE_SHARE)
+            files[min(turn, SAMPLE_FILES - 1)].append(frame(record.data))
+        written = [each for each in files if each]
+        for at, data in enumerate(written):
+            name = f"{split}.tfrecord-{at:05d}-of-{len(written):05d}"
+            (folder / name).write_bytes(b"".join(data))

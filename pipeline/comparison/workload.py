@@ -16,11 +16,15 @@ COUNTED_FILES = 2
 """Files of each split whose records are counted; the others count as much as their mean."""
 SCORED_LOGS = "score of logs"
 """The units of stage ``score`` that score logs; runs with the same settings share them."""
+VALIDATION, CHECKPOINTS = "validation of training", "checkpoints"
+"""Parts of stage ``train`` besides its steps."""
 ITEMS = {
     "ingest": "scenes",
     "build-vocab": "scenes",
     "tokenize": "scenes",
     "train": "scenes shown",
+    VALIDATION: "scenes",
+    CHECKPOINTS: "checkpoints",
     "calibrate": "rollouts",
     "rollout": "rollouts",
     "reference": "scenes",
@@ -57,7 +61,7 @@ class Work:
         arm_run: The run that makes it.
         amount: How many of ``ITEMS``.
         units: Units that it is cut into.
-        seconds: Length of its rollouts; 0 for other stages.
+        seconds: Length of the rollouts it simulates or scores; 0 for other stages.
     """
 
     stage: str
@@ -124,6 +128,9 @@ def workload(
                 known.add(key)
                 work = _work(arm_run, plan.stages, planned, splits)
                 found += [work] if work.amount else []
+                if name == TRAIN:
+                    most = plan.stages["ingest"].settings.max_scenes_per_file
+                    found += _besides_steps(arm_run, planned, splits, most)
         if SCORE in plan.stages:
             key = (SCORED_LOGS, f"{plan['reference'].key} {plan[SCORE].settings}")
             if key not in known:
@@ -166,6 +173,29 @@ def _work(
     scenes = min(scenes, played.max_scenes or scenes)
     units = -(-scenes // played.scenes_per_unit)
     return Work(name, arm_run, scenes * played.count, units, played.duration_s)
+
+
+def _besides_steps(
+    arm_run: ArmRun, planned: PlannedStage, splits: Splits, most: int
+) -> list[Work]:
+    """Count the validations and checkpoints of training, those in the end among them."""
+    how: TrainSettings = planned.settings["train"]
+    if not how.steps:
+        return []
+    validations = 1 + (
+        how.steps // how.validate_every_steps if how.validate_every_steps else 0
+    )
+    held_out = _limited(splits.get(how.validation_split, Split(0, 0, 0)), most)
+    saved = 1 + (
+        (how.steps - 1) // how.checkpoint_every_steps if how.checkpoint_every_steps else 0
+    )
+    amounts = {
+        VALIDATION: validations * min(how.validation_scenes, held_out),
+        CHECKPOINTS: saved,
+    }
+    return [
+        Work(name, arm_run, amount, units=1) for name, amount in amounts.items() if amount
+    ]
 
 
 def _calibration(arm_run: ArmRun, settings: Mapping[str, Any]) -> Work:

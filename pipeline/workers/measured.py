@@ -16,14 +16,18 @@ class MeasuredUnit:
     """One unit of work, measured.
 
     Attributes:
+        name: Its name.
         seconds: That it used.
         marks: The same, so far, whenever it reported progress.
+        done: What it reported each time.
         folder: What it wrote.
         report: What it reported.
     """
 
+    name: str
     seconds: float
     marks: tuple[float, ...]
+    done: tuple[float, ...]
     folder: Path
     report: Mapping[str, Any]
 
@@ -64,15 +68,18 @@ class MeasuredWorkers:
 
     def _measure(self, task: Task) -> Outcome:
         marks: list[float] = []
+        reported: list[float] = []
         begun = self._now()
 
         def mark(done: float | int, total: float | int, note: str = "") -> None:
             marks.append(self._now() - begun)
+            reported.append(float(done))
 
         outcome = attempt(task, mark)
         seconds = self._now() - begun
         if outcome.report is not None:
-            sample = MeasuredUnit(seconds, tuple(marks), task.target, outcome.report)
+            times = (seconds, tuple(marks), tuple(reported))
+            sample = MeasuredUnit(task.unit.name, *times, task.target, outcome.report)
             self.samples.setdefault(str(task.about["stage"]), []).append(sample)
         return outcome
 

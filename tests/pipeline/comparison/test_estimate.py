@@ -7,10 +7,18 @@ import pytest
 from infgen.errors import ConfigError
 from infgen.sources.towns import builtin_records
 from pipeline.commands.estimates import hours_of, num_workers
+from pipeline.comparison.costs import Cost
 from pipeline.comparison.estimate import Budget, Estimated, clock_hours, estimate, fit
-from pipeline.comparison.probe import Cost, kind
+from pipeline.comparison.probe import kind
 from pipeline.comparison.runs import Comparison, arm_runs_of
-from pipeline.comparison.workload import SCORED_LOGS, Split, count_splits, workload
+from pipeline.comparison.workload import (
+    CHECKPOINTS,
+    SCORED_LOGS,
+    VALIDATION,
+    Split,
+    count_splits,
+    workload,
+)
 from pipeline.engine.layout import Root
 from pipeline.engine.plan import PlanError
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
@@ -95,6 +103,23 @@ def test_rollouts_of_calibration_are_counted(tmp_path):
     assert amounts(found, "calibrate")["infgen, seed 0, long"] % 48 == 0
 
 
+def test_validations_and_checkpoints_of_training_are_counted(tmp_path):
+    words = ("train.steps=1000", "train.checkpoint_every_steps=400")
+    often = "train.validate_every_steps=250"
+
+    found = work_of(comparison(tmp_path, *words, often))
+
+    # After 400, 800 and all 1,000 steps; 4 times on the way and once in the end.
+    assert set(amounts(found, CHECKPOINTS).values()) == {3}
+    assert set(amounts(found, VALIDATION).values()) == {5 * 64}
+
+
+def test_few_held_out_scenes_are_all_validated(tmp_path):
+    found = work_of(comparison(tmp_path), WOMD | {"validation": Split(2, 20, 2)})
+
+    assert set(amounts(found, VALIDATION).values()) == {20}
+
+
 def test_a_split_that_no_record_is_of_is_named(tmp_path):
     with pytest.raises(
         PlanError, match=r"no file of split 'validation'.*there is training"
@@ -114,12 +139,13 @@ def test_hours_bytes_and_files_follow_from_costs(tmp_path):
         for each in work_of(comparison(tmp_path))
         if (each.stage, each.arm_run.words) == ("rollout", "smart, seed 0, wosac")
     ]
-    # 8 s are 16 token steps: 2 + 16 * 0.5 seconds for each of 44,000 * 32 rollouts.
-    cost = Cost(seconds=2.0, per_token=0.5, bytes_per_s=10.0, files=4.0)
+    # 8 s are 16 token steps: 2 + 16 * 0.5 seconds for each of 44,000 * 32 rollouts, and
+    # a minute for each unit of 8 scenes.
+    cost = Cost(seconds=2.0, per_unit=60.0, per_token=0.5, bytes_per_s=10.0, files=4.0)
 
     (found,) = estimate([work], {kind(work.arm_run, "rollout"): cost})
 
-    assert found.hours == pytest.approx(44_000 * 32 * 10 / HOUR)
+    assert found.hours == pytest.approx((44_000 * 32 * 10 + 5_500 * 60) / HOUR)
     assert found.bytes == 44_000 * 32 * 80
     assert found.files == 44_000 // 8 * 4
 
