@@ -89,7 +89,7 @@ class MapGrid:
         order: Tokens by square, those that are none last.
         xy_m: Where the tokens are, in the order of ``order``.
         longest: Most tokens of so many consecutive squares, as far as it is known.
-        lists: Lists of cells by radius and count, as far as they were asked for.
+        lists: Lists of cells by radius and count, as far as they were requested.
     """
 
     corner_m: Float32[Tensor, "scene 2"]
