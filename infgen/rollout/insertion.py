@@ -27,8 +27,8 @@ UniformNumbers = Callable[[Purpose], Tensor]
 class _Turns:
     """Insertion turns of a batch: every rollout is at a turn and an attempt of its own.
 
-    So no rollout waits for the rejected positions of another, and the network is queried for
-    many at once. Nothing is computed for rollouts that are done. Changes in place.
+    So no rollout waits for the rejected positions of another, and the network is queried
+    for many at once. Nothing is computed for rollouts that are done. Changes in place.
 
     Attributes:
         batch: All rollouts.
