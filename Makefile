@@ -33,7 +33,7 @@ format: $(INSTALLED)
 	$(BIN)/ruff format $(CODE)
 
 # Those that look at an experiment want to be told which one.
-OF_A_ROOT := $(addprefix benchmarks/,setting_off.py traffic_drift.py towns_pictures.py tune_radius.py)
+OF_A_ROOT := $(addprefix benchmarks/,score_ratios.py setting_off.py traffic_drift.py towns_pictures.py tune_radius.py)
 
 bench: $(INSTALLED)
 	for script in $(filter-out $(OF_A_ROOT),$(wildcard benchmarks/*.py)); do \
