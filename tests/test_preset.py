@@ -199,6 +199,18 @@ def test_a_dry_run_says_what_is_left_to_make(desk, capsys):
     assert "train" not in out
 
 
+def test_a_dry_run_plans_policy_gradient_before_the_weights_it_starts_from(desk, capsys):
+    arms = ("--arms", "infgen", "--seeds", "1")
+    capsys.readouterr()
+
+    preset = ("--preset", "womd-mini-fine-tuned", *arms)
+    code = call("run", "report", *preset, *FROM, "-n", "--json")
+
+    assert code == 0
+    runs = json.loads(capsys.readouterr().out)["runs"]
+    assert {run["note"] for run in runs if "infgen" in run["run"]} == {"after closed-loop"}
+
+
 def test_a_failing_arm_is_named_beside_those_that_are_there_and_the_exit_code_is_1(
     desk, capsys
 ):

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from infgen.config import TrainSettings
 from infgen.errors import ConfigError
 from pipeline.engine.atomic import write_json
 from pipeline.engine.layout import Root
@@ -16,6 +17,7 @@ from pipeline.settings.overlay import Overlay, SettingValue, merge_overlays, rea
 from pipeline.settings.presets import Arm, Preset
 from pipeline.settings.request import Request, read_request, request_file
 from pipeline.settings.stages_file import DEFAULT_FILE, StagesFile
+from pipeline.storage.initial_weights import BUILTIN
 
 TRAIN, ROLLOUT, SCORE, REPORT = "train", "rollout", "score", "report"
 PRESET = "preset"
@@ -169,20 +171,28 @@ class Comparison:
             section: {"seed": SettingValue(arm_run.seed, f"--seeds: {section}")}
             for section in _SEEDED
         }
-        if start is not None:
-            own[TRAIN]["initial_weights"] = SettingValue(
-                start, f"weights of arm {arm_run.arm.starts_from}: {TRAIN}"
-            )
         words = read_overrides(self.overrides, self.file.sections)
         for section in _SEEDED:
             if "seed" in words.values.get(section, {}):
                 raise ConfigError(f"-s {section}.seed: {_NO_SEED}")
-        return [
-            arm_run.settings,
-            *self.file.profile_overlays(self.profile),
-            words,
-            Overlay((), own),
-        ]
+        over = [arm_run.settings, *self.file.profile_overlays(self.profile), words]
+        start = start or self._stand_in(arm_run, over)
+        if start is not None:
+            own[TRAIN]["initial_weights"] = SettingValue(
+                start, f"weights of arm {arm_run.arm.starts_from}: {TRAIN}"
+            )
+        return [*over, Overlay((), own)]
+
+    def _stand_in(self, arm_run: ArmRun, over: list[Overlay]) -> str | None:
+        """Weights to plan with while those that the arm starts from are not there.
+
+        None leaves the setting as it is; only policy gradient cannot do without any.
+        """
+        if arm_run.arm.starts_from is None:
+            return None
+        chosen = self.file.choose(self._profile(arm_run), between=over)
+        how = chosen.build(TRAIN, TrainSettings)
+        return BUILTIN if how.policy_gradient_rollouts else None
 
 
 def arm_runs_of(comparison: Comparison, arms: Sequence[Arm], seeds: int) -> list[ArmRun]:

@@ -295,7 +295,9 @@ def test_the_packaged_presets_compare_all_methods_of_the_paper_and_all_ablations
             radius = "score.presence_radius_m=75" in arm.rollout_sets["long"].words
             assert radius == (arm.published != "InfGen")
         assert preset.arms["catk"].starts_from == "smart"
-    assert file.preset("womd-mini").towns == {}
+    tuned = file.preset("womd-mini-fine-tuned")
+    assert tuned.arms["infgen"].starts_from == "closed-loop"
+    assert file.preset("womd-mini").towns == tuned.towns == {}
     towns = file.preset("towns-benchmark").towns
     assert {split: each.seconds for split, each in towns.items()} == {
         "training": 9.1,
