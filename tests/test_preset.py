@@ -208,7 +208,9 @@ def test_a_dry_run_plans_policy_gradient_before_the_weights_it_starts_from(desk,
 
     assert code == 0
     runs = json.loads(capsys.readouterr().out)["runs"]
-    assert {run["note"] for run in runs if "infgen" in run["run"]} == {"after closed-loop"}
+    assert {run["note"] for run in runs if "infgen" in run["run"]} == {
+        "after policy-gradient"
+    }
 
 
 def test_a_failing_arm_is_named_beside_those_that_are_there_and_the_exit_code_is_1(
