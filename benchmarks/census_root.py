@@ -21,7 +21,6 @@ import polars as pl
 from infgen.scene import Scene
 from infgen.sources.tfrecord import frame
 from infgen.sources.womd_write import encode_scenario
-from pipeline.comparison.probe import RECORDS_EACH
 from pipeline.engine.atomic import MANIFEST
 from pipeline.engine.inputs import FinishedInputs
 from pipeline.engine.layout import RUN
@@ -87,19 +86,17 @@ def scenario_id(split: str, file: int, record: int) -> str:
 def write_records(folder: Path, census: Census, scene: Scene) -> None:
     """Write TFRecords: whole scenes in the first of each split, a few bytes in the others.
 
-    Stages only ever decode those of the first, and the probe of ``plan --preset`` the first
-    records of any file; fingerprints tell all of them apart.
+    Stages only ever decode those of the first, and the probe of ``plan --preset`` takes
+    usable ones only; fingerprints tell all of them apart.
     """
     folder.mkdir(parents=True)
     blank = b"x" * ID_DIGITS
     placed = encode_scenario(replace(scene, scenario_id=blank.decode()))
     for split, files in census.files.items():
         for file in range(files):
-            whole = census.scenes_per_file[split] if file == 0 else RECORDS_EACH
+            content = blank if file else placed
             records = (
-                (placed if row < whole else blank).replace(
-                    blank, scenario_id(split, file, row).encode(), 1
-                )
+                content.replace(blank, scenario_id(split, file, row).encode(), 1)
                 for row in range(census.scenes_per_file[split])
             )
             path = folder / f"{split}.tfrecord-{file:05d}-of-{files:05d}"

@@ -72,6 +72,18 @@ def read_scenario_id(data: bytes) -> str:
         raise RecordError(f"not a usable Scenario message: {error}") from error
 
 
+def count_tracks(data: bytes) -> int:
+    """Count the tracks of a ``Scenario`` record, without decoding them.
+
+    Raises:
+        RecordError: if it is no sound message.
+    """
+    try:
+        return len(_by_number(data)[_TRACKS])
+    except WireError as error:
+        raise RecordError(f"not a usable Scenario message: {error}") from error
+
+
 def _decode_scene(data: bytes) -> Scene:
     fields = _by_number(data)
     if not fields[_TRACKS]:

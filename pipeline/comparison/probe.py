@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from infgen.sources.tfrecord import Record, frame
 from pipeline.comparison.costs import (
     Cost,
     cost_of_files,
@@ -24,13 +23,18 @@ from pipeline.comparison.costs import (
     costs_of_training,
 )
 from pipeline.comparison.runs import ROLLOUT, SCORE, TRAIN, ArmRun, Comparison
+from pipeline.comparison.sample import (
+    RECORDS,
+    SMALL,
+    SMALL_FILES,
+    read_sizes,
+    write_sample,
+)
 from pipeline.comparison.workload import (
     CHECKPOINTS,
     SCORED_LOGS,
     VALIDATION,
     Split,
-    count_splits,
-    first_records,
 )
 from pipeline.engine import machine
 from pipeline.engine.atomic import StoreError, write_json
@@ -39,25 +43,19 @@ from pipeline.engine.layout import Root, read_json
 from pipeline.engine.plan import PlanError, digest
 from pipeline.engine.runner import RunOptions, run
 from pipeline.storage.sources.source_files import RawRecords
-from pipeline.storage.splits import split_of
 from pipeline.workers.measured import MeasuredUnit, MeasuredWorkers
 
-FILES, RECORDS_EACH = 8, 2
-"""Records that are read: of so many files of each split, and of each file."""
-SAMPLE_FILES, LARGE_SHARE = 3, 6
-"""Files that they are written to. The last one gets so many of every eight, each other one:
-units of two sizes tell what a unit takes from what a scene does, besides the first, which
-loads code and is not counted."""
 PLAYED_SCENES, PLAYED_TOGETHER = 4, 2
 PLAYED_S, SHORT_S = 6.0, 2.0
 """Length of the rollouts, and of those whose scores tell what each further second takes."""
 MOST_PLAYED = 16
 """Rollouts of a scene. As many as the settings say, up to this: they are simulated at once,
 and one of several takes less than one alone."""
-FEW_STEPS, MORE_STEPS = 1, 4
-"""Steps of two training runs ..."""
-FEW_VALIDATED, MORE_VALIDATED = 1, 8
-"""... and scenes of the validation that ends each."""
+FEW_STEPS, LEAST_STEPS = 1, 4
+"""Steps of two training runs: of one, and as many more as show every scene of the sample,
+but so many at least."""
+FEW_VALIDATED, MORE_VALIDATED = 1, RECORDS
+"""Scenes of the validation that ends each."""
 SETTINGS = {
     "train.warmup_steps": 1,
     "train.gradient_accumulation": 1,
@@ -126,14 +124,13 @@ def probe(
             "records": sorted(records.urls),
             "settings": {each.name: _keys(comparison, each) for each in probed},
             "probe": [
-                FILES,
-                RECORDS_EACH,
-                LARGE_SHARE,
+                RECORDS,
+                [SMALL_FILES, SMALL],
                 MOST_PLAYED,
                 [PLAYED_S, SHORT_S],
                 [CPU_BATCH, GPU_BATCH],
-                MORE_STEPS,
-                MORE_VALIDATED,
+                [FEW_STEPS, LEAST_STEPS],
+                [FEW_VALIDATED, MORE_VALIDATED],
                 SETTINGS,
                 platform.python_version(),
             ],
@@ -142,11 +139,12 @@ def probe(
     known = _read(path, key)
     if known is not None:
         return known
-    splits = count_splits(records)
+    sizes = read_sizes(records)
+    splits = {name: each.split for name, each in sizes.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix="probe-", dir=path.parent))
     try:
-        _write_sample(records, folder / "records")
+        write_sample(sizes, folder / "records", PLAYED_SCENES)
         costs = _measure(comparison, probed, splits, folder, tell)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -204,7 +202,8 @@ def _measure(
         sample = _sample(comparison, arm_run, GPU_BATCH if by_clock else CPU_BATCH, folder)
         if kind(arm_run, TRAIN) not in found:
             found |= _train(sample, arm_run, watched, loads_code=not found)
-        sample = replace(_of_length(sample, *_LONGER), targets=comparison.targets)
+        longer = _of_length(sample, _steps(sample, arm_run), MORE_VALIDATED)
+        sample = replace(longer, targets=comparison.targets)
         _run(sample, arm_run, watched)
         played = _take(watched)
         if sample.plan(arm_run)[ROLLOUT].settings.mode != WOSAC:
@@ -223,18 +222,17 @@ def _measure(
     return found
 
 
-_SHORTER, _LONGER = (FEW_STEPS, FEW_VALIDATED), (MORE_STEPS, MORE_VALIDATED)
-
-
 def _train(
     sample: Comparison, arm_run: ArmRun, watched: MeasuredWorkers, *, loads_code: bool
 ) -> dict[str, Cost]:
     """Measure training; with ``loads_code``, after a run that only loads its code."""
     first = ((FEW_STEPS + 1, FEW_VALIDATED),) if loads_code else ()
-    for length in (*first, _SHORTER, _LONGER):
+    shorter = (FEW_STEPS, FEW_VALIDATED)
+    longer = (_steps(sample, arm_run), MORE_VALIDATED)
+    for length in (*first, shorter, longer):
         _run(_of_length(sample, *length), arm_run, watched)
     few, many = watched.samples.pop(TRAIN)[-2:]
-    batch = sample.plan(arm_run)[TRAIN].settings["train"].batch_scenes
+    batch = _batch(sample, arm_run)
     found = costs_of_training(few, many, batch, (FEW_VALIDATED, MORE_VALIDATED))
     parts = {
         TRAIN: found.steps,
@@ -242,6 +240,16 @@ def _train(
         CHECKPOINTS: found.checkpoint,
     }
     return {kind(arm_run, name): cost for name, cost in parts.items()}
+
+
+def _batch(sample: Comparison, arm_run: ArmRun) -> int:
+    batch: int = sample.sketch(arm_run)[TRAIN].settings["train"].batch_scenes
+    return batch
+
+
+def _steps(sample: Comparison, arm_run: ArmRun) -> int:
+    """Count the steps of the longer run: one that is not counted, and an epoch."""
+    return max(LEAST_STEPS, 1 + -(-RECORDS // _batch(sample, arm_run)))
 
 
 def _take(watched: MeasuredWorkers) -> dict[str, list[MeasuredUnit]]:
@@ -296,21 +304,3 @@ def _run(sample: Comparison, arm_run: ArmRun, watched: MeasuredWorkers) -> None:
         if result.state == "failed":
             why = next(iter(result.errors.values()))
             raise PlanError(f"the probe of {arm_run.words} failed: {result.stage}: {why}")
-
-
-def _write_sample(records: RawRecords, folder: Path) -> None:
-    """Write the first records of some files of each split, as files of two sizes."""
-    folder.mkdir()
-    splits: dict[str, list[str]] = {}
-    for url in records.urls:
-        splits.setdefault(split_of(url.rsplit("/", 1)[-1]), []).append(url)
-    for split, urls in splits.items():
-        found = first_records(urls, FILES, RECORDS_EACH)
-        files: list[list[bytes]] = [[] for _ in range(SAMPLE_FILES)]
-        for at, record in enumerate(each for each in found if isinstance(each, Record)):
-            turn = at % (SAMPLE_FILES - 1 + LARGE_SHARE)
-            files[min(turn, SAMPLE_FILES - 1)].append(frame(record.data))
-        written = [each for each in files if each]
-        for at, data in enumerate(written):
-            name = f"{split}.tfrecord-{at:05d}-of-{len(written):05d}"
-            (folder / name).write_bytes(b"".join(data))

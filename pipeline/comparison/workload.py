@@ -1,19 +1,13 @@
 """How much work the runs of a comparison are: scenes, steps, rollouts; nothing is run."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any
 
 from infgen.config import ReferenceSettings, RolloutSettings, TrainSettings, VocabSettings
-from infgen.sources.tfrecord import iter_records
 from pipeline.comparison.runs import SCORE, TRAIN, ArmRun, Comparison
 from pipeline.engine.plan import PlanError, PlannedStage
-from pipeline.storage.sources.source_files import RawRecords
-from pipeline.storage.splits import split_of
 
-COUNTED_FILES = 2
-"""Files of each split whose records are counted; the others count as much as their mean."""
 SCORED_LOGS = "score of logs"
 """The units of stage ``score`` that score logs; runs with the same settings share them."""
 VALIDATION, CHECKPOINTS = "validation of training", "checkpoints"
@@ -69,41 +63,6 @@ class Work:
     amount: int
     units: int
     seconds: float = 0.0
-
-
-def count_splits(records: RawRecords) -> dict[str, Split]:
-    """Count the records of a few files of each split.
-
-    Raises:
-        PlanError: if there are scene files, whose work cannot be estimated.
-    """
-    if records.scenes:
-        raise PlanError(
-            f"{records.scenes[0].files.name} is no TFRecord; estimates are made of "
-            "TFRecords only (`infgen plan` without --preset says what would be made)"
-        )
-    files: dict[str, list[str]] = {}
-    for url in records.urls:
-        files.setdefault(split_of(url.rsplit("/", 1)[-1]), []).append(url)
-    return {split: _count(urls) for split, urls in files.items()}
-
-
-def _count(urls: Sequence[str]) -> Split:
-    counted = some_of(urls, COUNTED_FILES)
-    records = sum(sum(1 for _ in iter_records(url)) for url in counted)
-    return Split(len(urls), round(records * len(urls) / len(counted)), len(counted))
-
-
-def some_of(urls: Sequence[str], most: int) -> list[str]:
-    """Choose files, evenly spread over all."""
-    count = min(most, len(urls))
-    return [urls[at * len(urls) // count] for at in range(count)]
-
-
-def first_records(urls: Sequence[str], files: int, each: int) -> Iterator[Any]:
-    """Read the first records of some files."""
-    for url in some_of(urls, files):
-        yield from islice(iter_records(url), each)
 
 
 def workload(

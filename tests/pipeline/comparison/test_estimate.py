@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from infgen.errors import ConfigError
-from infgen.sources.towns import builtin_records
 from pipeline.commands.estimates import hours_of, num_workers
 from pipeline.comparison.costs import Cost
 from pipeline.comparison.estimate import Budget, Estimated, clock_hours, estimate, fit
@@ -16,13 +15,11 @@ from pipeline.comparison.workload import (
     SCORED_LOGS,
     VALIDATION,
     Split,
-    count_splits,
     workload,
 )
 from pipeline.engine.layout import Root
 from pipeline.engine.plan import PlanError
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
-from pipeline.storage.sources.source_files import RawRecords
 
 WOMD = {"training": Split(1000, 487_000, 2), "validation": Split(150, 44_000, 2)}
 HOUR = 3600.0
@@ -125,12 +122,6 @@ def test_a_split_that_no_record_is_of_is_named(tmp_path):
         PlanError, match=r"no file of split 'validation'.*there is training"
     ):
         work_of(comparison(tmp_path), {"training": WOMD["training"]})
-
-
-def test_records_are_counted_in_files_of_each_split():
-    found = count_splits(RawRecords([str(path) for path in builtin_records()], []))
-
-    assert found == {"training": Split(2, 24, 2), "validation": Split(1, 8, 1)}
 
 
 def test_hours_bytes_and_files_follow_from_costs(tmp_path):
