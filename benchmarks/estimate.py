@@ -60,7 +60,7 @@ def _arguments() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("records", nargs="*", default=["builtin"])
     parser.add_argument("--preset", default="womd-mini")
-    parser.add_argument("--profile", default="small")
+    parser.add_argument("--profile", default="small", help="Empty for none.")
     parser.add_argument("--arms", nargs="+", default=["infgen"], help=f"Or: {EVERY}.")
     parser.add_argument("-s", dest="settings", nargs="+", default=list(SETTINGS))
     parser.add_argument("--folder", type=Path, help="Where; default: for temporary files.")
@@ -75,7 +75,7 @@ def _requested(asked: argparse.Namespace, root: Path) -> tuple[Comparison, list[
         path=DEFAULT_FILE,
         file=file,
         preset=file.preset(asked.preset),
-        profile=asked.profile,
+        profile=asked.profile or None,
         overrides=tuple(asked.settings),
         records=tuple(asked.records),
         targets=("score",),
