@@ -1,4 +1,4 @@
-"""``benchmarks/census.py`` and ``ingest_files.py`` on a few scenes: every step of them."""
+"""Benchmarks of size on a few scenes: every step of them."""
 
 import importlib
 import json
@@ -88,3 +88,18 @@ def test_files_of_tiny_scenes_are_ingested_and_counted():
     assert (figures["files"], figures["scenes_per_file"]) == (2, 60)
     assert figures["files_per_unit"] <= 6
     assert figures["cpu_s_per_unit"] > 0
+
+
+@pytest.mark.slow
+def test_two_versions_of_the_code_are_measured_on_the_same_records():
+    script, checkout = str(BENCHMARKS / "two_versions.py"), str(BENCHMARKS.parent)
+    words = [sys.executable, script, checkout, checkout, "--files", "1"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+
+    assert done.returncode == 0, done.stderr[-3000:]
+    figures = json.loads(done.stdout.splitlines()[-1])
+    older, newer = figures["older"], figures["newer"]
+    assert older["unit"].keys() == newer["unit"].keys() == {"ingest", "tokenize"}
+    assert older["unit"]["tokenize"] == newer["unit"]["tokenize"]
+    assert all(cpu_s > 0 for (cpu_s,) in newer["cpu_s"].values())
+    assert {"status", "plan", "verify", "gc", "train, one step"} < newer["cpu_s"].keys()
