@@ -127,9 +127,6 @@ def _figures(points: Sequence[Measured]) -> dict[str, object]:
             command: [round(one.rows[command].cpu_s, 2) for one in points]
             for command in points[0].rows
         },
-        "peak_mib": {
-            command: round(points[-1].rows[command].peak_mib) for command in points[0].rows
-        },
         "cpu_s_per_unit": {
             command: round(per_unit(points, command), 4) for command in points[0].rows
         },
