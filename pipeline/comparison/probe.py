@@ -25,8 +25,7 @@ from pipeline.comparison.costs import (
 from pipeline.comparison.runs import ROLLOUT, SCORE, TRAIN, ArmRun, Comparison
 from pipeline.comparison.sample import (
     RECORDS,
-    SMALL,
-    SMALL_FILES,
+    SINGLES,
     read_sizes,
     write_sample,
 )
@@ -125,7 +124,7 @@ def probe(
             "settings": {each.name: _keys(comparison, each) for each in probed},
             "probe": [
                 RECORDS,
-                [SMALL_FILES, SMALL],
+                SINGLES,
                 MOST_PLAYED,
                 [PLAYED_S, SHORT_S],
                 [CPU_BATCH, GPU_BATCH],

@@ -22,10 +22,10 @@ from pipeline.storage.splits import split_of
 
 RECORDS = 16
 """That are read, of each split."""
-SMALL_FILES, SMALL = 2, 2
-"""Files of the sample, and records of each, besides a last one that gets all others: units
-of two sizes tell what a unit takes from what a scene does, besides the first, which loads
-code and is not counted."""
+SINGLES = 2
+"""Files of one record each, besides a last one that gets all others: units of two sizes
+tell what a unit takes from what a scene does. One more is before them: the first unit loads
+code, and is not counted."""
 COUNTED_FILES, MORE_FILES, ENOUGH_RECORDS = 2, 8, 400
 """Files of each split whose records are counted, and more of them where there are fewer
 than so many records."""
@@ -127,7 +127,7 @@ def choose(sizes: Sequence[RecordSize], count: int = RECORDS) -> list[RecordSize
 
 
 def arrange(chosen: Sequence[RecordSize], played: int) -> list[list[RecordSize]]:
-    """Put records in files, each of which is like all of them.
+    """Put records in files: of one record each, together like all of them, and a large one.
 
     Args:
         chosen: The records.
@@ -136,9 +136,8 @@ def arrange(chosen: Sequence[RecordSize], played: int) -> list[list[RecordSize]]
     if not chosen:
         return []
     left = list(chosen)
-    files: list[list[RecordSize]] = []
-    while len(files) < SMALL_FILES and len(left) > SMALL:
-        files.append(_take(left, chosen, SMALL))
+    singles = _take(left, chosen, min(SINGLES, len(left) - 1))
+    first = _take(left, chosen, min(1, len(left) - 1))
     # Few scenes are simulated, and those of the last file are like all too.
     before = len(chosen) - len(left)
     rows = {at * len(chosen) // played - before for at in range(played)}
@@ -146,8 +145,7 @@ def arrange(chosen: Sequence[RecordSize], played: int) -> list[list[RecordSize]]
     last = dict(zip(typical, _take(left, chosen, len(typical)), strict=True))
     others = iter(left)
     rest = [last.get(row) or next(others) for row in range(len(last) + len(left))]
-    # The first unit is not counted: those that are most alike go to the second.
-    return [*files[::-1], rest]
+    return [*([one] for one in first + singles), rest]
 
 
 def _take(
