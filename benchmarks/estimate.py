@@ -50,10 +50,10 @@ def main() -> None:
             return
         command = [sys.executable, *sys.argv, "--root", folder]
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-        expected: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
-        print(f"estimated: {json.dumps(expected)}", file=sys.stderr, flush=True)
-        taken, besides_s = taken_s(comparison, arm_runs)
-        report(expected, taken, besides_s)
+        expected: list[dict[str, float]] = json.loads(done.stdout.splitlines()[-1])
+        taken, besides_s = taken_s(comparison, arm_runs, expected)
+        print(f"{'not estimated':14}{'':12}{besides_s:10.1f}")
+        print(json.dumps(figures(expected[-1], taken, besides_s)))
 
 
 def _arguments() -> argparse.ArgumentParser:
@@ -84,20 +84,27 @@ def _requested(asked: argparse.Namespace, root: Path) -> tuple[Comparison, list[
     return comparison, arm_runs_of(comparison, comparison.preset.chosen(names), 1)
 
 
-def estimated_s(comparison: Comparison, arm_runs: list[ArmRun]) -> dict[str, float]:
-    """Estimated seconds of each stage."""
+def estimated_s(comparison: Comparison, arm_runs: list[ArmRun]) -> list[dict[str, float]]:
+    """Estimated seconds of each stage: of the first run, of the first two, and so on."""
     records = find_records(comparison.records)
     measured = probe(comparison, arm_runs, records, tell=lambda run: None)
-    found: dict[str, float] = defaultdict(float)
-    for each in estimate(workload(comparison, arm_runs, measured.splits), measured.costs):
-        found[PART_OF.get(each.stage, each.stage)] += each.hours * S_PER_HOUR
-    return found
+    sums = []
+    for count in range(1, len(arm_runs) + 1):
+        found: dict[str, float] = defaultdict(float)
+        work = workload(comparison, arm_runs[:count], measured.splits)
+        for each in estimate(work, measured.costs):
+            found[PART_OF.get(each.stage, each.stage)] += each.hours * S_PER_HOUR
+        sums.append(found)
+    return sums
 
 
 def taken_s(
-    comparison: Comparison, arm_runs: list[ArmRun]
+    comparison: Comparison, arm_runs: list[ArmRun], expected: list[dict[str, float]]
 ) -> tuple[dict[str, float], float]:
-    """Seconds that the units of each stage truly took, and those of all else."""
+    """Seconds that the units of each stage truly took, and those of all else.
+
+    After each run the table so far is printed: the work may be ended before all is done.
+    """
     workers = MeasuredWorkers(by_clock=False)
 
     def taken() -> dict[str, float]:
@@ -107,35 +114,47 @@ def taken_s(
         }
 
     def options(plan: Plan) -> RunOptions:
-        print(f"taken so far: {json.dumps(taken())}", file=sys.stderr, flush=True)
         return RunOptions(workers=workers)
 
     begun = time.process_time()
-    for ran in execute_arm_runs(comparison, arm_runs, options, Events(comparison.root)):
-        if not ran.is_whole:
-            raise RuntimeError(f"{ran.arm_run.words}: {ran.why}")
+    events = Events(comparison.root)
+    for count in range(1, len(arm_runs) + 1):
+        # Those before are found made; weights that others go on from are among them.
+        for ran in execute_arm_runs(comparison, arm_runs[:count], options, events):
+            if not ran.is_whole:
+                raise RuntimeError(f"{ran.arm_run.words}: {ran.why}")
+        show(f"{count} of {len(arm_runs)} runs", expected[count - 1], taken())
     all_s = time.process_time() - begun
     return taken(), all_s - sum(taken().values())
 
 
-def report(
-    expected: Mapping[str, float], taken: Mapping[str, float], besides_s: float
-) -> None:
-    """Print the table and the line of JSON."""
-    print(f"{'CPU seconds':14}{'estimated':>12}{'taken':>10}{'ratio':>8}")
+def rows_of(
+    expected: Mapping[str, float], taken: Mapping[str, float]
+) -> dict[str, tuple[float, float]]:
+    """Estimated and taken seconds of each stage, and of all."""
     rows = {stage: (expected[stage], taken[stage]) for stage in taken}
-    rows["all"] = (sum(expected.values()), sum(taken.values()))
-    for stage, (ours, true) in rows.items():
-        print(f"{stage:14}{ours:12.1f}{true:10.1f}{ours / true:8.2f}")
-    print(f"{'not estimated':14}{'':12}{besides_s:10.1f}")
+    return rows | {"all": (sum(expected.values()), sum(taken.values()))}
+
+
+def show(title: str, expected: Mapping[str, float], taken: Mapping[str, float]) -> None:
+    """Print a table."""
+    print(f"{title:14}{'estimated':>12}{'taken':>10}{'ratio':>8}  CPU seconds")
+    for stage, (ours, true) in rows_of(expected, taken).items():
+        print(f"{stage:14}{ours:12.1f}{true:10.1f}{ours / true:8.2f}", flush=True)
+
+
+def figures(
+    expected: Mapping[str, float], taken: Mapping[str, float], besides_s: float
+) -> dict[str, object]:
+    """Everything, JSON-able."""
+    rows = rows_of(expected, taken)
     ours, true = rows["all"]
-    figures = {
+    return {
         "off": round(ours / true - 1, 3),
         "goal": GOAL,
         "rows": {stage: [round(x, 2) for x in pair] for stage, pair in rows.items()},
         "not_estimated": round(besides_s, 1),
     }
-    print(json.dumps(figures))
 
 
 if __name__ == "__main__":
