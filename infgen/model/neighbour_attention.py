@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from infgen.model.rotary.turns import turned, turned_back
+from infgen.model.rotary.turns import turned_back, turned_first
 
 HIDDEN_SCORE = -1e9
 """Score of what a target does not see: its weight is exactly zero beside any other."""
@@ -143,6 +143,12 @@ def attend_to_pairs(
 
 
 class _Attend(torch.autograd.Function):
+    """Products with neighbours are made a few targets at a time, and others at once.
+
+    Wide queries, of features first and of relations behind them, are made again in the
+    backward pass.
+    """
+
     @staticmethod
     def forward(
         ctx: Any,
@@ -162,42 +168,38 @@ class _Attend(torch.autograd.Function):
         turn: Tensor | None,
     ) -> Tensor:
         learns = any(ctx.needs_input_grad)
+        (targets, neighbours), width = index.shape, features.shape[1]
         queries = query.shape[1] * query.shape[2]
-        count = len(query) if learns else 0
-        weight = query.new_empty((count, queries, index.shape[1]))
-        saw = query.new_empty((count, queries, features.shape[1]))
-        related = query.new_empty((count, queries, relation.shape[2]))
-        summed = torch.empty_like(query)
-        blind = _blind(hidden)
-        for part, near in _parts(query, features, index):
-            turns = None if turn is None else turn[part, None]
-            used = _scores(
-                (
-                    turned(_widen(query[part], key), turns),
-                    _widen(query[part], relation_key),
-                ),
-                (near, relation[part]),
-                hidden[part],
-            )
-            used = _softmax(used).to(query.dtype)
+        asked = turned_first(_widen(query[None], torch.cat([key, relation_key], 2)), turn)
+        cover, blind = hidden * HIDDEN_SCORE, _blind(hidden)
+        kept = None if kept is None else kept.flatten(1, 2)
+        weight = query.new_empty((targets if learns else 0, queries, neighbours))
+        saw = query.new_empty((targets, queries, width))
+        related = query.new_empty((targets, queries, relation.shape[2]))
+        total = query.new_empty((targets, queries))
+        for part, near in _parts(queries, features, index):
+            sources = near, relation[part]
+            score = _products(asked[part], sources)
+            _by_slot(score, hidden[part]).add_(cover[part, :, None])
+            used = _softmax(score).to(query.dtype)
             if blind is not None:
                 _by_slot(used, hidden[part]).masked_fill_(blind[part, :, None], 0.0)
             if learns:
                 weight[part] = used
             if kept is not None:
-                used = used * kept[part].flatten(1, 2)
-            looked = turned_back(torch.bmm(used, near), turns)
-            beside = torch.bmm(used, relation[part])
-            if learns:
-                saw[part], related[part] = looked, beside
-            found = torch.bmm(_by_head(looked, key), value.mT)
-            found.baddbmm_(_by_head(beside, key), relation_value.mT)
-            summed[part] = found.transpose(0, 1).view_as(summed[part])
-            total = used.sum(dim=-1).view(*summed[part].shape[:3], 1)
-            summed[part].addcmul_(total, value_bias)
+                used = used * kept[part]
+            torch.bmm(used, near, out=saw[part])
+            torch.bmm(used, sources[1], out=related[part])
+            torch.sum(used, dim=-1, out=total[part])
+        saw = turned_back(saw, None if turn is None else turn[:, None])
+        found = torch.bmm(_by_head(saw, key), value.mT)
+        found.baddbmm_(_by_head(related, key), relation_value.mT)
+        summed = torch.empty_like(query)
+        found = found.transpose(0, 1).view_as(query)
+        torch.addcmul(found, total.view(*query.shape[:3], 1), value_bias, out=summed)
         ctx.save_for_backward(
             query, key, value, relation_key, relation_value, value_bias,
-            features, index, relation, weight, saw, related, kept, turn,
+            features, index, relation, weight, saw, related, total, kept, turn,
         )  # fmt: skip
         ctx.pulled = pulled
         return summed
@@ -207,69 +209,60 @@ class _Attend(torch.autograd.Function):
     def backward(ctx: Any, pull: Tensor) -> tuple[Tensor | None, ...]:
         (
             query, key, value, relation_key, relation_value, value_bias,
-            features, index, relation, weight, saw, related, kept, turn,
+            features, index, relation, weight, saw, related, total, kept, turn,
         ) = ctx.saved_tensors  # fmt: skip
-        pull = pull.contiguous()
-        to_query, to_features = torch.empty_like(query), torch.zeros_like(features)
-        to_key, to_value = torch.zeros_like(key), torch.zeros_like(value)
-        to_relation_key = torch.zeros_like(relation_key)
-        to_relation_value = torch.zeros_like(relation_value)
-        to_bias = torch.zeros_like(value_bias)
+        queries, width = weight.shape[1], features.shape[1]
         shared = ctx.needs_input_grad[9]
         first = ctx.pulled.tensor is None
         if shared and first:
             ctx.pulled.tensor = torch.empty_like(relation, dtype=torch.float32)
-        for part, near in _parts(query, features, index):
-            turns = None if turn is None else turn[part, None]
-            to_saw = turned(_widen(pull[part], value), turns)
-            to_related = _widen(pull[part], relation_value)
-            used, factor = weight[part], 1.0
-            if kept is not None:
-                factor = kept[part].flatten(1, 2)
-            dropped = used * factor
-            to_score = torch.bmm(to_saw, near.mT)
-            to_score.baddbmm_(to_related, relation[part].mT)
-            to_total = (pull[part] * value_bias).sum(dim=-1).flatten(1)
-            to_score.add_(to_total[..., None]).mul_(factor)
-            to_score.sub_((to_score * used).sum(dim=-1, keepdim=True)).mul_(used)
-
-            asked = (
-                turned_back(torch.bmm(to_score, near), turns),
-                torch.bmm(to_score, relation[part]),
-            )
-            pulled = torch.bmm(_by_head(asked[0], key), key.mT)
-            pulled.baddbmm_(_by_head(asked[1], key), relation_key.mT)
-            to_query[part] = pulled.transpose(0, 1).view_as(to_query[part])
-
-            given = query[part].flatten(0, 1).permute(1, 2, 0)  # [H, C, T]
-            to_key.baddbmm_(given, _by_head(asked[0], key))
-            to_relation_key.baddbmm_(given, _by_head(asked[1], key))
-            given = pull[part].flatten(0, 1).permute(1, 2, 0)
-            to_value.baddbmm_(given, _by_head(saw[part], key))
-            to_relation_value.baddbmm_(given, _by_head(related[part], key))
-            total = dropped.sum(dim=-1).view(*pull[part].shape[:3], 1)
-            to_bias += (pull[part] * total).sum(dim=(0, 1))
-
-            both = torch.cat([to_score, dropped], dim=1).mT  # [N, K, 2 Q]
-            widened = torch.cat([turned(_widen(query[part], key), turns), to_saw], dim=1)
-            _add_rows(to_features, index[part], torch.bmm(both, widened))
+        wide = torch.cat(
+            [torch.cat([key, value]), torch.cat([relation_key, relation_value])], 2
+        )
+        pair = turned_first(_widen(torch.stack([query, pull]), wide), turn)
+        to_total = (pull * value_bias).sum(dim=-1).flatten(1)
+        to_saw, to_related = torch.empty_like(saw), torch.empty_like(related)
+        to_features = torch.zeros_like(features)
+        for part, near in _parts(queries, features, index):
+            sources, used = (near, relation[part]), weight[part]
+            both = used.new_empty((len(used), 2 * queries, used.shape[2]))
+            to_score, dropped = both.split(queries, dim=1)
+            to_used = _products(pair[part, queries:], sources)
+            to_used.add_(to_total[part, :, None])
+            if kept is None:
+                dropped.copy_(used)
+            else:
+                torch.mul(used, kept[part], out=dropped)
+                to_used.mul_(kept[part])
+            to_used.sub_((to_used * used).sum(dim=-1, keepdim=True))
+            torch.mul(to_used, used, out=to_score)
+            torch.bmm(to_score, near, out=to_saw[part])
+            torch.bmm(to_score, sources[1], out=to_related[part])
+            to_near = torch.bmm(both.mT, pair[part, :, :width])
+            _add_rows(to_features, index[part], to_near)
             if shared:
-                widened = torch.cat([_widen(query[part], relation_key), to_related], dim=1)
-                _add_product(ctx.pulled.tensor[part], both, widened, first=first)
+                more = both.mT, pair[part, :, width:]
+                _add_product(ctx.pulled.tensor[part], *more, first=first)
+        to_saw = turned_back(to_saw, None if turn is None else turn[:, None])
+        pulled = torch.bmm(_by_head(to_saw, key), key.mT)
+        pulled.baddbmm_(_by_head(to_related, key), relation_key.mT)
+        asked, given = (each.flatten(0, 1).permute(1, 2, 0) for each in (query, pull))
         return (
-            to_query, to_key, to_value, to_relation_key, to_relation_value, to_bias,
+            pulled.transpose(0, 1).reshape(query.shape),
+            torch.bmm(asked, _by_head(to_saw, key)),
+            torch.bmm(given, _by_head(saw, key)),
+            torch.bmm(asked, _by_head(to_related, key)),
+            torch.bmm(given, _by_head(related, key)),
+            (pull * total.view(*pull.shape[:3], 1)).sum(dim=(0, 1)),
             to_features, None, None, None, None, None, None, None,
         )  # fmt: skip
 
 
-def _parts(
-    query: Tensor, features: Tensor, index: Tensor
-) -> Iterator[tuple[slice, Tensor]]:
+def _parts(queries: int, features: Tensor, index: Tensor) -> Iterator[tuple[slice, Tensor]]:
     """Take targets a few at a time; yield which, and their neighbours' features."""
     targets, neighbours = index.shape
     few = max(1, targets)
     if features.device.type == "cpu":
-        queries = query.shape[1] * query.shape[2]
         few = max(1, CACHED_NUMBERS // ((neighbours + 2 * queries) * features.shape[1]))
     few = min(few, max(1, targets))
     # One buffer for all of them: a fresh one each time costs more than to fill it.
@@ -289,15 +282,14 @@ def _blind(hidden: Tensor) -> Tensor | None:
     return blind if blind.device.type != "cpu" or bool(blind.any()) else None
 
 
-def _widen(narrow: Tensor, weight_HCD: Tensor) -> Tensor:
-    """Bring what each head has [N, S, H, C] to the space of features: [N, Q, D]."""
-    rows = narrow.flatten(0, 1).transpose(0, 1)  # [H, T, C]
-    if narrow.shape[1] == 1:  # A view will do: every head's rows stay where they are.
-        return torch.bmm(rows, weight_HCD).transpose(0, 1)
-    wide = narrow.new_empty((rows.shape[1], len(rows), weight_HCD.shape[2]))
-    # Written where it belongs: the copy would cost as much as the product.
-    torch.bmm(rows, weight_HCD, out=wide.transpose(0, 1))
-    return wide.view(len(narrow), narrow.shape[1:3].numel(), weight_HCD.shape[2])
+def _widen(narrow: Tensor, weight_HCE: Tensor) -> Tensor:
+    """Bring what each head has [B, N, S, H, C] to the space of features: [N, B Q, E]."""
+    count, targets, slots, heads, _ = narrow.shape
+    rows = narrow.flatten(1, 2).transpose(1, 2).flatten(0, 1)  # [B H, T, C]
+    width = weight_HCE.shape[2]
+    wide = torch.bmm(rows, weight_HCE).view(count, heads, targets, slots, width)
+    # With a single slot a view: every head's rows stay where they are.
+    return wide.permute(2, 0, 3, 1, 4).reshape(targets, count * slots * heads, width)
 
 
 def _by_head(wide: Tensor, weight_HCD: Tensor) -> Tensor:
@@ -313,17 +305,14 @@ def _by_slot(score: Tensor, hidden: Tensor) -> Tensor:
     return score.view(targets, slots, score.shape[1] // slots, neighbours)
 
 
-def _scores(
-    queries: tuple[Tensor, Tensor], sources: tuple[Tensor, Tensor], hidden: Tensor
-) -> Tensor:
-    """Scores [N, Q, K] of features and relations together, in float32."""
-    score = torch.bmm(queries[0], sources[0].mT)
-    if score.dtype == torch.float32:
-        score.baddbmm_(queries[1], sources[1].mT)
-    else:
-        score = score.float() + torch.bmm(queries[1], sources[1].mT)
-    _by_slot(score, hidden).masked_fill_(hidden[:, :, None], HIDDEN_SCORE)
-    return score
+def _products(wide_NQE: Tensor, sources: tuple[Tensor, Tensor]) -> Tensor:
+    """Products [N, Q, K] with features and relations together, in float32."""
+    near, relation = sources
+    width = near.shape[2]
+    found = torch.bmm(wide_NQE[..., :width], near.mT)
+    if found.dtype == torch.float32:
+        return found.baddbmm_(wide_NQE[..., width:], relation.mT)
+    return found.float() + torch.bmm(wide_NQE[..., width:], relation.mT)
 
 
 def _softmax(score: Tensor) -> Tensor:

@@ -255,7 +255,7 @@ def _rates(counts: "FlowCounts") -> dict[str, float | None]:
 
 STAGE = Stage(
     name="calibrate",
-    version=8,
+    version=9,
     settings={
         "tokenize": TokenSettings,
         "rollout": RolloutSettings,

@@ -185,7 +185,7 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=10,
+    version=11,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=simulate,

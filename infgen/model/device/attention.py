@@ -24,7 +24,7 @@ from torch.autograd.function import once_differentiable
 from infgen.model.device.folding import ALIGNED, Folded, fold
 from infgen.model.layers import Attention, AttentionSources, normed
 from infgen.model.neighbour_attention import HIDDEN_SCORE, Shared
-from infgen.model.rotary.turns import turned, turned_back
+from infgen.model.rotary.turns import turned_first
 
 FULL_BYTES = 4
 """Of a float32; numbers of fewer bytes are products only."""
@@ -130,11 +130,11 @@ class _Look(torch.autograd.Function):
             asked = _heads(torch.addmm(query_bias, normal, query.T), heads)
             by_both = normal.new_empty((*asked.shape[:2], both))
             torch.bmm(asked.transpose(0, 1), wide, out=by_both.transpose(0, 1))
-            by_both = _turned_first(by_both.view(len(index), -1, both), turn)
+            by_both = turned_first(by_both.view(len(index), -1, both), turn)
             weight, kept, looked = _weigh(
                 by_both, features, index, relation, (cover, blind), share
             )
-            looked = _turned_first(looked, turn, back=True)
+            looked = turned_first(looked, turn, back=True)
             each = looked.view(-1, heads, looked.shape[2]).transpose(0, 1)
             saw = torch.bmm(each, value).transpose(0, 1)
             joined = torch.cat([saw, _heads(normal, heads)], dim=1).flatten(1)
@@ -170,7 +170,7 @@ class _Look(torch.autograd.Function):
 
             shared = ctx.pulled if ctx.needs_input_grad[10] else None
             to_both, to_features = _pull_pairs(
-                _turned_first(to_looked, turn),
+                turned_first(to_looked, turn),
                 by_both,
                 (features, index, relation),
                 (weight, kept),
@@ -178,7 +178,7 @@ class _Look(torch.autograd.Function):
                 shared,
             )
             of_heads = (-1, heads, by_both.shape[2])
-            to_both = _turned_first(to_both, turn, back=True).view(of_heads).transpose(0, 1)
+            to_both = turned_first(to_both, turn, back=True).view(of_heads).transpose(0, 1)
             to_asked = torch.empty_like(asked)
             torch.bmm(to_both, wide.mT, out=to_asked.transpose(0, 1))
             to_wide = torch.bmm(asked.permute(1, 2, 0), to_both)
@@ -190,18 +190,6 @@ class _Look(torch.autograd.Function):
                 *(through.T @ joined, through.sum(dim=0), to_features, None),
                 *(None, None, None, None, None, None, None),
             )
-
-
-def _turned_first(
-    values_NQE: Tensor, turn_NP: Tensor | None, *, back: bool = False
-) -> Tensor:
-    """Turn the first numbers of values, those of features, in place; or turn them back."""
-    if turn_NP is None:
-        return values_NQE
-    first, turn = values_NQE[..., : 2 * turn_NP.shape[-1]], turn_NP[:, None]
-    turns = turned_back if back else turned
-    first.copy_(turns(first.contiguous(), turn))
-    return values_NQE
 
 
 def _heads(values_TD: Tensor, heads: int) -> Tensor:

@@ -69,6 +69,18 @@ def turned_back(features: Tensor, turn: Tensor | None) -> Tensor:
     return turned(features, None if turn is None else turn.conj_physical())
 
 
+def turned_first(
+    values_NQE: Tensor, turn_NP: Tensor | None, *, back: bool = False
+) -> Tensor:
+    """Turn the first numbers of values, those of features, in place; or turn them back."""
+    if turn_NP is None:
+        return values_NQE
+    first, turn = values_NQE[..., : 2 * turn_NP.shape[-1]], turn_NP[:, None]
+    turns = turned_back if back else turned
+    first.copy_(turns(first.contiguous(), turn))
+    return values_NQE
+
+
 class _Turn(torch.autograd.Function):
     """Autograd would keep the features, though the gradient needs the turn alone."""
 

@@ -221,7 +221,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=6,
+    version=7,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,
