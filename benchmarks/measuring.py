@@ -30,6 +30,7 @@ _TINY = ModelSettings(
 SIZES = {
     "paper": ModelSettings(),
     "paper-narrow": ModelSettings(relation_width=32),
+    "paper-narrow-16": ModelSettings(relation_width=16),
     "paper-rotary": ModelSettings(relations="rotary"),
     "small": _SMALL,
     "small-narrow": replace(_SMALL, relation_width=16),

@@ -6,13 +6,14 @@ of relations, H heads, C width of one head, F scalars, P nodes of a table.
 
 import math
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from infgen.model.neighbour_attention import PairWeights, Shared, attend_to_pairs
+from infgen.model.neighbour_attention import Hiding, PairWeights, Shared, attend_to_pairs
 from infgen.model.settings import ModelSettings
 
 FEED_FORWARD = 4
@@ -156,6 +157,23 @@ class AttentionSources:
         )
 
 
+class EvaluationWeights(NamedTuple):
+    """Weights of an attention block in evaluation, made once: norms are folded in.
+
+    Attributes:
+        own: From a normed target to its query, scaled, its part of the gate, and its own
+            value [3 D, D] ...
+        own_bias: ... with their biases.
+        pairs: Of keys and values.
+        gate: From what a target saw to the gate [D, D].
+    """
+
+    own: Tensor
+    own_bias: Tensor
+    pairs: PairWeights
+    gate: Tensor
+
+
 class Attention(nn.Module):
     """Let targets look at their neighbours; gated update and feed-forward (SPEC 4.1).
 
@@ -193,7 +211,7 @@ class Attention(nn.Module):
             nn.Linear(FEED_FORWARD * width, width),
             nn.LayerNorm(width),
         )
-        self._kept_fold: tuple[Hashable, PairWeights] | None = None
+        self._kept_fold: tuple[Hashable, EvaluationWeights] | None = None
         self.fused: Callable[[Tensor, AttentionSources], Tensor] | None = None
 
     def train(self, mode: bool = True) -> "Attention":
@@ -206,26 +224,45 @@ class Attention(nn.Module):
         if self.fused is not None:
             return self.fused(target, seen)
         slots = target if target.dim() == 3 else target[:, None]
-        present = seen.present if seen.present.dim() == 3 else seen.present[:, None]
+        if not (self.training or torch.is_grad_enabled()):
+            return self._evaluated(slots, seen).view_as(target)
         normal = self.norm_target(slots)
-        looked = self.look(normal, replace(seen, present=present))
+        looked = self.look(normal, seen)
         gate = torch.sigmoid(self.gate(torch.cat([looked, normal], dim=-1)))
         update = looked + gate * (self.itself(normal) - looked)
         slots = slots + self.norm_out(self.out(update))
         slots = slots + self.feed_forward(slots)
         return slots.view_as(target)
 
+    def _evaluated(self, slots: Tensor, seen: AttentionSources) -> Tensor:
+        """Do the same in evaluation by fewer operations, which few targets consist of."""
+        weights, (width, heads) = self._folded(), (slots.shape[-1], self.heads)
+        own = functional.linear(normed(slots), weights.own, weights.own_bias)
+        query, gate, itself = torch.split(own, width, dim=-1)
+        looked = attend_to_pairs(
+            query.view(*query.shape[:2], heads, width // heads),
+            weights.pairs,
+            *(seen.features, seen.index, seen.relation),
+            *(_hiding(seen), None, seen.turn),
+        ).flatten(2)
+        gate = (gate + functional.linear(looked, weights.gate)).sigmoid_()
+        update = self.out(torch.lerp(looked, itself, gate))
+        slots = slots + self.norm_out(update)
+        norm, hidden, _, _, out, norm_out = self.feed_forward
+        forward = out(hidden(norm(slots)).relu_())
+        return slots + norm_out(forward)
+
     def look(self, normal_NSD: Tensor, seen: AttentionSources) -> Tensor:
-        """Sum what each slot sees: [N, S, D]; ``seen.present`` is [N, S, K]."""
+        """Sum what each slot sees: [N, S, D]."""
         width = normal_NSD.shape[-1]
         query = self.query(normal_NSD).unflatten(-1, (self.heads, width // self.heads))
         looked = attend_to_pairs(
             query * query.shape[-1] ** -0.5,
-            self._folded(),
+            self._fold(),
             seen.features,
             seen.index,
             seen.relation,
-            ~seen.present,
+            _hiding(seen),
             self._kept(query, seen.index.shape[-1]),
             seen.turn,
         )
@@ -242,30 +279,54 @@ class Attention(nn.Module):
         """Norm of the neighbours' features: the targets' own unless they differ."""
         return self.norm_target if self.norm_source is None else self.norm_source
 
-    def _folded(self) -> PairWeights:
-        """Fold the norms into the weights: in evaluation once, until the weights change."""
-        if self.training or torch.is_grad_enabled():
-            return self._fold()
+    def _folded(self) -> EvaluationWeights:
+        """Fold the norms into the weights: once, until the weights change."""
         # Fused optimizers write without a new version, but only in training.
-        parts = [self.key, self.value, self.relation_key, self.relation_value]
-        weights = [part.weight for part in (*parts, self.source_norm(), self.norm_relation)]
         device = self.key.weight.device
-        versions = tuple((id(each), each._version) for each in weights)
+        parts = [self.key, self.value, self.relation_key, self.relation_value]
+        parts += [self.query, self.gate, self.itself]
+        weights = [*parts, self.norm_target, self.source_norm(), self.norm_relation]
+        versions = tuple((id(each.weight), each.weight._version) for each in weights)
         now = (device, torch.is_autocast_enabled(device.type), versions)
         if self._kept_fold is None or self._kept_fold[0] != now:
-            self._kept_fold = now, self._fold()
+            self._kept_fold = now, self._fold_all()
         return self._kept_fold[1]
 
-    def _fold(self) -> PairWeights:
-        def fold(linear: nn.Linear, norm: nn.LayerNorm) -> Tensor:
-            return (linear.weight * norm.weight).view(self.heads, -1, len(norm.weight))
+    def _fold_all(self) -> EvaluationWeights:
+        """Fold the norms into the weights of pairs, and of the targets themselves."""
+        width, pairs, norm = self.query.in_features, self._fold(), self.norm_target
+        scale = (width // self.heads) ** -0.5
+        of_looked, of_target = torch.split(self.gate.weight, width, dim=1)
+        weight = torch.cat([self.query.weight * scale, of_target, self.itself.weight])
+        bias = torch.cat([self.query.bias * scale, self.gate.bias, self.itself.bias])
+        kind = pairs.value_bias.dtype  # Of a product: what autocast, if any, gives them.
+        return EvaluationWeights(
+            own=(weight * norm.weight).to(kind),
+            own_bias=(bias + weight @ norm.bias).to(kind),
+            pairs=PairWeights(*(each.to(kind) for each in pairs)),
+            gate=of_looked.to(kind).contiguous(),
+        )
 
+    def _fold(self) -> PairWeights:
+        """Fold the norms into the weights of keys and values."""
         source, relation = self.source_norm(), self.norm_relation
+        gain = torch.cat([source.weight, relation.weight])
+        key = torch.cat([self.key.weight, self.relation_key.weight], dim=1)
+        value = torch.cat([self.value.weight, self.relation_value.weight], dim=1)
         bias = self.value(source.bias) + self.relation_value(relation.bias)
         return PairWeights(
-            key=fold(self.key, source),
-            value=fold(self.value, source),
-            relation_key=fold(self.relation_key, relation),
-            relation_value=fold(self.relation_value, relation),
+            key=(key * gain).view(self.heads, -1, len(gain)),
+            value=(value * gain).view(self.heads, -1, len(gain)),
             value_bias=bias.view(self.heads, -1),
         )
+
+
+def _hiding(seen: AttentionSources) -> Hiding:
+    """Say what targets do not see; made once for all blocks."""
+    covers = seen.relation.covers
+    if covers is None or covers[0] is not seen.present:
+        present = seen.present if seen.present.dim() == 3 else seen.present[:, None]
+        covers = seen.present, Hiding.of(present)
+        object.__setattr__(seen.relation, "covers", covers)
+    hiding: Hiding = covers[1]
+    return hiding

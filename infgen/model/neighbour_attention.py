@@ -2,14 +2,14 @@
 
 What is big here is what there is per pair: the neighbours' features, gathered from the
 rows of all sources, and their relations to the target, which many layers share. Left to
-autograd both would be kept, or made anew, for every layer. Instead targets are taken a few
-at a time, so that everything about them stays in the processor's cache: queries are brought
-to the space of features, and sums back from it, when they are used; features are gathered
+autograd both would be kept, or made anew, for every layer. Instead queries are brought to
+the space of features, and sums back from it; targets are taken a few at a time, so that
+everything about their neighbours stays in the processor's cache; features are gathered
 again in the backward pass, and the gradient of shared relations is summed in place.
 
 Shape letters as in ``layers``: N targets, S slots, H heads, C width of a head, K
-neighbours, D width of features, R of relations, M rows of sources; T are the slots of a few
-targets, and Q the queries of a target, its slots times its heads.
+neighbours, D width of features, R of relations, E of both, M rows of sources; T are the
+slots of all targets, and Q the queries of a target, its slots times its heads.
 """
 
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ class Shared:
     ticket: Tensor
     pulled: "_Sum"
     copies: dict[torch.dtype, Tensor] = field(default_factory=dict)
-    covers: tuple[Tensor, Tensor, Tensor] | None = None
+    covers: tuple[Tensor, Any] | None = None
 
     @classmethod
     def of(cls, tensor: Tensor) -> "Shared":
@@ -90,18 +90,35 @@ class PairWeights(NamedTuple):
     """Weights of keys and values, the gains and biases of norms folded in.
 
     Attributes:
-        key: Of features [H, C, D].
-        value: Of features [H, C, D].
-        relation_key: Of relations [H, C, R].
-        relation_value: Of relations [H, C, R].
+        key: Of features, and behind them of relations [H, C, E].
+        value: Of the same [H, C, E].
         value_bias: Added to every value [H, C]; in keys a bias would cancel out.
     """
 
     key: Tensor
     value: Tensor
-    relation_key: Tensor
-    relation_value: Tensor
     value_bias: Tensor
+
+
+class Hiding(NamedTuple):
+    """What targets do not see.
+
+    Attributes:
+        cover: Added to scores: ``HIDDEN_SCORE`` for what a slot does not see [N, S, K].
+        blind: Slots that see nobody [N, S, 1]; None if it is known that there are none.
+    """
+
+    cover: Tensor
+    blind: Tensor | None
+
+    @classmethod
+    def of(cls, present: Tensor) -> "Hiding":
+        """Hide all that is not present [N, S, K]."""
+        hidden = ~present
+        blind = hidden.all(dim=-1, keepdim=True)
+        # Looking whether there are any saves a pass, but would make a GPU wait.
+        some = blind.device.type != "cpu" or bool(blind.any())
+        return cls(hidden * HIDDEN_SCORE, blind if some else None)
 
 
 def attend_to_pairs(
@@ -110,7 +127,7 @@ def attend_to_pairs(
     features: Tensor,
     index: Tensor,
     relation: Shared,
-    hidden: Tensor,
+    hiding: Hiding,
     kept: Tensor | None,
     turn: Tensor | None = None,
 ) -> Tensor:
@@ -122,7 +139,7 @@ def attend_to_pairs(
         features: Of all sources [M, D].
         index: Row of each neighbour among them [N, K].
         relation: Of the neighbours [N, K, R].
-        hidden: Which neighbours a slot does not see [N, S, K].
+        hiding: Which neighbours a slot does not see.
         kept: Factor on each weight for dropout [N, S, H, K], or None.
         turn: By what features are turned at the targets [N, P], if those of the sources are
             turned: queries are turned as the sources are, and sums turned back.
@@ -132,22 +149,84 @@ def attend_to_pairs(
     """
     kind = query.dtype  # The queries' own: low precision under autocast.
     weights = PairWeights(*(weight.to(kind) for weight in weights))
-    kept = None if kept is None else kept.to(kind)
+    kept = None if kept is None else kept.to(kind).flatten(1, 2)
     sources = features.to(kind), index, relation.of_kind(kind)
-    shared = relation.ticket, relation.pulled
+    query = query.contiguous()
     with torch.autocast(query.device.type, enabled=False):
+        if not torch.is_grad_enabled():
+            return _look(query, weights, sources, hiding, kept, turn, None)[0]
+        shared = relation.ticket, relation.pulled
         summed: Tensor = _Attend.apply(  # type: ignore[no-untyped-call]
-            query.contiguous(), *weights, *sources, *shared, hidden, kept, turn
+            query, *weights, *sources, *shared, hiding, kept, turn
         )
     return summed
 
 
-class _Attend(torch.autograd.Function):
-    """Products with neighbours are made a few targets at a time, and others at once.
+Sources = tuple[Tensor, Tensor, Tensor]
+"""Features [M, D], rows of neighbours among them [N, K], and their relations [N, K, R]."""
 
-    Wide queries, of features first and of relations behind them, are made again in the
-    backward pass.
+
+def _look(
+    query: Tensor,
+    weights: PairWeights,
+    sources: Sources,
+    hiding: Hiding,
+    kept: Tensor | None,
+    turn: Tensor | None,
+    weight: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Attend; what differs by neighbour is made a few targets at a time.
+
+    Args:
+        query: Scaled queries [N, S, H, C].
+        weights: Of keys and values.
+        sources: What is seen.
+        hiding: What of it is not seen.
+        kept: Factor on each weight for dropout [N, Q, K], or None.
+        turn: As in ``attend_to_pairs``.
+        weight: Where the weights of pairs are written to [N, Q, K], if they are wanted.
+
+    Returns:
+        Sums of values [N, S, H, C], of features [N, Q, D], and of relations [N, Q, R], and
+        of weights [N, Q], or None if these are 1.
     """
+    (features, index, relation), (cover, blind) = sources, hiding
+    queries, width = query.shape[1] * query.shape[2], features.shape[1]
+    asked = turned_first(_widen(query[None], weights.key), turn)
+    saw = query.new_empty((len(index), queries, width))
+    related = query.new_empty((len(index), queries, relation.shape[2]))
+    total = None
+    if kept is not None or blind is not None:
+        total = query.new_empty((len(index), queries))
+    for part, near in _parts(queries, features, index):
+        score = _products(asked[part], near, relation[part])
+        _by_slot(score, cover[part]).add_(cover[part, :, None])
+        used = _softmax(score).to(query.dtype)
+        if blind is not None:
+            _by_slot(used, cover[part]).masked_fill_(blind[part, :, None], 0.0)
+        if weight is not None:
+            weight[part] = used
+        if kept is not None:
+            used = used * kept[part]
+        torch.bmm(used, near, out=saw[part])
+        torch.bmm(used, relation[part], out=related[part])
+        if total is not None:
+            torch.sum(used, dim=-1, out=total[part])
+    saw = turned_back(saw, None if turn is None else turn[:, None])
+    value = weights.value.mT
+    found = torch.bmm(_by_head(saw, query), value[:, :width])
+    found = found.baddbmm_(_by_head(related, query), value[:, width:])
+    found = found.transpose(0, 1).view_as(query)
+    if total is None:
+        summed = found + weights.value_bias
+    else:
+        own = total.view(*query.shape[:3], 1)
+        summed = torch.addcmul(found, own, weights.value_bias)
+    return summed, saw, related, total
+
+
+class _Attend(torch.autograd.Function):
+    """The same with its gradient; wide queries are made again in the backward pass."""
 
     @staticmethod
     def forward(
@@ -155,52 +234,21 @@ class _Attend(torch.autograd.Function):
         query: Tensor,
         key: Tensor,
         value: Tensor,
-        relation_key: Tensor,
-        relation_value: Tensor,
         value_bias: Tensor,
         features: Tensor,
         index: Tensor,
         relation: Tensor,
         ticket: Tensor,
         pulled: _Sum,
-        hidden: Tensor,
+        hiding: Hiding,
         kept: Tensor | None,
         turn: Tensor | None,
     ) -> Tensor:
-        learns = any(ctx.needs_input_grad)
-        (targets, neighbours), width = index.shape, features.shape[1]
         queries = query.shape[1] * query.shape[2]
-        asked = turned_first(_widen(query[None], torch.cat([key, relation_key], 2)), turn)
-        cover, blind = hidden * HIDDEN_SCORE, _blind(hidden)
-        kept = None if kept is None else kept.flatten(1, 2)
-        weight = query.new_empty((targets if learns else 0, queries, neighbours))
-        saw = query.new_empty((targets, queries, width))
-        related = query.new_empty((targets, queries, relation.shape[2]))
-        total = query.new_empty((targets, queries))
-        for part, near in _parts(queries, features, index):
-            sources = near, relation[part]
-            score = _products(asked[part], sources)
-            _by_slot(score, hidden[part]).add_(cover[part, :, None])
-            used = _softmax(score).to(query.dtype)
-            if blind is not None:
-                _by_slot(used, hidden[part]).masked_fill_(blind[part, :, None], 0.0)
-            if learns:
-                weight[part] = used
-            if kept is not None:
-                used = used * kept[part]
-            torch.bmm(used, near, out=saw[part])
-            torch.bmm(used, sources[1], out=related[part])
-            torch.sum(used, dim=-1, out=total[part])
-        saw = turned_back(saw, None if turn is None else turn[:, None])
-        found = torch.bmm(_by_head(saw, key), value.mT)
-        found.baddbmm_(_by_head(related, key), relation_value.mT)
-        summed = torch.empty_like(query)
-        found = found.transpose(0, 1).view_as(query)
-        torch.addcmul(found, total.view(*query.shape[:3], 1), value_bias, out=summed)
-        ctx.save_for_backward(
-            query, key, value, relation_key, relation_value, value_bias,
-            features, index, relation, weight, saw, related, total, kept, turn,
-        )  # fmt: skip
+        weight = query.new_empty((len(index), queries, index.shape[1]))
+        weights, sources = PairWeights(key, value, value_bias), (features, index, relation)
+        summed, *seen = _look(query, weights, sources, hiding, kept, turn, weight)
+        ctx.save_for_backward(query, *weights, *sources, weight, *seen, kept, turn)
         ctx.pulled = pulled
         return summed
 
@@ -208,26 +256,24 @@ class _Attend(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, pull: Tensor) -> tuple[Tensor | None, ...]:
         (
-            query, key, value, relation_key, relation_value, value_bias,
+            query, key, value, value_bias,
             features, index, relation, weight, saw, related, total, kept, turn,
         ) = ctx.saved_tensors  # fmt: skip
         queries, width = weight.shape[1], features.shape[1]
-        shared = ctx.needs_input_grad[9]
+        shared = ctx.needs_input_grad[7]
         first = ctx.pulled.tensor is None
         if shared and first:
             ctx.pulled.tensor = torch.empty_like(relation, dtype=torch.float32)
-        wide = torch.cat(
-            [torch.cat([key, value]), torch.cat([relation_key, relation_value])], 2
-        )
-        pair = turned_first(_widen(torch.stack([query, pull]), wide), turn)
+        pair = _widen(torch.stack([query, pull]), torch.cat([key, value]))
+        pair = turned_first(pair, turn)
         to_total = (pull * value_bias).sum(dim=-1).flatten(1)
         to_saw, to_related = torch.empty_like(saw), torch.empty_like(related)
         to_features = torch.zeros_like(features)
         for part, near in _parts(queries, features, index):
-            sources, used = (near, relation[part]), weight[part]
+            used, beside = weight[part], relation[part]
             both = used.new_empty((len(used), 2 * queries, used.shape[2]))
             to_score, dropped = both.split(queries, dim=1)
-            to_used = _products(pair[part, queries:], sources)
+            to_used = _products(pair[part, queries:], near, beside)
             to_used.add_(to_total[part, :, None])
             if kept is None:
                 dropped.copy_(used)
@@ -237,24 +283,25 @@ class _Attend(torch.autograd.Function):
             to_used.sub_((to_used * used).sum(dim=-1, keepdim=True))
             torch.mul(to_used, used, out=to_score)
             torch.bmm(to_score, near, out=to_saw[part])
-            torch.bmm(to_score, sources[1], out=to_related[part])
+            torch.bmm(to_score, beside, out=to_related[part])
             to_near = torch.bmm(both.mT, pair[part, :, :width])
             _add_rows(to_features, index[part], to_near)
             if shared:
                 more = both.mT, pair[part, :, width:]
                 _add_product(ctx.pulled.tensor[part], *more, first=first)
         to_saw = turned_back(to_saw, None if turn is None else turn[:, None])
-        pulled = torch.bmm(_by_head(to_saw, key), key.mT)
-        pulled.baddbmm_(_by_head(to_related, key), relation_key.mT)
+        to_asked = _by_head(to_saw, query), _by_head(to_related, query)
+        seen = _by_head(saw, query), _by_head(related, query)
+        pulled = torch.bmm(to_asked[0], key[..., :width].mT)
+        pulled.baddbmm_(to_asked[1], key[..., width:].mT)
         asked, given = (each.flatten(0, 1).permute(1, 2, 0) for each in (query, pull))
+        own = pull if total is None else pull * total.view(*pull.shape[:3], 1)
         return (
             pulled.transpose(0, 1).reshape(query.shape),
-            torch.bmm(asked, _by_head(to_saw, key)),
-            torch.bmm(given, _by_head(saw, key)),
-            torch.bmm(asked, _by_head(to_related, key)),
-            torch.bmm(given, _by_head(related, key)),
-            (pull * total.view(*pull.shape[:3], 1)).sum(dim=(0, 1)),
-            to_features, None, None, None, None, None, None, None,
+            torch.cat([torch.bmm(asked, each) for each in to_asked], dim=2),
+            torch.cat([torch.bmm(given, each) for each in seen], dim=2),
+            own.sum(dim=(0, 1)), to_features,
+            None, None, None, None, None, None, None,
         )  # fmt: skip
 
 
@@ -275,13 +322,6 @@ def _parts(queries: int, features: Tensor, index: Tensor) -> Iterator[tuple[slic
         yield part, near
 
 
-def _blind(hidden: Tensor) -> Tensor | None:
-    """Mark the slots [N, S, 1] that see nobody; None if it is known that there are none."""
-    blind = hidden.all(dim=-1, keepdim=True)
-    # Looking whether there are any saves a pass, but would make a GPU wait.
-    return blind if blind.device.type != "cpu" or bool(blind.any()) else None
-
-
 def _widen(narrow: Tensor, weight_HCE: Tensor) -> Tensor:
     """Bring what each head has [B, N, S, H, C] to the space of features: [N, B Q, E]."""
     count, targets, slots, heads, _ = narrow.shape
@@ -292,27 +332,25 @@ def _widen(narrow: Tensor, weight_HCE: Tensor) -> Tensor:
     return wide.permute(2, 0, 3, 1, 4).reshape(targets, count * slots * heads, width)
 
 
-def _by_head(wide: Tensor, weight_HCD: Tensor) -> Tensor:
-    """View queries [N, Q, D] head by head: [H, T, D]."""
-    heads = len(weight_HCD)
-    rows = wide.shape[:2].numel() // heads
-    return wide.view(rows, heads, wide.shape[-1]).transpose(0, 1)
+def _by_head(wide: Tensor, query: Tensor) -> Tensor:
+    """View what queries [N, S, H, C] saw [N, Q, D] head by head: [H, T, D]."""
+    targets, slots, heads, _ = query.shape
+    return wide.view(targets * slots, heads, wide.shape[-1]).transpose(0, 1)
 
 
-def _by_slot(score: Tensor, hidden: Tensor) -> Tensor:
+def _by_slot(score: Tensor, cover: Tensor) -> Tensor:
     """View numbers of queries [N, Q, K] slot by slot: [N, S, H, K]."""
-    targets, slots, neighbours = hidden.shape
+    targets, slots, neighbours = cover.shape
     return score.view(targets, slots, score.shape[1] // slots, neighbours)
 
 
-def _products(wide_NQE: Tensor, sources: tuple[Tensor, Tensor]) -> Tensor:
+def _products(wide_NQE: Tensor, near_NKD: Tensor, relation_NKR: Tensor) -> Tensor:
     """Products [N, Q, K] with features and relations together, in float32."""
-    near, relation = sources
-    width = near.shape[2]
-    found = torch.bmm(wide_NQE[..., :width], near.mT)
+    width = near_NKD.shape[2]
+    found = torch.bmm(wide_NQE[..., :width], near_NKD.mT)
     if found.dtype == torch.float32:
-        return found.baddbmm_(wide_NQE[..., width:], relation.mT)
-    return found.float() + torch.bmm(wide_NQE[..., width:], relation.mT)
+        return found.baddbmm_(wide_NQE[..., width:], relation_NKR.mT)
+    return found.float() + torch.bmm(wide_NQE[..., width:], relation_NKR.mT)
 
 
 def _softmax(score: Tensor) -> Tensor:

@@ -214,6 +214,17 @@ def test_normed_features_have_mean_zero_and_variance_one():
     assert functional.mse_loss(x, x) == 0
 
 
+@pytest.mark.parametrize("bipartite", [True, False])
+def test_evaluation_gives_what_is_given_with_gradients(bipartite):
+    layer, (seen, _) = make_layer(bipartite).eval(), make_seen(5, 2, 7)
+    target = torch.randn(5, 2, WIDTH)
+
+    with torch.no_grad():
+        found = layer(target, seen)
+
+    torch.testing.assert_close(found, layer(target, seen), atol=1e-5, rtol=1e-5)
+
+
 def test_weights_are_folded_anew_when_they_change():
     layer, (seen, _) = make_layer(True).eval(), make_seen(5, 1, 7)
     target = torch.randn(5, WIDTH)
@@ -227,7 +238,8 @@ def test_weights_are_folded_anew_when_they_change():
         layer.train()
         layer.relation_value.weight.data.div_(2)  # As fused optimizers: no new version.
         back = layer.eval()(target, seen)
+        wanted = other.eval()(target, seen)
 
-    torch.testing.assert_close(after, other(target, seen), atol=0, rtol=0)
+    torch.testing.assert_close(after, wanted, atol=0, rtol=0)
     assert not torch.equal(before, after)
     torch.testing.assert_close(back, before, atol=0, rtol=0)

@@ -98,10 +98,11 @@ def _cover(seen: AttentionSources, queries: int, heads: int) -> tuple[Tensor, Te
             )  # [N, S H, K]
         elif hidden.dim() == 2:
             hidden = hidden[:, None]
-        score = hidden * HIDDEN_SCORE
-        covers = seen.present, score, hidden.all(dim=-1, keepdim=True)
+        found = hidden * HIDDEN_SCORE, hidden.all(dim=-1, keepdim=True)
+        covers = seen.present, found
         object.__setattr__(seen.relation, "covers", covers)
-    return covers[1], covers[2]
+    cover, blind = covers[1]
+    return cover, blind
 
 
 class _Look(torch.autograd.Function):

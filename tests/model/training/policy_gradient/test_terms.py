@@ -17,6 +17,8 @@ from infgen.model.training.policy_gradient.rollouts import HISTORY_TOKENS
 from infgen.model.training.policy_gradient.terms import divergence, policy_terms
 
 HOW = TrainSettings(policy_gradient_rollouts=3, policy_top_p=0.9)
+ROUNDING = 1e-6
+"""Between a network with gradients and its copy without, which computes in another order."""
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +135,7 @@ def test_networks_of_all_kinds_learn_from_rollouts(variant, new_network, logged)
     found = terms(network, copy.deepcopy(network), lesson)
     (found["policy"].mean + found["divergence"].mean).backward()
 
-    assert found["divergence"].loss == 0
+    assert abs(found["divergence"].mean) < ROUNDING
     gradients = [p.grad for p in network.parameters() if p.grad is not None]
     assert all(torch.isfinite(each).all() for each in gradients)
     assert steepest(network) > 0
