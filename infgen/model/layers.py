@@ -5,14 +5,14 @@ of relations, H heads, C width of one head, F scalars, P nodes of a table.
 """
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from infgen.model.attention.evaluation import Affine, EvaluationWeights, KeptFold
 from infgen.model.neighbour_attention import Hiding, PairWeights, Shared, attend_to_pairs
 from infgen.model.settings import ModelSettings
 
@@ -131,6 +131,7 @@ class AttentionSources:
         present: Which neighbours there are: [N, K], or [N, S, K] if slots differ.
         turn: By what features are turned at the targets [N, P], if those of the sources are
             turned (``rotary.turns``).
+        groups: Ranges of targets that see the same sources, as in ``attention.parts``.
     """
 
     features: Tensor
@@ -138,6 +139,7 @@ class AttentionSources:
     relation: Shared
     present: Tensor
     turn: Tensor | None = None
+    groups: tuple[slice, ...] | None = None
 
     @classmethod
     def own(
@@ -155,23 +157,6 @@ class AttentionSources:
         return AttentionSources(
             self.features, self.index[targets], relation, self.present[targets], turn
         )
-
-
-class EvaluationWeights(NamedTuple):
-    """Weights of an attention block in evaluation, made once: norms are folded in.
-
-    Attributes:
-        own: From a normed target to its query, scaled, its part of the gate, and its own
-            value [3 D, D] ...
-        own_bias: ... with their biases.
-        pairs: Of keys and values.
-        gate: From what a target saw to the gate [D, D].
-    """
-
-    own: Tensor
-    own_bias: Tensor
-    pairs: PairWeights
-    gate: Tensor
 
 
 class Attention(nn.Module):
@@ -211,7 +196,7 @@ class Attention(nn.Module):
             nn.Linear(FEED_FORWARD * width, width),
             nn.LayerNorm(width),
         )
-        self._kept_fold: tuple[Hashable, EvaluationWeights] | None = None
+        self._kept_fold: KeptFold | None = None
         self.fused: Callable[[Tensor, AttentionSources], Tensor] | None = None
 
     def train(self, mode: bool = True) -> "Attention":
@@ -236,21 +221,26 @@ class Attention(nn.Module):
 
     def _evaluated(self, slots: Tensor, seen: AttentionSources) -> Tensor:
         """Do the same in evaluation by fewer operations, which few targets consist of."""
-        weights, (width, heads) = self._folded(), (slots.shape[-1], self.heads)
-        own = functional.linear(normed(slots), weights.own, weights.own_bias)
+        weights, (targets, count, width) = self._folded(), slots.shape
+        own = weights.own.linear(normed(slots))
         query, gate, itself = torch.split(own, width, dim=-1)
         looked = attend_to_pairs(
-            query.view(*query.shape[:2], heads, width // heads),
+            query.view(targets, count, self.heads, width // self.heads),
             weights.pairs,
-            *(seen.features, seen.index, seen.relation),
-            *(_hiding(seen), None, seen.turn),
+            seen.features,
+            seen.index,
+            seen.relation,
+            _hiding(seen),
+            None,
+            seen.turn,
+            seen.groups,
         ).flatten(2)
         gate = (gate + functional.linear(looked, weights.gate)).sigmoid_()
-        update = self.out(torch.lerp(looked, itself, gate))
-        slots = slots + self.norm_out(update)
-        norm, hidden, _, _, out, norm_out = self.feed_forward
-        forward = out(hidden(norm(slots)).relu_())
-        return slots + norm_out(forward)
+        update = weights.out.linear(torch.lerp(looked, itself, gate))
+        slots = slots + weights.norm_out.norm(update)
+        norm, hidden, out, norm_out = weights.forward
+        forward = out.linear(hidden.linear(norm.norm(slots)).relu_())
+        return slots + norm_out.norm(forward)
 
     def look(self, normal_NSD: Tensor, seen: AttentionSources) -> Tensor:
         """Sum what each slot sees: [N, S, D]."""
@@ -265,6 +255,7 @@ class Attention(nn.Module):
             _hiding(seen),
             self._kept(query, seen.index.shape[-1]),
             seen.turn,
+            seen.groups,
         )
         return looked.flatten(2)
 
@@ -282,15 +273,13 @@ class Attention(nn.Module):
     def _folded(self) -> EvaluationWeights:
         """Fold the norms into the weights: once, until the weights change."""
         # Fused optimizers write without a new version, but only in training.
-        device = self.key.weight.device
-        parts = [self.key, self.value, self.relation_key, self.relation_value]
-        parts += [self.query, self.gate, self.itself]
-        weights = [*parts, self.norm_target, self.source_norm(), self.norm_relation]
-        versions = tuple((id(each.weight), each.weight._version) for each in weights)
-        now = (device, torch.is_autocast_enabled(device.type), versions)
-        if self._kept_fold is None or self._kept_fold[0] != now:
-            self._kept_fold = now, self._fold_all()
-        return self._kept_fold[1]
+        kept, first = self._kept_fold, self.key.weight
+        autocast = torch.is_autocast_enabled(first.device.type)
+        if kept is None or not kept.holds(first, autocast):
+            weights = (first, *self.parameters())
+            kept = KeptFold.of(weights, autocast, self._fold_all())
+            self._kept_fold = kept
+        return kept.folded
 
     def _fold_all(self) -> EvaluationWeights:
         """Fold the norms into the weights of pairs, and of the targets themselves."""
@@ -300,11 +289,19 @@ class Attention(nn.Module):
         weight = torch.cat([self.query.weight * scale, of_target, self.itself.weight])
         bias = torch.cat([self.query.bias * scale, self.gate.bias, self.itself.bias])
         kind = pairs.value_bias.dtype  # Of a product: what autocast, if any, gives them.
+        first, hidden, _, _, out, last = self.feed_forward
         return EvaluationWeights(
-            own=(weight * norm.weight).to(kind),
-            own_bias=(bias + weight @ norm.bias).to(kind),
+            own=Affine(weight * norm.weight, bias + weight @ norm.bias).to(kind),
             pairs=PairWeights(*(each.to(kind) for each in pairs)),
             gate=of_looked.to(kind).contiguous(),
+            out=Affine.of(self.out).to(kind),
+            norm_out=Affine.of(self.norm_out),
+            forward=(
+                Affine.of(first),
+                Affine.of(hidden).to(kind),
+                Affine.of(out).to(kind),
+                Affine.of(last),
+            ),
         )
 
     def _fold(self) -> PairWeights:

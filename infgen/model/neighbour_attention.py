@@ -12,7 +12,7 @@ neighbours, D width of features, R of relations, E of both, M rows of sources; T
 slots of all targets, and Q the queries of a target, its slots times its heads.
 """
 
-from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -20,14 +20,21 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from infgen.model.attention.parts import (
+    Sources,
+    ToFeatures,
+    add_product,
+    by_head,
+    by_slot,
+    products,
+    softmax,
+    sums,
+    widen,
+)
 from infgen.model.rotary.turns import turned_back, turned_first
 
 HIDDEN_SCORE = -1e9
 """Score of what a target does not see: its weight is exactly zero beside any other."""
-CACHED_NUMBERS = 1 << 19
-"""Numbers about targets that are held at once on a CPU: some of its cache."""
-VECTOR_NUMBERS = 16
-"""Softmax over fewer numbers than a vector register holds is made of plain operations."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -130,6 +137,7 @@ def attend_to_pairs(
     hiding: Hiding,
     kept: Tensor | None,
     turn: Tensor | None = None,
+    groups: tuple[slice, ...] | None = None,
 ) -> Tensor:
     """Weigh the values of neighbours by the softmax of their scores, and sum them.
 
@@ -143,6 +151,7 @@ def attend_to_pairs(
         kept: Factor on each weight for dropout [N, S, H, K], or None.
         turn: By what features are turned at the targets [N, P], if those of the sources are
             turned: queries are turned as the sources are, and sums turned back.
+        groups: Ranges of targets that see the same sources, as in ``Sources``.
 
     Returns:
         Sums [N, S, H, C]; zero for a slot that sees nobody.
@@ -150,9 +159,9 @@ def attend_to_pairs(
     kind = query.dtype  # The queries' own: low precision under autocast.
     weights = PairWeights(*(weight.to(kind) for weight in weights))
     kept = None if kept is None else kept.to(kind).flatten(1, 2)
-    sources = features.to(kind), index, relation.of_kind(kind)
+    sources = Sources(features.to(kind), index, relation.of_kind(kind), groups)
     query = query.contiguous()
-    with torch.autocast(query.device.type, enabled=False):
+    with _no_autocast(query.device.type):
         if not torch.is_grad_enabled():
             return _look(query, weights, sources, hiding, kept, turn, None)[0]
         shared = relation.ticket, relation.pulled
@@ -162,8 +171,11 @@ def attend_to_pairs(
     return summed
 
 
-Sources = tuple[Tensor, Tensor, Tensor]
-"""Features [M, D], rows of neighbours among them [N, K], and their relations [N, K, R]."""
+def _no_autocast(device: str) -> AbstractContextManager[object]:
+    """Leave precisions as they are; to enter autocast, even to end it, takes a while."""
+    if torch.is_autocast_enabled(device):
+        return torch.autocast(device, enabled=False)
+    return nullcontext()
 
 
 def _look(
@@ -190,32 +202,32 @@ def _look(
         Sums of values [N, S, H, C], of features [N, Q, D], and of relations [N, Q, R], and
         of weights [N, Q], or None if these are 1.
     """
-    (features, index, relation), (cover, blind) = sources, hiding
+    (features, index, relation, _), (cover, blind) = sources, hiding
     queries, width = query.shape[1] * query.shape[2], features.shape[1]
-    asked = turned_first(_widen(query[None], weights.key), turn)
+    asked = turned_first(widen(query[None], weights.key), turn)
     saw = query.new_empty((len(index), queries, width))
     related = query.new_empty((len(index), queries, relation.shape[2]))
     total = None
     if kept is not None or blind is not None:
         total = query.new_empty((len(index), queries))
-    for part, near in _parts(queries, features, index):
-        score = _products(asked[part], near, relation[part])
-        _by_slot(score, cover[part]).add_(cover[part, :, None])
-        used = _softmax(score).to(query.dtype)
+    for part, near in sources.parts(queries):
+        score = products(asked[part], near, relation[part])
+        by_slot(score, cover[part]).add_(cover[part, :, None])
+        used = softmax(score).to(query.dtype)
         if blind is not None:
-            _by_slot(used, cover[part]).masked_fill_(blind[part, :, None], 0.0)
+            by_slot(used, cover[part]).masked_fill_(blind[part, :, None], 0.0)
         if weight is not None:
             weight[part] = used
         if kept is not None:
             used = used * kept[part]
-        torch.bmm(used, near, out=saw[part])
+        sums(used, near, saw[part])
         torch.bmm(used, relation[part], out=related[part])
         if total is not None:
             torch.sum(used, dim=-1, out=total[part])
     saw = turned_back(saw, None if turn is None else turn[:, None])
     value = weights.value.mT
-    found = torch.bmm(_by_head(saw, query), value[:, :width])
-    found = found.baddbmm_(_by_head(related, query), value[:, width:])
+    found = torch.bmm(by_head(saw, query), value[:, :width])
+    found = found.baddbmm_(by_head(related, query), value[:, width:])
     found = found.transpose(0, 1).view_as(query)
     if total is None:
         summed = found + weights.value_bias
@@ -238,6 +250,7 @@ class _Attend(torch.autograd.Function):
         features: Tensor,
         index: Tensor,
         relation: Tensor,
+        groups: tuple[slice, ...] | None,
         ticket: Tensor,
         pulled: _Sum,
         hiding: Hiding,
@@ -246,10 +259,11 @@ class _Attend(torch.autograd.Function):
     ) -> Tensor:
         queries = query.shape[1] * query.shape[2]
         weight = query.new_empty((len(index), queries, index.shape[1]))
-        weights, sources = PairWeights(key, value, value_bias), (features, index, relation)
+        weights = PairWeights(key, value, value_bias)
+        sources = Sources(features, index, relation, groups)
         summed, *seen = _look(query, weights, sources, hiding, kept, turn, weight)
-        ctx.save_for_backward(query, *weights, *sources, weight, *seen, kept, turn)
-        ctx.pulled = pulled
+        ctx.save_for_backward(query, *weights, *sources[:3], weight, *seen, kept, turn)
+        ctx.pulled, ctx.groups = pulled, groups
         return summed
 
     @staticmethod
@@ -260,20 +274,21 @@ class _Attend(torch.autograd.Function):
             features, index, relation, weight, saw, related, total, kept, turn,
         ) = ctx.saved_tensors  # fmt: skip
         queries, width = weight.shape[1], features.shape[1]
-        shared = ctx.needs_input_grad[7]
+        sources = Sources(features, index, relation, ctx.groups)
+        shared = ctx.needs_input_grad[8]
         first = ctx.pulled.tensor is None
         if shared and first:
             ctx.pulled.tensor = torch.empty_like(relation, dtype=torch.float32)
-        pair = _widen(torch.stack([query, pull]), torch.cat([key, value]))
+        pair = widen(torch.stack([query, pull]), torch.cat([key, value]))
         pair = turned_first(pair, turn)
         to_total = (pull * value_bias).sum(dim=-1).flatten(1)
         to_saw, to_related = torch.empty_like(saw), torch.empty_like(related)
-        to_features = torch.zeros_like(features)
-        for part, near in _parts(queries, features, index):
+        to_features = ToFeatures(sources)
+        for part, near in sources.parts(queries):
             used, beside = weight[part], relation[part]
             both = used.new_empty((len(used), 2 * queries, used.shape[2]))
             to_score, dropped = both.split(queries, dim=1)
-            to_used = _products(pair[part, queries:], near, beside)
+            to_used = products(pair[part, queries:], near, beside)
             to_used.add_(to_total[part, :, None])
             if kept is None:
                 dropped.copy_(used)
@@ -282,16 +297,15 @@ class _Attend(torch.autograd.Function):
                 to_used.mul_(kept[part])
             to_used.sub_((to_used * used).sum(dim=-1, keepdim=True))
             torch.mul(to_used, used, out=to_score)
-            torch.bmm(to_score, near, out=to_saw[part])
+            sums(to_score, near, to_saw[part])
             torch.bmm(to_score, beside, out=to_related[part])
-            to_near = torch.bmm(both.mT, pair[part, :, :width])
-            _add_rows(to_features, index[part], to_near)
+            to_features.add(part, both, pair[part, :, :width])
             if shared:
                 more = both.mT, pair[part, :, width:]
-                _add_product(ctx.pulled.tensor[part], *more, first=first)
+                add_product(ctx.pulled.tensor[part], *more, first=first)
         to_saw = turned_back(to_saw, None if turn is None else turn[:, None])
-        to_asked = _by_head(to_saw, query), _by_head(to_related, query)
-        seen = _by_head(saw, query), _by_head(related, query)
+        to_asked = by_head(to_saw, query), by_head(to_related, query)
+        seen = by_head(saw, query), by_head(related, query)
         pulled = torch.bmm(to_asked[0], key[..., :width].mT)
         pulled.baddbmm_(to_asked[1], key[..., width:].mT)
         asked, given = (each.flatten(0, 1).permute(1, 2, 0) for each in (query, pull))
@@ -300,83 +314,6 @@ class _Attend(torch.autograd.Function):
             pulled.transpose(0, 1).reshape(query.shape),
             torch.cat([torch.bmm(asked, each) for each in to_asked], dim=2),
             torch.cat([torch.bmm(given, each) for each in seen], dim=2),
-            own.sum(dim=(0, 1)), to_features,
-            None, None, None, None, None, None, None,
+            own.sum(dim=(0, 1)), to_features.total(),
+            None, None, None, None, None, None, None, None,
         )  # fmt: skip
-
-
-def _parts(queries: int, features: Tensor, index: Tensor) -> Iterator[tuple[slice, Tensor]]:
-    """Take targets a few at a time; yield which, and their neighbours' features."""
-    targets, neighbours = index.shape
-    few = max(1, targets)
-    if features.device.type == "cpu":
-        few = max(1, CACHED_NUMBERS // ((neighbours + 2 * queries) * features.shape[1]))
-    few = min(few, max(1, targets))
-    # One buffer for all of them: a fresh one each time costs more than to fill it.
-    buffer = features.new_empty((few, neighbours, features.shape[1]))
-    for start in range(0, targets, few):
-        part = slice(start, min(start + few, targets))
-        near = buffer[: part.stop - part.start]
-        rows = near.flatten(0, 1)
-        torch.index_select(features, 0, index[part].flatten(), out=rows)
-        yield part, near
-
-
-def _widen(narrow: Tensor, weight_HCE: Tensor) -> Tensor:
-    """Bring what each head has [B, N, S, H, C] to the space of features: [N, B Q, E]."""
-    count, targets, slots, heads, _ = narrow.shape
-    rows = narrow.flatten(1, 2).transpose(1, 2).flatten(0, 1)  # [B H, T, C]
-    width = weight_HCE.shape[2]
-    wide = torch.bmm(rows, weight_HCE).view(count, heads, targets, slots, width)
-    # With a single slot a view: every head's rows stay where they are.
-    return wide.permute(2, 0, 3, 1, 4).reshape(targets, count * slots * heads, width)
-
-
-def _by_head(wide: Tensor, query: Tensor) -> Tensor:
-    """View what queries [N, S, H, C] saw [N, Q, D] head by head: [H, T, D]."""
-    targets, slots, heads, _ = query.shape
-    return wide.view(targets * slots, heads, wide.shape[-1]).transpose(0, 1)
-
-
-def _by_slot(score: Tensor, cover: Tensor) -> Tensor:
-    """View numbers of queries [N, Q, K] slot by slot: [N, S, H, K]."""
-    targets, slots, neighbours = cover.shape
-    return score.view(targets, slots, score.shape[1] // slots, neighbours)
-
-
-def _products(wide_NQE: Tensor, near_NKD: Tensor, relation_NKR: Tensor) -> Tensor:
-    """Products [N, Q, K] with features and relations together, in float32."""
-    width = near_NKD.shape[2]
-    found = torch.bmm(wide_NQE[..., :width], near_NKD.mT)
-    if found.dtype == torch.float32:
-        return found.baddbmm_(wide_NQE[..., width:], relation_NKR.mT)
-    return found.float() + torch.bmm(wide_NQE[..., width:], relation_NKR.mT)
-
-
-def _softmax(score: Tensor) -> Tensor:
-    """Softmax over neighbours, in place where that is quicker."""
-    if score.device.type != "cpu" or not 0 < score.shape[-1] < VECTOR_NUMBERS:
-        return score.softmax(dim=-1)
-    # Torch takes so few numbers one by one, five times as long as this.
-    score.sub_(score.amax(dim=-1, keepdim=True)).exp_()
-    return score.div_(score.sum(dim=-1, keepdim=True))
-
-
-def _add_rows(rows: Tensor, index: Tensor, values: Tensor) -> None:
-    """Add values [N, K, D] to the rows [M, D] that an index [N, K] names."""
-    index, values = index.flatten(), values.flatten(0, 1)
-    if rows.device.type == "cpu":
-        rows.index_add_(0, index, values)
-    else:  # There ``index_add_`` adds in any order.
-        rows += torch.ops.aten.embedding_dense_backward(values, index, len(rows), -1, False)
-
-
-def _add_product(total: Tensor, one: Tensor, other: Tensor, *, first: bool) -> None:
-    """Add products to a float32 total; the first ones are written over what it holds."""
-    if one.dtype != total.dtype:
-        product = torch.bmm(one, other)
-        total.copy_(product) if first else total.add_(product)
-    elif first:
-        torch.bmm(one, other, out=total)
-    else:
-        total.baddbmm_(one, other)

@@ -14,7 +14,13 @@ from torch import Tensor
 from infgen.model.layers import AttentionSources
 from infgen.model.map_grid import MapGrid
 from infgen.model.neighbour_attention import Shared
-from infgen.model.relations import Relation, Rows, describe_pairs, nearest
+from infgen.model.relations import (
+    Relation,
+    Rows,
+    describe_pairs,
+    nearest,
+    within_radius,
+)
 from infgen.model.signal_features import StopLines
 
 
@@ -82,6 +88,7 @@ class NeighbourRows:
         present: Which of them there are [N, K].
         place: Position of each neighbour among its group's sources [N, K].
         turn: By what the features of the row itself are turned [N, P], if they are.
+        groups: Ranges of rows that see the same ones, as in ``attention.parts``.
     """
 
     index: Tensor
@@ -89,11 +96,12 @@ class NeighbourRows:
     present: Tensor
     place: Tensor
     turn: Tensor | None
+    groups: tuple[slice, ...] | None = None
 
     def seen(self, features: Tensor) -> AttentionSources:
         """Join with the features of all rows [row, D], which are turned if any are."""
         return AttentionSources(
-            features, self.index, self.relation, self.present, self.turn
+            features, self.index, self.relation, self.present, self.turn, self.groups
         )
 
 
@@ -189,6 +197,59 @@ def find_neighbours(
         present=present,
         place=place,
         turn=reach.relation.turn(pose),
+    )
+
+
+def find_others(
+    reach: NeighbourSpec,
+    rows: Rows,
+    pose: Float32[Tensor, "group place 3"],
+    visible: Bool[Tensor, "group place"],
+) -> NeighbourRows:
+    """Find what every row sees of the other rows of its group.
+
+    Where a group has no more rows than are seen, and on a CPU, all of its rows are listed
+    in order: so one product does for the whole group, and nothing is gathered.
+
+    Args:
+        reach: How far and how many; looking from where they are, not ahead.
+        rows: The visible places.
+        pose: Poses of all places.
+        visible: Which places hold somebody.
+    """
+    if visible.device.type == "cpu":
+        sizes = visible.sum(dim=1)
+        if len(rows.at) and int(sizes.max()) <= reach.count + 1:
+            return _whole_groups(reach, rows, pose, sizes)
+    others = ~torch.eye(visible.shape[1], dtype=torch.bool, device=visible.device)
+    allowed = visible[:, None] & visible[:, :, None] & others
+    return find_neighbours(reach, rows, pose, pose, rows.number, allowed)
+
+
+def _whole_groups(
+    reach: NeighbourSpec, rows: Rows, pose: Tensor, sizes: Tensor
+) -> NeighbourRows:
+    """List all rows of each group for each of its rows; they are there if they are seen."""
+    own, ends = rows.pack(pose), sizes.cumsum(dim=0)
+    group = rows.at // pose.shape[1]
+    listed = torch.arange(int(sizes.max()))
+    first = (ends - sizes)[group, None]
+    index = (first + listed).clamp(max=len(own) - 1)
+    others = own[index]
+    present = (listed < sizes[group, None]) & (index != torch.arange(len(own))[:, None])
+    present &= within_radius(own[:, None].expand_as(others), others, reach.radius_m)
+    starts = (ends - sizes).tolist()
+    return NeighbourRows(
+        index=index,
+        relation=reach.describe(own, others),
+        present=present,
+        place=rows.at[index] % pose.shape[1],
+        turn=reach.relation.turn(own),
+        groups=tuple(
+            slice(start, end)
+            for start, end in zip(starts, ends.tolist(), strict=True)
+            if end > start
+        ),
     )
 
 

@@ -38,6 +38,7 @@ from infgen.model.neighbours import (
     cell_pose,
     find_map_neighbours,
     find_neighbours,
+    find_others,
 )
 from infgen.model.relations import Rows, describe_pairs
 from infgen.model.rotary.turns import turned
@@ -190,7 +191,6 @@ class Network(nn.Module):
         by_token = Rows(rows.at, rows.number.flatten(0, 1))
         pose = agents.pose.flatten(0, 1)  # [scene token, agent, 3]
         visible = visible.flatten(0, 1)
-        others = ~torch.eye(visible.shape[1], dtype=torch.bool, device=visible.device)
         own_pose = rows.pack(agents.pose)
         past_index, past_present, past_relation = self._past(agents, rows, as_logged)
         reach, token = self.motion.map_reach(), _tokens(agents, rows)
@@ -201,14 +201,7 @@ class Network(nn.Module):
             find_map_neighbours(
                 reach, by_scene, agents.pose.flatten(1, 2), roads, scene, token
             ),
-            find_neighbours(
-                self.motion.agents_reach(),
-                by_token,
-                pose,
-                pose,
-                by_token.number,
-                visible[:, None] & visible[:, :, None] & others,
-            ),
+            find_others(self.motion.agents_reach(), by_token, pose, visible),
             self.motion.lights_ahead(
                 roads, own_pose, rows.at // agents.visible[0].numel(), token
             ),

@@ -40,6 +40,7 @@ from infgen.model.neighbours import (
     cell_pose,
     find_map_neighbours,
     find_neighbours,
+    find_others,
 )
 from infgen.model.network import EGO, Network
 from infgen.model.relations import Rows, describe_pairs, within_radius
@@ -371,15 +372,7 @@ class Stepper:
     ) -> AgentContext:
         """What the visible rows of a column see."""
         visible = token_step.visible
-        others = ~torch.eye(visible.shape[1], dtype=torch.bool, device=visible.device)
-        around = find_neighbours(
-            self._agents_reach,
-            rows,
-            token_step.pose,
-            token_step.pose,
-            rows.number,
-            visible[:, None] & visible[:, :, None] & others,
-        )
+        around = find_others(self._agents_reach, rows, token_step.pose, visible)
         pose, rollout = rows.pack(token_step.pose), rows.at // visible.shape[1]
         scene, token = memory.scene[rollout], memory.columns - memory.begun[rollout]
         light = self.network.motion.lights_ahead(memory.roads, pose, scene, token)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from infgen.model import neighbour_attention
+from infgen.model.attention import parts as attention_parts
 from infgen.model.layers import (
     Attention,
     AttentionSources,
@@ -112,7 +112,7 @@ def test_targets_taken_a_few_at_a_time_give_what_all_at_once_give(monkeypatch):
         return found, *torch.autograd.grad(found.square().sum(), inputs, retain_graph=True)
 
     whole = run()
-    monkeypatch.setattr(neighbour_attention, "CACHED_NUMBERS", 2 * 7 * WIDTH)
+    monkeypatch.setattr(attention_parts, "CACHED_NUMBERS", 2 * 7 * WIDTH)
     parts = run()
 
     for part, other in zip(parts, whole, strict=True):

@@ -18,7 +18,7 @@ from infgen.model.training.policy_gradient.terms import divergence, policy_terms
 
 HOW = TrainSettings(policy_gradient_rollouts=3, policy_top_p=0.9)
 ROUNDING = 1e-6
-"""Between a network with gradients and its copy without, which computes in another order."""
+"""Between a network with gradients and its copy without, which sums in another order."""
 
 
 @pytest.fixture(scope="module")

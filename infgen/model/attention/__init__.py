@@ -1,0 +1,1 @@
+"""Attention over neighbours, a few targets at a time."""
