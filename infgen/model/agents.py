@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from infgen.clock import CLOCK
+from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.layers import (
     Attention,
     AttentionSources,
@@ -26,7 +27,6 @@ from infgen.model.long_memory import (
     StandingFeatures,
 )
 from infgen.model.motion_head import MotionHead
-from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import MapFeatures, NeighbourRows, NeighbourSpec
 from infgen.model.relations import Rows, direction, relation_embedding
 from infgen.model.rotary.turns import turned

@@ -13,7 +13,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from infgen.model.attention.evaluation import Affine, EvaluationWeights, KeptFold
-from infgen.model.neighbour_attention import Hiding, PairWeights, Shared, attend_to_pairs
+from infgen.model.attention.neighbour_attention import (
+    Hiding,
+    PairWeights,
+    Shared,
+    attend_to_pairs,
+)
 from infgen.model.settings import ModelSettings
 
 FEED_FORWARD = 4

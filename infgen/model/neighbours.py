@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
+from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.layers import AttentionSources
 from infgen.model.map_grid import MapGrid
-from infgen.model.neighbour_attention import Shared
 from infgen.model.relations import (
     Relation,
     Rows,

@@ -8,6 +8,7 @@ from torch.nn import functional
 
 from infgen.clock import CLOCK
 from infgen.model.agents import AgentContext, AgentEmbedding, AgentRows, MotionStack
+from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.cell_features import CellSources
 from infgen.model.device.index import BatchIndex
@@ -32,7 +33,6 @@ from infgen.model.long_memory import (
     standing_at,
 )
 from infgen.model.map import MapEncoder
-from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import (
     MapFeatures,
     cell_pose,

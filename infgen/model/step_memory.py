@@ -7,9 +7,9 @@ from jaxtyping import Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
+from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.layers import AttentionSources
 from infgen.model.long_memory import AVERAGED_TOKENS, Standing, next_averages
-from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import MapFeatures
 from infgen.model.rotary.turns import multiples, turn_of, turned
 from infgen.model.settings import ModelSettings

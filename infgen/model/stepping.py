@@ -28,13 +28,13 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from infgen.model.agents import AgentContext, AgentRows
+from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import MapTokens
 from infgen.model.cell_features import CellSources
 from infgen.model.insertion import InsertionBlocks
 from infgen.model.layers import AttentionSources, normed
 from infgen.model.long_memory import Density, Standing, count_around, standing_after
 from infgen.model.map_grid import MapGrid
-from infgen.model.neighbour_attention import Shared
 from infgen.model.neighbours import (
     MapFeatures,
     cell_pose,

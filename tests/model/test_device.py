@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from infgen.config import TrainSettings
+from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import collate
 from infgen.model.batching.tensors import in_float32
 from infgen.model.device.attention import _FeedForward, _Look
 from infgen.model.device.folding import ALIGNED
 from infgen.model.device.index import BatchIndex
 from infgen.model.device.together import launched_together
-from infgen.model.neighbour_attention import Shared
 from infgen.model.network import Network
 from infgen.model.relation_tables import (
     RelationEmbedding,

@@ -8,6 +8,7 @@ import torch
 from torch.nn import functional
 
 from infgen.model.attention import parts as attention_parts
+from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.layers import (
     Attention,
     AttentionSources,
@@ -17,7 +18,6 @@ from infgen.model.layers import (
     initialise,
     normed,
 )
-from infgen.model.neighbour_attention import Shared
 from infgen.model.rotary.turns import multiples, turn_of, turned_back
 from infgen.model.settings import ModelSettings
 

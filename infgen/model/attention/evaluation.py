@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from infgen.model.neighbour_attention import PairWeights
+from infgen.model.attention.neighbour_attention import PairWeights
 
 
 class Affine(NamedTuple):

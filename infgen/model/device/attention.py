@@ -21,9 +21,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from infgen.model.attention.neighbour_attention import HIDDEN_SCORE, Shared
 from infgen.model.device.folding import ALIGNED, Folded, fold
 from infgen.model.layers import Attention, AttentionSources, normed
-from infgen.model.neighbour_attention import HIDDEN_SCORE, Shared
 from infgen.model.rotary.turns import turned_first
 
 FULL_BYTES = 4
