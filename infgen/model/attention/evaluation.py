@@ -21,8 +21,8 @@ class Affine(NamedTuple):
 
     @classmethod
     def of(cls, part: nn.Module) -> "Affine":
-        """Take those of a layer or norm."""
-        return cls(part.get_parameter("weight"), part.get_parameter("bias"))
+        """Take those of a layer or norm; averaged ones may stand in for its parameters."""
+        return cls(getattr(part, "weight"), getattr(part, "bias"))  # noqa: B009
 
     def to(self, kind: torch.dtype) -> "Affine":
         """Return them in some precision."""
