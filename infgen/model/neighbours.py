@@ -215,7 +215,7 @@ def find_others(
         reach: How far and how many; looking from where they are, not ahead.
         rows: The visible places.
         pose: Poses of all places.
-        visible: Which places hold somebody.
+        visible: Which places hold an agent.
     """
     if visible.device.type == "cpu":
         sizes = visible.sum(dim=1)

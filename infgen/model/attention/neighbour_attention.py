@@ -112,7 +112,7 @@ class Hiding(NamedTuple):
 
     Attributes:
         cover: Added to scores: ``HIDDEN_SCORE`` for what a slot does not see [N, S, K].
-        blind: Slots that see nobody [N, S, 1]; None if it is known that there are none.
+        blind: Slots that see no neighbour [N, S, 1]; None if there are surely none.
     """
 
     cover: Tensor
@@ -154,7 +154,7 @@ def attend_to_pairs(
         groups: Ranges of targets that see the same sources, as in ``Sources``.
 
     Returns:
-        Sums [N, S, H, C]; zero for a slot that sees nobody.
+        Sums [N, S, H, C]; zero for a slot that sees no neighbour.
     """
     kind = query.dtype  # The queries' own: low precision under autocast.
     weights = PairWeights(*(weight.to(kind) for weight in weights))
