@@ -53,8 +53,10 @@ def main() -> None:
         with tempfile.TemporaryDirectory(prefix="infgen-bench-") as name:
             records = Path(name) / "records"
             write_files(records, files)
-            for checkout, measured in zip(checkouts, sizes, strict=True):
-                folder = Path(name) / f"version-{len(measured)}-{checkout.name}"
+            for version, (checkout, measured) in enumerate(
+                zip(checkouts, sizes, strict=True)
+            ):
+                folder = Path(name) / f"version-{version}-{checkout.name}"
                 folder.mkdir()
                 measured.append(_measure(checkout, records, folder, files))
     report(sizes)
