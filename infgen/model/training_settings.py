@@ -156,6 +156,9 @@ class TrainSettings:
     log_distance_penalty: NonNegative = 0.1
     """Cost of the square root of a metre from the logged position, less that from the
     other rollouts, for each token step (an energy score)."""
+    placement_penalty: NonNegative = 0.5
+    """Cost of a metre (of at most one on either side of the road edge) by which an inserted
+    vehicle is farther from the scene's logged newcomers than from other inserted ones."""
     divergence_weight: NonNegative = 0.1
     """Weight of the divergence from the pretrained network: cost of a nat per motion
     token."""

@@ -221,7 +221,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=7,
+    version=8,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,

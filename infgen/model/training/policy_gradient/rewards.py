@@ -1,15 +1,16 @@
 """Realism of simulated rollouts, agent by agent and token step by token step.
 
-Three terms, all of them costs, each at the token step at the end of which it is seen:
+Four terms, all of them costs, each at the token step at the end of which it is seen:
 
 - *overlap*: the agent runs into another one (or is inserted into it);
 - *off-road*: a vehicle leaves the road, or gets farther off it;
-- *log distance*: how far from the log's distribution of positions the agent is.
+- *log distance*: how far from the log's distribution of positions the agent is;
+- *placement*: how far from the log's distribution, off the road or on it, it is inserted.
 
-The first two are events, counted once. The third is the gradient of an energy score
-(Gneiting and Raftery 2007), which is best for the true distribution: the square root of the
-distance to the logged position, less that to the other rollouts' positions. Without the
-second part all rollouts would be drawn to one path.
+The first two are events, counted once. The others are gradients of an energy score
+(Gneiting and Raftery 2007), which is best for the true distribution. The log distance is
+the square root of the distance to the logged position, less that to the other rollouts'
+positions. Without the second part all rollouts would be drawn to one path.
 """
 
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from infgen.geometry import boxes_overlap, to_local, to_world
 from infgen.model.batching.batch import Agents
+from infgen.model.training.policy_gradient.placement import placement_costs
 from infgen.model.training.policy_gradient.road import Road
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
 from infgen.model.training_settings import LEAST_ROLLOUTS, TrainSettings
@@ -44,12 +46,14 @@ class Costs:
         off_road: Whether it leaves the road.
         log_distance: Its log distance, in square roots of metres.
         energy_score: The energy score that it is a part of, in the same unit.
+        placement: Placement cost of an inserted vehicle, in metres.
     """
 
     overlap: Bool[Tensor, "rollout token agent"]
     off_road: Bool[Tensor, "rollout token agent"]
     log_distance: Float32[Tensor, "rollout token agent"]
     energy_score: Float32[Tensor, "rollout token agent"]
+    placement: Float32[Tensor, "rollout token agent"]
 
     def reward(self, settings: TrainSettings) -> Float32[Tensor, "rollout token agent"]:
         """Weigh the costs."""
@@ -57,6 +61,7 @@ class Costs:
             settings.overlap_penalty * self.overlap.float()
             + settings.off_road_penalty * self.off_road.float()
             + settings.log_distance_penalty * self.log_distance
+            + settings.placement_penalty * self.placement
         )
 
 
@@ -75,6 +80,7 @@ def find_costs(
         torch.from_numpy(find_overlaps(seen, vocabulary)).to(device),
         torch.from_numpy(find_departures(seen, roads)).to(device),
         *log_distance(rollouts),
+        torch.from_numpy(placement_costs(rollouts, roads)).to(device),
     )
 
 

@@ -119,6 +119,7 @@ def test_no_step_is_done_where_nothing_is_better_than_anything_else(tuned, books
     setup = tuned(
         "run",
         overlap_penalty=0,
+        placement_penalty=0,
         off_road_penalty=0,
         log_distance_penalty=0,
         weight_decay=0,
