@@ -52,20 +52,20 @@ class Excluded:
 
     Attributes:
         used_s: The time.
-        held: What they returned, until the next call: freeing it is their cost too.
+        held: What each returned, until it is called again: freeing it is its cost too, and
+            so it must not be the last to be let go of by somebody else.
     """
 
     used_s: float = 0.0
-    held: list[Any] = field(default_factory=list)
+    held: dict[str, Any] = field(default_factory=dict)
 
     def wrap(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function whose processor time is added up here."""
 
         def timed(*arguments: Any, **named: Any) -> Any:
             start = time.process_time()
-            self.held.clear()
-            found = function(*arguments, **named)
-            self.held.append(found)
+            self.held.pop(function.__qualname__, None)
+            found = self.held[function.__qualname__] = function(*arguments, **named)
             self.used_s += time.process_time() - start
             return found
 

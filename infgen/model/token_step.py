@@ -58,6 +58,12 @@ class TokenStep:
             changed.append(old.flatten(0, 1).index_copy(0, at, new).view_as(old))
         return TokenStep(*changed)
 
+    def write(self, at: Int64[Tensor, " changed"], rows: "TokenStep") -> None:
+        """Do the same in place."""
+        for each in fields(self):
+            old, new = getattr(self, each.name), getattr(rows, each.name)[0]
+            old.flatten(0, 1).index_copy_(0, at, new)
+
     def where(self, chosen: Bool[Tensor, "rollout row"], other: "TokenStep") -> "TokenStep":
         """Take the chosen rows of this, and the other rows of another token step."""
         merged = []

@@ -5,12 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.token_step import InsertionDetails, PositionOutputs
-from infgen.rollout.insertion_state import InsertionRequest, InsertionState, TurnNumbers
+from infgen.rollout.insertion_state import (
+    TURN_PURPOSES,
+    InsertionRequest,
+    InsertionState,
+    TurnNumbers,
+)
 from infgen.rollout.population import InsertedAgents, Population
 from infgen.rollout.random_streams import Purpose
 from infgen.rollout.sampling import choose, sample_event
@@ -61,15 +66,16 @@ class _Turns:
         self, rollouts: Int64[np.ndarray, " active"]
     ) -> Int64[np.ndarray, " active_"]:
         """Sample one position of every active rollout; return those that go on."""
-        self.numbers.draw(rollouts, self.turn[rollouts], self.attempt[rollouts])
-        fresh = self.attempt[rollouts] == 0
+        turn, attempt = self.turn[rollouts], self.attempt[rollouts]
+        self.numbers.draw(rollouts, turn, attempt)
+        numbers, fresh = self.numbers.get(rollouts, turn, attempt), attempt == 0
         if fresh.any():
             goes_on = ~fresh
-            goes_on[fresh] = self._query(rollouts[fresh])
-            rollouts = rollouts[goes_on]
+            goes_on[fresh] = self._query(rollouts[fresh], numbers[:, fresh])
+            rollouts, numbers = rollouts[goes_on], numbers[:, goes_on]
         if not len(rollouts):
             return rollouts
-        inserted, cell = _sample_agents(self, rollouts)
+        inserted, cell = _sample_agents(self, rollouts, numbers)
         batch = self.batch
         mask, allowed = batch.request.insertion_mask, inserted.who
         if mask is not None:
@@ -92,18 +98,17 @@ class _Turns:
             return self.query
         return self.query.take(self.batch.request.simulator.tensor(rollouts))
 
-    def uniforms(self, purpose: Purpose, rollouts: Int64[np.ndarray, " active"]) -> Tensor:
-        """Return a uniform number of each of some rollouts."""
-        numbers = self.numbers.get(purpose, rollouts, self.attempt[rollouts])
-        return self.batch.request.simulator.tensor(numbers)
-
     def some_entries(self, rollouts: Int64[np.ndarray, " active"]) -> Insertions:
         """Return the token step of some rollouts, as the network sees it."""
         if len(rollouts) == len(self.turn):
             return self.entries
         return self.entries.take(self.batch.request.simulator.tensor(rollouts))
 
-    def _query(self, rollouts: Int64[np.ndarray, " asked"]) -> Bool[np.ndarray, " asked"]:
+    def _query(
+        self,
+        rollouts: Int64[np.ndarray, " asked"],
+        numbers: Float64[np.ndarray, "purpose asked"],
+    ) -> Bool[np.ndarray, " asked"]:
         """Ask whether one more agent is inserted; full rollouts insert none."""
         batch, request = self.batch, self.batch.request
         simulator = request.simulator
@@ -114,7 +119,7 @@ class _Turns:
         else:
             self.query.put(asked, query)
         bias = simulator.tensor(batch.add_bias(rollouts))
-        uniform = self.uniforms(Purpose.ADD, rollouts)
+        uniform = simulator.tensor(numbers[TURN_PURPOSES.index(Purpose.ADD)])
         add = simulator.fetch(sample_event(query.add_logit, uniform, bias))[0]
         # A batch has as many rows as its most crowded scene needs: free rows are no limit.
         free: np.ndarray = batch.num_agents[rollouts] < request.most[rollouts]
@@ -129,11 +134,9 @@ class _Turns:
         at = rollouts[row >= 0], row[row >= 0]
         fresh = np.zeros(batch.cells.shape, dtype=bool)
         fresh[at] = True
-        rows = simulator.rows(fresh)
-        step = simulator.token_step(batch.population, batch.cells, at)
-        self.entries = simulator.stepper.entry_add(
-            self.entries, self.entries.token_step.put(rows.at, step), rows
-        )
+        rows, token_step = simulator.rows(fresh), self.entries.token_step
+        token_step.write(rows.at, simulator.token_step(batch.population, batch.cells, at))
+        self.entries = simulator.stepper.entry_add(self.entries, token_step, rows)
 
 
 def insert_agents(
@@ -147,7 +150,8 @@ def insert_agents(
     simulator, batch = request.simulator, InsertionState.of(request, population)
     entries = simulator.stepper.entry_begin(
         memory,
-        simulator.token_step(population, batch.cells),
+        # Of the batch's own arrays, which it may share: both change in place.
+        simulator.token_step(batch.population, batch.cells),
         simulator.rows(population.visible),
     )
     turns = _Turns.of(batch, entries, token)
@@ -159,7 +163,9 @@ def insert_agents(
 
 
 def _sample_agents(
-    turns: _Turns, rollouts: Int64[np.ndarray, " active"]
+    turns: _Turns,
+    rollouts: Int64[np.ndarray, " active"],
+    numbers: Float64[np.ndarray, "purpose active"],
 ) -> tuple[InsertedAgents, Int64[np.ndarray, " active"]]:
     """Sample position, type, size and heading; return them and the cells.
 
@@ -170,7 +176,7 @@ def _sample_agents(
     taken = batch.occupied[rollouts] | turns.tried[rollouts]
 
     def uniforms(purpose: Purpose) -> Tensor:
-        return turns.uniforms(purpose, rollouts)
+        return simulator.tensor(numbers[TURN_PURPOSES.index(purpose)])
 
     cell, regressed_m = _sample_cell(simulator, query, taken, uniforms)
     entries = turns.some_entries(rollouts)

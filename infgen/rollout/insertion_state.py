@@ -19,6 +19,8 @@ from infgen.tokens.scene_tokens import NO_CELL
 
 TURN_PURPOSES = (Purpose.ADD, Purpose.CELL, Purpose.AGENT_TYPE, Purpose.HEADING)
 """What is sampled in one insertion."""
+TURNS_AT_ONCE = 4
+"""Turns whose random numbers are drawn together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,18 +56,18 @@ class TurnNumbers:
     Attributes:
         streams: Random numbers of the rollouts.
         token: Token step.
-        numbers: Those of four attempts, by purpose: of the turn and the attempts that each
-            rollout is at. Changes in place.
+        numbers: Those of four attempts, by purpose, of the turns that each rollout is at,
+            turn by turn as a ring. Changes in place.
     """
 
     streams: Streams
     token: int
-    numbers: Float64[np.ndarray, "purpose rollout 4"]
+    numbers: Float64[np.ndarray, "purpose rollout turn 4"]
 
     @classmethod
     def of(cls, streams: Streams, token: int) -> "TurnNumbers":
         """Begin a token step; no number is drawn yet."""
-        shape = (len(TURN_PURPOSES), len(streams), WORDS)
+        shape = (len(TURN_PURPOSES), len(streams), TURNS_AT_ONCE, WORDS)
         return cls(streams, token, np.zeros(shape))
 
     def draw(
@@ -74,23 +76,29 @@ class TurnNumbers:
         turn: Int64[np.ndarray, " asked"],
         attempt: Int64[np.ndarray, " asked"],
     ) -> None:
-        """Draw the numbers of rollouts that are at a first attempt, or at the next four."""
-        begins = attempt % WORDS == 0
-        some, block = rollouts[begins], attempt[begins] // WORDS
-        if len(some):
-            self.numbers[:, some] = self.streams.take(some).uniform_block(
-                self.token, TURN_PURPOSES, block, turn[begins]
+        """Draw the numbers of rollouts whose next turns, or attempts, are not drawn yet."""
+        place = turn % TURNS_AT_ONCE
+        begins = (place == 0) & (attempt == 0)
+        if begins.any():
+            some = rollouts[begins]
+            self.numbers[:, some] = self.streams.take(some).uniform_turns(
+                self.token, TURN_PURPOSES, turn[begins], TURNS_AT_ONCE
+            )
+        more = (attempt > 0) & (attempt % WORDS == 0)
+        if more.any():
+            some = rollouts[more]
+            self.numbers[:, some, place[more]] = self.streams.take(some).uniform_block(
+                self.token, TURN_PURPOSES, attempt[more] // WORDS, turn[more]
             )
 
     def get(
         self,
-        purpose: Purpose,
         rollouts: Int64[np.ndarray, " asked"],
+        turn: Int64[np.ndarray, " asked"],
         attempt: Int64[np.ndarray, " asked"],
-    ) -> Float64[np.ndarray, " asked"]:
-        """Return one number of each rollout, at an attempt that was drawn."""
-        number = TURN_PURPOSES.index(purpose)
-        return self.numbers[number, rollouts, attempt % WORDS]
+    ) -> Float64[np.ndarray, "purpose asked"]:
+        """Return the numbers of each rollout at an attempt that was drawn."""
+        return self.numbers[:, rollouts, turn % TURNS_AT_ONCE, attempt % WORDS]
 
 
 @dataclass(slots=True)

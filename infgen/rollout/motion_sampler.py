@@ -190,5 +190,7 @@ class MotionSampler:
         attempt: int = 0,
     ) -> Tensor:
         """Draw a uniform number per chosen row; it does not depend on the other rows."""
-        numbers = self.streams.uniform(token, purpose, chosen.shape[1], attempt)
-        return self.simulator.tensor(numbers[chosen])
+        used = chosen.any(axis=0)
+        rows = len(used) - int(used[::-1].argmax())  # Free rows are the last ones.
+        numbers = self.streams.uniform(token, purpose, rows, attempt)
+        return self.simulator.tensor(numbers[chosen[:, :rows]])

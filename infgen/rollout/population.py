@@ -241,9 +241,9 @@ def advance_agents(
     there = (population.presence != Presence.ABSENT) & ~gone
     remove = remove & there
     remove[:, EGO_ROW] = False
-    paths = vocabulary.path[:, :, 1:].reshape(-1, *vocabulary.path[0, 0, 1:].shape)
+    paths = vocabulary.path.reshape(-1, *vocabulary.path.shape[2:])
     row = population.agent_type[there] * np.int64(vocabulary.num_motion_tokens)
-    steps = paths.take(row + motion_token[there], axis=0)
+    steps = paths.take(row + motion_token[there], axis=0)[:, 1:]
     path = np.zeros((*there.shape, *steps.shape[1:]), dtype=np.float32)
     path[there] = to_world(steps, population.pose[there][:, None])
     presence = np.where(remove, Presence.REMOVED, Presence.PRESENT) * there
@@ -328,5 +328,7 @@ def insertion_pose(
     ego_pose: Float32[np.ndarray, "rollout 3"], inserted: InsertedAgents
 ) -> Float32[np.ndarray, "rollout 3"]:
     """Poses [rollout, 3] of inserted agents in the scene's frame."""
-    heading_rad = wrap_angle(inserted.turned_rad + ego_pose[:, 2])
-    return np.column_stack([from_grid(inserted.position_m, ego_pose), heading_rad])
+    pose = np.empty_like(ego_pose)
+    pose[:, :2] = from_grid(inserted.position_m, ego_pose)
+    pose[:, 2] = wrap_angle(inserted.turned_rad + ego_pose[:, 2])
+    return pose

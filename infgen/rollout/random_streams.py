@@ -113,6 +113,24 @@ class Streams:
         words = _philox(counter, token - self.begun, self.key)
         return np.moveaxis(_numbers(words), 1, 0)
 
+    def uniform_turns(
+        self,
+        token: int,
+        purposes: Sequence[Purpose],
+        first: Int64[np.ndarray, " stream"],
+        count: int,
+    ) -> Float64[np.ndarray, "purpose stream turn 4"]:
+        """Return the first four numbers of each purpose's draw in some turns.
+
+        They are ``uniform_block(token, purposes, 0, turn)`` for ``count`` turns on from
+        each stream's first: one evaluation of many draws costs little more than of one.
+        """
+        kinds = np.repeat(np.array(purposes, dtype=np.uint64), count)
+        turns = np.tile(first[:, None] + np.arange(count), len(purposes)).astype(np.uint64)
+        words = _philox((1, turns, kinds), token - self.begun, self.key)
+        numbers = _numbers(words).reshape(len(self), len(purposes), count, WORDS)
+        return np.moveaxis(numbers, 1, 0)
+
 
 def _by_stream(word: int | np.ndarray) -> UInt64[np.ndarray, "_ 1"]:
     """Return a word of every stream, or of all of them, for all draws."""

@@ -19,6 +19,8 @@ from infgen.tokens.scene_tokens import NO_CELL
 from infgen.tokens.settings import TokenSettings
 
 _QUARTER_TURN_RAD = np.float32(np.pi / 2)
+_AROUND = np.array([[x, y] for y in (1, 0, -1) for x in (-1, 0, 1)])
+"""The squares around one, and itself, in the order of cells."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -95,16 +97,14 @@ def to_grid(
     xy_m: Float32[np.ndarray, "*batch 2"], ego_pose: Float32[np.ndarray, "*#batch 3"]
 ) -> Float32[np.ndarray, "*batch 2"]:
     """Bring world points to the grid frame of an ego. Inverse of ``from_grid``."""
-    turn_rad = np.broadcast_to(_QUARTER_TURN_RAD - ego_pose[..., 2], xy_m.shape[:-1])
-    return rotate(xy_m - ego_pose[..., :2], turn_rad)
+    return rotate(xy_m - ego_pose[..., :2], _QUARTER_TURN_RAD - ego_pose[..., 2])
 
 
 def from_grid(
     xy_m: Float32[np.ndarray, "*batch 2"], ego_pose: Float32[np.ndarray, "*#batch 3"]
 ) -> Float32[np.ndarray, "*batch 2"]:
     """Bring points of an ego's grid frame to the world."""
-    turn_rad = np.broadcast_to(ego_pose[..., 2] - _QUARTER_TURN_RAD, xy_m.shape[:-1])
-    return rotate(xy_m, turn_rad) + ego_pose[..., :2]
+    return rotate(xy_m, ego_pose[..., 2] - _QUARTER_TURN_RAD) + ego_pose[..., :2]
 
 
 def encode_cell(
@@ -122,9 +122,24 @@ def encode_cell(
     inside = np.hypot(xy_m[..., 0], xy_m[..., 1]) <= grid.radius_m
     rim = inside & (cell == NO_CELL)
     if rim.any():
-        gap_m = np.linalg.norm(xy_m[rim][:, None] - grid.centre_m, axis=-1)
-        cell[rim] = gap_m.argmin(axis=1)
+        cell[rim] = _nearest_around(xy_m[rim], tick[rim] + reach, grid)
     return np.where(inside, cell, NO_CELL).astype(np.int16)
+
+
+def _nearest_around(
+    xy_m: Float32[np.ndarray, "point 2"], at: Int64[np.ndarray, "point 2"], grid: Grid
+) -> Int64[np.ndarray, " point"]:
+    """Find the nearest cell to each point, the first of them, around its lattice square.
+
+    The nearest is in none but the nine squares there: towards the ego along both axes, one
+    of them is a cell, and no farther away than a square's diagonal.
+    """
+    around = (at[:, None] + _AROUND).clip(0, len(grid.cell_at) - 1)
+    cell = grid.cell_at[around[..., 1], around[..., 0]]  # [point, 9]
+    away_m = xy_m[:, None] - grid.centre_m[cell]
+    x_m, y_m = away_m[..., 0], away_m[..., 1]
+    gap_m = np.where(cell == NO_CELL, np.inf, np.sqrt(x_m * x_m + y_m * y_m))
+    return cell[np.arange(len(cell)), gap_m.argmin(axis=1)]
 
 
 def decode_cell(

@@ -125,6 +125,9 @@ class InsertionMask:
             inserted.agent_type[who] == AgentType.PEDESTRIAN
         )
         who, row = who[~pedestrians], row[~pedestrians]
+        overlaps = np.zeros(len(pose), dtype=bool)
+        if not len(who):
+            return overlaps
         at = (rollouts[who], row)
         now = population.pose[at]
         soon = to_world(self._step(population, at), now)
@@ -134,7 +137,6 @@ class InsertionMask:
             np.stack([now, soon]),
             population.size_lwh_m[at][:, :2],
         ).any(axis=0)
-        overlaps = np.zeros(len(pose), dtype=bool)
         overlaps[who[meets]] = True
         return overlaps
 
