@@ -49,15 +49,15 @@ class InsertionRequest:
         return self.simulator.rules.max_insertion_attempts
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class TurnNumbers:
     """The uniform numbers of the insertions of one token step.
 
     Attributes:
         streams: Random numbers of the rollouts.
         token: Token step.
-        numbers: Those of four attempts, by purpose, of the turns that each rollout is at,
-            turn by turn as a ring. Changes in place.
+        numbers: Those of four attempts, by purpose, of the turns drawn so far: of each turn
+            the attempts that a rollout is at.
     """
 
     streams: Streams
@@ -67,8 +67,7 @@ class TurnNumbers:
     @classmethod
     def of(cls, streams: Streams, token: int) -> "TurnNumbers":
         """Begin a token step; no number is drawn yet."""
-        shape = (len(TURN_PURPOSES), len(streams), TURNS_AT_ONCE, WORDS)
-        return cls(streams, token, np.zeros(shape))
+        return cls(streams, token, np.zeros((len(TURN_PURPOSES), len(streams), 0, WORDS)))
 
     def draw(
         self,
@@ -76,18 +75,22 @@ class TurnNumbers:
         turn: Int64[np.ndarray, " asked"],
         attempt: Int64[np.ndarray, " asked"],
     ) -> None:
-        """Draw the numbers of rollouts whose next turns, or attempts, are not drawn yet."""
-        place = turn % TURNS_AT_ONCE
-        begins = (place == 0) & (attempt == 0)
-        if begins.any():
-            some = rollouts[begins]
-            self.numbers[:, some] = self.streams.take(some).uniform_turns(
-                self.token, TURN_PURPOSES, turn[begins], TURNS_AT_ONCE
+        """Draw numbers of all rollouts that go on, if one of them is behind the last turn.
+
+        Attempts beyond the first four are drawn when a rollout comes to them.
+        """
+        known = self.numbers.shape[2]
+        if turn.max() >= known:
+            turns = range(known, known + TURNS_AT_ONCE)
+            drawn = np.zeros((*self.numbers.shape[:2], TURNS_AT_ONCE, WORDS))
+            drawn[:, rollouts] = self.streams.take(rollouts).uniform_turns(
+                self.token, TURN_PURPOSES, turns
             )
+            self.numbers = np.concatenate([self.numbers, drawn], axis=2)
         more = (attempt > 0) & (attempt % WORDS == 0)
         if more.any():
             some = rollouts[more]
-            self.numbers[:, some, place[more]] = self.streams.take(some).uniform_block(
+            self.numbers[:, some, turn[more]] = self.streams.take(some).uniform_block(
                 self.token, TURN_PURPOSES, attempt[more] // WORDS, turn[more]
             )
 
@@ -98,7 +101,7 @@ class TurnNumbers:
         attempt: Int64[np.ndarray, " asked"],
     ) -> Float64[np.ndarray, "purpose asked"]:
         """Return the numbers of each rollout at an attempt that was drawn."""
-        return self.numbers[:, rollouts, turn % TURNS_AT_ONCE, attempt % WORDS]
+        return self.numbers[:, rollouts, turn, attempt % WORDS]
 
 
 @dataclass(slots=True)

@@ -117,18 +117,17 @@ class Streams:
         self,
         token: int,
         purposes: Sequence[Purpose],
-        first: Int64[np.ndarray, " stream"],
-        count: int,
+        turns: range,
     ) -> Float64[np.ndarray, "purpose stream turn 4"]:
         """Return the first four numbers of each purpose's draw in some turns.
 
-        They are ``uniform_block(token, purposes, 0, turn)`` for ``count`` turns on from
-        each stream's first: one evaluation of many draws costs little more than of one.
+        They are ``uniform_block(token, purposes, 0, turn)`` for each of the turns: one
+        evaluation of many draws costs little more than of one.
         """
-        kinds = np.repeat(np.array(purposes, dtype=np.uint64), count)
-        turns = np.tile(first[:, None] + np.arange(count), len(purposes)).astype(np.uint64)
-        words = _philox((1, turns, kinds), token - self.begun, self.key)
-        numbers = _numbers(words).reshape(len(self), len(purposes), count, WORDS)
+        kinds = np.repeat(np.array(purposes, dtype=np.uint64), len(turns))
+        counter = (1, np.tile(np.array(turns, dtype=np.uint64), len(purposes)), kinds)
+        words = _philox(counter, token - self.begun, self.key)
+        numbers = _numbers(words).reshape(len(self), len(purposes), len(turns), WORDS)
         return np.moveaxis(numbers, 1, 0)
 
 

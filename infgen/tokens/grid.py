@@ -60,8 +60,13 @@ class Grid:
     @property
     def heading_centre_rad(self) -> Float32[np.ndarray, " heading"]:
         """Heading at the middle of each bin, relative to the ego."""
-        bins = np.arange(self.num_headings) + 0.5
-        return (bins * self.heading_step_rad - np.pi).astype(np.float32)
+        return _heading_centres_rad(self.num_headings)
+
+
+@lru_cache(maxsize=16)
+def _heading_centres_rad(count: int) -> Float32[np.ndarray, " heading"]:
+    bins = np.arange(count) + 0.5
+    return (bins * (2 * math.pi / count) - np.pi).astype(np.float32)
 
 
 @lru_cache(maxsize=16)

@@ -52,6 +52,7 @@ class InsertionMask:
     Attributes:
         lanes: Lane segments of each map.
         squares: The same by where they are.
+        has_lanes: Which maps have any.
         scene: Map of each rollout.
         end_pose: End pose of each motion token by agent type ...
         length_m: ... and how far away it is.
@@ -59,6 +60,7 @@ class InsertionMask:
 
     lanes: Sequence[Lanes]
     squares: LaneSquares
+    has_lanes: Bool[np.ndarray, " map"]
     scene: Int64[np.ndarray, " rollout"]
     end_pose: Float32[np.ndarray, "3 motion_token 3"]
     length_m: Float32[np.ndarray, "3 motion_token"]
@@ -101,9 +103,8 @@ class InsertionMask:
         pose = insertion_pose(population.pose[rollouts, EGO_ROW], inserted)
         allowed = ~self._overlaps(population, inserted, rollouts, pose, circles)
         vehicle = inserted.agent_type == AgentType.VEHICLE
-        has_lanes = np.array([len(start_m) > 0 for start_m, _ in self.lanes])
         scene = self.scene[rollouts]
-        asked = np.flatnonzero(allowed & vehicle & has_lanes[scene])
+        asked = np.flatnonzero(allowed & vehicle & self.has_lanes[scene])
         allowed[asked] = self.squares.has_lane(pose[asked, :2], scene[asked])
         return allowed
 
@@ -177,9 +178,9 @@ def make_insertion_mask(
     moves, roads = books
     lanes = [_lanes(tokens, roads) for tokens in maps]
     length_m = np.hypot(moves.end_pose[..., 0], moves.end_pose[..., 1])
-    return InsertionMask(
-        lanes, LaneSquares.of(lanes, lane_m), scene, moves.end_pose, length_m
-    )
+    has_lanes = np.array([len(start_m) > 0 for start_m, _ in lanes])
+    squares = LaneSquares.of(lanes, lane_m)
+    return InsertionMask(lanes, squares, has_lanes, scene, moves.end_pose, length_m)
 
 
 def _lanes(tokens: SceneTokens, roads: MapVocabulary) -> Lanes:

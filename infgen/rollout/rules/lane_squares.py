@@ -28,6 +28,7 @@ class LaneSquares:
         start_m: First point of the segments, by square.
         along_m: Vector from there to their last point.
         reach_m: The distance.
+        is_sure: Squares that are within it of a segment as a whole.
     """
 
     corner_m: Float32[np.ndarray, "scene 2"]
@@ -37,6 +38,7 @@ class LaneSquares:
     start_m: Float32[np.ndarray, "listed 2"]
     along_m: Float32[np.ndarray, "listed 2"]
     reach_m: float
+    is_sure: Bool[np.ndarray, " square"]
 
     @classmethod
     def of(cls, maps: Sequence[Lanes], reach_m: float) -> "LaneSquares":
@@ -66,7 +68,10 @@ class LaneSquares:
             )
             for k in (0, 1)
         )
-        return cls(corner_m, side_m, (columns, rows), begin, start_m, along_m, reach_m)
+        size, is_sure = (columns, rows), np.zeros(len(begin) - 1, dtype=bool)
+        within = _are_within(corner_m, side_m, size, square, (start_m, along_m), reach_m)
+        is_sure[square[within]] = True
+        return cls(corner_m, side_m, size, begin, start_m, along_m, reach_m, is_sure)
 
     def has_lane(
         self, xy_m: Float32[np.ndarray, "point 2"], scene: Int64[np.ndarray, " point"]
@@ -77,14 +82,38 @@ class LaneSquares:
         column, row = at.astype(np.int64).T
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         square = np.where(inside, (scene * rows + row) * columns + column, 0)
+        found = self.is_sure[square] & inside
         first = self.begin[square]
-        count = (self.begin[square + 1] - first) * inside
+        count = (self.begin[square + 1] - first) * (inside & ~found)
+        if not count.any():
+            return found
         point = np.repeat(np.arange(len(xy_m)), count)
         listed = np.arange(len(point)) + np.repeat(first - (count.cumsum() - count), count)
         gap_m = lane_gap_m(xy_m[point], self.start_m[listed], self.along_m[listed])
-        found = np.zeros(len(xy_m), dtype=bool)
         found[point[gap_m <= self.reach_m]] = True
         return found
+
+
+def _are_within(
+    corner_m: Float32[np.ndarray, "scene 2"],
+    side_m: float,
+    size: tuple[int, int],
+    square: Int64[np.ndarray, " listed"],
+    segments: Lanes,
+    reach_m: float,
+) -> Bool[np.ndarray, " listed"]:
+    """Tell which squares are within a distance of a segment that they list, as a whole.
+
+    The distance to a segment is convex: nowhere in a square is it larger than at a corner.
+    """
+    columns, rows = size
+    scene, own = np.divmod(square, columns * rows)
+    at = np.stack([own % columns, own // columns], axis=-1)
+    within = np.ones(len(square), dtype=bool)
+    for corner in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        corners_m = (corner_m[scene] + (at + corner) * side_m).astype(np.float32)
+        within &= lane_gap_m(corners_m, *segments) < reach_m - MARGIN_M
+    return within
 
 
 def lane_gap_m(
