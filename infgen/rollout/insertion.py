@@ -20,7 +20,7 @@ from infgen.rollout.population import InsertedAgents, Population
 from infgen.rollout.random_streams import Purpose
 from infgen.rollout.sampling import choose, sample_event
 from infgen.rollout.simulator import Simulator
-from infgen.tokens.grid import Grid, decode_cell, decode_heading, encode_cell
+from infgen.tokens.grid import Grid, decode_heading, encode_cell
 
 INSIDE = 0.999
 """Inserted agents stay within this share of the grid radius, whatever their offsets."""
@@ -38,11 +38,11 @@ class _Turns:
     Attributes:
         batch: All rollouts.
         entries: The token step as the network sees it, of all rollouts.
-        query: Latest logits of their positions.
+        query: Latest logits of their positions, minus infinity for cells that hold an agent
+            or were rejected in this turn.
         numbers: Random numbers.
         turn: Agents that each rollout has inserted.
-        attempt: Positions rejected in this turn ...
-        tried: ... and their cells.
+        attempt: Positions rejected in this turn.
     """
 
     batch: InsertionState
@@ -51,7 +51,6 @@ class _Turns:
     numbers: TurnNumbers
     turn: Int64[np.ndarray, " rollout"]
     attempt: Int64[np.ndarray, " rollout"]
-    tried: Bool[np.ndarray, "rollout cell"]
 
     @classmethod
     def of(cls, batch: InsertionState, entries: Insertions, token: int) -> "_Turns":
@@ -59,8 +58,7 @@ class _Turns:
         streams = batch.request.streams
         turn = np.zeros(len(streams), dtype=np.int64)
         numbers = TurnNumbers.of(streams, token)
-        tried = np.zeros_like(batch.occupied)
-        return cls(batch, entries, None, numbers, turn, turn.copy(), tried)
+        return cls(batch, entries, None, numbers, turn, turn.copy())
 
     def advance(
         self, rollouts: Int64[np.ndarray, " active"]
@@ -84,9 +82,9 @@ class _Turns:
         if len(placed):
             self._add(placed, inserted.take(np.flatnonzero(allowed)))
         self.turn[placed] += 1
-        self.attempt[placed], self.tried[placed] = 0, False
+        self.attempt[placed] = 0
         self.attempt[rejected] += 1
-        self.tried[rejected, cell[~allowed]] = True
+        self._exclude(rejected, cell[~allowed])
         turns = batch.request.simulator.settings.max_insertions
         ends = (self.turn >= turns) | (self.attempt >= batch.request.attempts)
         return rollouts[~ends[rollouts]]
@@ -114,6 +112,9 @@ class _Turns:
         simulator = request.simulator
         query = simulator.stepper.entry_query(self.some_entries(rollouts))
         asked = simulator.tensor(rollouts)
+        if query.position_logits is not None:
+            taken = simulator.tensor(batch.occupied[rollouts])
+            query.position_logits.masked_fill_(taken, -torch.inf)
         if self.query is None:  # The first query is of all; a copy, as it will change.
             self.query = query.take(asked)
         else:
@@ -124,6 +125,15 @@ class _Turns:
         # A batch has as many rows as its most crowded scene needs: free rows are no limit.
         free: np.ndarray = batch.num_agents[rollouts] < request.most[rollouts]
         return free & add
+
+    def _exclude(
+        self, rollouts: Int64[np.ndarray, " rejected"], cell: Int64[np.ndarray, " rejected"]
+    ) -> None:
+        """Exclude rejected cells until the next turn."""
+        assert self.query is not None
+        logits, simulator = self.query.position_logits, self.batch.request.simulator
+        if logits is not None:
+            logits[simulator.tensor(rollouts), simulator.tensor(cell)] = -torch.inf
 
     def _add(
         self, rollouts: Int64[np.ndarray, " inserted"], inserted: InsertedAgents
@@ -171,14 +181,13 @@ def _sample_agents(
 
     Everything is sampled where the network is, and fetched at once.
     """
-    batch, simulator = turns.batch, turns.batch.request.simulator
+    simulator = turns.batch.request.simulator
     grid, query = simulator.grid, turns.positions(rollouts)
-    taken = batch.occupied[rollouts] | turns.tried[rollouts]
 
     def uniforms(purpose: Purpose) -> Tensor:
         return simulator.tensor(numbers[TURN_PURPOSES.index(purpose)])
 
-    cell, regressed_m = _sample_cell(simulator, query, taken, uniforms)
+    cell, regressed_m = _sample_cell(simulator, query, uniforms)
     entries = turns.some_entries(rollouts)
     details = simulator.stepper.entry_details(entries, cell, regressed_m)
     agent_type = choose(details.agent_type_logits, uniforms(Purpose.AGENT_TYPE))
@@ -189,7 +198,7 @@ def _sample_agents(
     parts = [cell, agent_type, size_lwh_m, heading, *([] if more is None else [more])]
     cells, types, sizes, headings, *rest = simulator.fetch(*parts)
 
-    position_m = decode_cell(cells.astype(np.int16), grid)
+    position_m = grid.centre_m[cells]
     if regressed_m is not None:
         position_m = rest[0]
     elif rest:
@@ -209,14 +218,13 @@ def _sample_agents(
 def _sample_cell(
     simulator: Simulator,
     query: PositionOutputs,
-    taken: Bool[np.ndarray, "rollout cell"],
     uniforms: UniformNumbers,
 ) -> tuple[Tensor, Tensor | None]:
     """Sample a cell per rollout, or take those of regressed positions, returned as well."""
     settings, grid = simulator.settings, simulator.grid
     if query.position_logits is not None:
         cell = choose(
-            query.position_logits.masked_fill(simulator.tensor(taken), float("-inf")),
+            query.position_logits,
             uniforms(Purpose.CELL),
             settings.position_top_k,
             nucleus=settings.position_top_p,
