@@ -1,7 +1,7 @@
 """Insertion of agents in one token step, one agent per query of the network."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -114,7 +114,8 @@ class _Turns:
         asked = simulator.tensor(rollouts)
         if query.position_logits is not None:
             taken = simulator.tensor(batch.occupied[rollouts])
-            query.position_logits.masked_fill_(taken, -torch.inf)
+            logits = query.position_logits.masked_fill(taken, -torch.inf)
+            query = replace(query, position_logits=logits)
         if self.query is None:  # The first query is of all; a copy, as it will change.
             self.query = query.take(asked)
         else:

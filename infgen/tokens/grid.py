@@ -102,14 +102,16 @@ def to_grid(
     xy_m: Float32[np.ndarray, "*batch 2"], ego_pose: Float32[np.ndarray, "*#batch 3"]
 ) -> Float32[np.ndarray, "*batch 2"]:
     """Bring world points to the grid frame of an ego. Inverse of ``from_grid``."""
-    return rotate(xy_m - ego_pose[..., :2], _QUARTER_TURN_RAD - ego_pose[..., 2])
+    turn_rad = np.asarray(_QUARTER_TURN_RAD - ego_pose[..., 2])
+    return rotate(xy_m - ego_pose[..., :2], turn_rad)
 
 
 def from_grid(
     xy_m: Float32[np.ndarray, "*batch 2"], ego_pose: Float32[np.ndarray, "*#batch 3"]
 ) -> Float32[np.ndarray, "*batch 2"]:
     """Bring points of an ego's grid frame to the world."""
-    return rotate(xy_m, ego_pose[..., 2] - _QUARTER_TURN_RAD) + ego_pose[..., :2]
+    turn_rad = np.asarray(ego_pose[..., 2] - _QUARTER_TURN_RAD)
+    return rotate(xy_m, turn_rad) + ego_pose[..., :2]
 
 
 def encode_cell(

@@ -68,6 +68,16 @@ def test_each_stream_may_be_at_a_block_and_a_turn_of_its_own():
         np.testing.assert_array_equal(found[:, [number]], alone)
 
 
+def test_turns_drawn_together_are_those_drawn_one_by_one():
+    streams, purposes = Streams.of([(0, "abc", n) for n in range(3)]), list(Purpose)
+
+    found = streams.uniform_turns(4, purposes, range(8, 12))
+
+    for place, turn in enumerate(range(8, 12)):
+        alone = streams.uniform_block(4, purposes, 0, turn)
+        np.testing.assert_array_equal(found[:, :, place], alone)
+
+
 @given(
     index=st.integers(0, 2**31),
     token=st.integers(0, 2**31),

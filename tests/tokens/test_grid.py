@@ -95,6 +95,19 @@ def test_points_of_the_rim_whose_square_is_outside_go_to_the_nearest_cell_inside
     assert encode_cell(f32(53, 53)[None], GRID)[0] != NO_CELL
 
 
+@pytest.mark.parametrize(("radius_m", "step_m"), [(75.0, 3.0), (51.2, 2.0), (4.3, 3.0)])
+def test_the_cell_of_a_point_at_the_rim_is_the_first_of_the_nearest(radius_m, step_m):
+    grid = make_grid(TokenSettings(grid_radius_m=radius_m, grid_cell_m=step_m))
+    random = np.random.default_rng(0)
+    turn = random.uniform(-np.pi, np.pi, 2000)
+    away_m = radius_m - step_m * random.uniform(0, 1.5, 2000)
+    xy_m = (away_m * np.stack([np.cos(turn), np.sin(turn)])).T.astype(np.float32)
+    cell = encode_cell(xy_m, grid)
+
+    gap_m = np.linalg.norm(xy_m[:, None] - grid.centre_m, axis=-1)
+    np.testing.assert_array_equal(gap_m[np.arange(2000), cell], gap_m.min(axis=1))
+
+
 def test_every_centre_is_in_its_own_cell():
     cells = np.arange(1961, dtype=np.int16)
 
