@@ -190,7 +190,7 @@ class MotionSampler:
         attempt: int = 0,
     ) -> Tensor:
         """Draw a uniform number per chosen row; it does not depend on the other rows."""
-        used = chosen.any(axis=0)
-        rows = len(used) - int(used[::-1].argmax())  # Free rows are the last ones.
+        # Rows beyond the last chosen one need none.
+        rows = int(np.flatnonzero(chosen.any(axis=0)).max(initial=-1)) + 1
         numbers = self.streams.uniform(token, purpose, rows, attempt)
         return self.simulator.tensor(numbers[chosen[:, :rows]])
