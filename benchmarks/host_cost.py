@@ -52,8 +52,8 @@ class Excluded:
 
     Attributes:
         used_s: The time.
-        held: What each returned, until it is called again: freeing it is its cost too, and
-            so it must not be the last to be let go of by somebody else.
+        held: What each returned, until it is called again: so that its memory is freed at
+            its cost, and not where the caller drops the last reference.
     """
 
     used_s: float = 0.0

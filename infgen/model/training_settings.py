@@ -158,7 +158,8 @@ class TrainSettings:
     other rollouts, for each token step (an energy score)."""
     placement_penalty: NonNegative = 0.5
     """Cost of a metre (of at most one on either side of the road edge) by which an inserted
-    vehicle is farther from the scene's logged newcomers than from other inserted ones."""
+    vehicle is farther from those that the scene's log inserts than from other inserted
+    ones."""
     divergence_weight: NonNegative = 0.1
     """Weight of the divergence from the pretrained network: cost of a nat per motion
     token."""

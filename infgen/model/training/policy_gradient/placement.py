@@ -1,11 +1,11 @@
 """Where vehicles are inserted, beside where the log inserts them: on the road or off it.
 
-Who is inserted off the road (into a parking lot) meets nobody and cannot leave the road
-any more, so that the other costs alone teach to insert there. The placement cost is the
-gradient of an energy score (Gneiting and Raftery 2007) of the signed distance off the road:
-the mean distance to the scene's logged newcomers less that to the other inserted vehicles
-of its rollouts. The score is best where both have the same distribution, and there no place
-costs more than another.
+A vehicle that is inserted off the road (into a parking lot) hits no agent and cannot leave
+the road any more, so that the other costs alone teach to insert there. The placement cost
+is the gradient of an energy score (Gneiting and Raftery 2007) of the signed distance off
+the road: the mean distance to the vehicles that the scene's log inserts less that to the
+other ones that its rollouts insert. The score is best where both have the same
+distribution, and there no place costs more than another.
 """
 
 import numpy as np
