@@ -32,7 +32,7 @@ def _remainder(
     For a few angles ``%`` alone is quickest.
     """
     if angle_rad.size < FEW_ANGLES:
-        return angle_rad % turn
+        return np.asarray(angle_rad % turn)  # Of no axes, ``%`` makes a scalar.
     if not ((angle_rad >= -turn) & (angle_rad < 2 * turn)).all():
         return angle_rad % turn
     below = np.where(angle_rad < 0, angle_rad + turn, angle_rad)
