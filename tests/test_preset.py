@@ -209,7 +209,7 @@ def test_a_dry_run_plans_policy_gradient_before_the_weights_it_starts_from(desk,
     assert code == 0
     runs = json.loads(capsys.readouterr().out)["runs"]
     assert {run["note"] for run in runs if "infgen" in run["run"]} == {
-        "after policy-gradient"
+        "after policy-gradient-2"
     }
 
 
