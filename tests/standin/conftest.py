@@ -24,7 +24,7 @@ def case():
             text=True,
             env={**os.environ, "OMP_NUM_THREADS": "1"},
             cwd=ROOT,
-            timeout=240,
+            timeout=600,
         )
         assert done.returncode == 0, done.stderr[-3000:]
         return json.loads(done.stdout.splitlines()[-1])
