@@ -327,13 +327,17 @@ def test_a_worker_that_does_not_move_is_given_up_and_its_unit_begins_again(
     words, started = cluster(
         workers=2, environment={"DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "15s"}
     )
-    workshop.run(targets=("count",))
+    # So long that a look every 20 ms cannot miss a unit in the making.
+    setting = "count.sleep_s=1"
+    workshop.run(setting, targets=("count",))
     expected = workshop.files()
     for number in range(4):
         workshop.text(f"{number}.txt", "word " * number)
     run_options = RunOptions(workers=DaskWorkers(words))
     running, found = in_background(
-        functools.partial(workshop.run, run_options=run_options, targets=("count",))
+        functools.partial(
+            workshop.run, setting, run_options=run_options, targets=("count",)
+        )
     )
     wait_for(lambda: list(workshop.root.units("count").glob("*.partial")))
 
