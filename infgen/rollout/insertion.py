@@ -1,7 +1,7 @@
 """Insertion of agents in one token step, one agent per query of the network."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -111,15 +111,14 @@ class _Turns:
         batch, request = self.batch, self.batch.request
         simulator = request.simulator
         query = simulator.stepper.entry_query(self.some_entries(rollouts))
-        asked = simulator.tensor(rollouts)
         if query.position_logits is not None:
+            # In place: nobody else holds the network's answer.
             taken = simulator.tensor(batch.occupied[rollouts])
-            logits = query.position_logits.masked_fill(taken, -torch.inf)
-            query = replace(query, position_logits=logits)
-        if self.query is None:  # The first query is of all; a copy, as it will change.
-            self.query = query.take(asked)
+            query.position_logits.masked_fill_(taken, -torch.inf)
+        if self.query is None:  # The first query is of all.
+            self.query = query
         else:
-            self.query.put(asked, query)
+            self.query.put(simulator.tensor(rollouts), query)
         bias = simulator.tensor(batch.add_bias(rollouts))
         uniform = simulator.tensor(numbers[TURN_PURPOSES.index(Purpose.ADD)])
         add = simulator.fetch(sample_event(query.add_logit, uniform, bias))[0]

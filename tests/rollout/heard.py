@@ -66,7 +66,9 @@ class Listening(Stepper):
 
     def entry_query(self, entries):
         said = super().entry_query(entries)
-        self.queries.append(asked(entries, said))
+        # A copy: logits of taken cells are masked in place.
+        everyone = torch.arange(len(said.add_logit))
+        self.queries.append(asked(entries, said.take(everyone)))
         return said
 
     def entry_details(self, entries, cell, position_m=None):
