@@ -112,7 +112,7 @@ class _Turns:
         simulator = request.simulator
         query = simulator.stepper.entry_query(self.some_entries(rollouts))
         if query.position_logits is not None:
-            # In place: nobody else holds the network's answer.
+            # In place: no other code keeps these logits.
             taken = simulator.tensor(batch.occupied[rollouts])
             query.position_logits.masked_fill_(taken, -torch.inf)
         if self.query is None:  # The first query is of all.
