@@ -160,6 +160,9 @@ class TrainSettings:
     """Cost of a metre (of at most one on either side of the road edge) by which an inserted
     vehicle is farther from those that the scene's log inserts than from other inserted
     ones."""
+    speed_penalty: NonNegative = 0.05
+    """Cost, for each token step, of a metre per second by which the speed of a vehicle is
+    farther from those of the log's vehicles than from those of other simulated ones."""
     divergence_weight: NonNegative = 0.1
     """Weight of the divergence from the pretrained network: cost of a nat per motion
     token."""

@@ -27,7 +27,10 @@ from pipeline.stages.train.ranks import Rank, own_rank
 POLL_S = 0.1
 MEETING = timedelta(minutes=30)
 """Time for all processes to start."""
+LEAVING_S = 10.0
+"""Longest time that the first process waits for the others to leave before it does."""
 OVER = "over"
+LEFT = "left"
 
 
 class PeerError(ValueError):
@@ -117,16 +120,29 @@ _MEETING = _Meeting()
 
 @contextmanager
 def joined_group() -> Iterator[None]:
-    """Meet the other processes; in the end the first one sends them home."""
-    store, rank, _ = next(rendezvous("env://", timeout=MEETING))
+    """Meet the other processes; in the end the first one sends them home.
+
+    The store is the first process's and ends with it, so that it leaves last.
+    """
+    store, rank, size = next(rendezvous("env://", timeout=MEETING))
     _MEETING.store = _part(store, "infgen")
     try:
         yield
     finally:
-        if rank == 0:
-            # The others may be gone, and the store with them.
-            with suppress(RuntimeError):
-                _MEETING.store.set(OVER, "")
+        # The others may be gone, and the store with them.
+        with suppress(RuntimeError):
+            if rank == 0:
+                _send_home(_MEETING.store, size - 1)
+            else:
+                _MEETING.store.add(LEFT, 1)
+
+
+def _send_home(store: Any, others: int) -> None:
+    """Tell the others that there is no more to do, and wait until they have left."""
+    store.set(OVER, "")
+    deadline = time.monotonic() + LEAVING_S
+    while store.add(LEFT, 0) < others and time.monotonic() < deadline:
+        time.sleep(POLL_S)
 
 
 @contextmanager

@@ -221,7 +221,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=8,
+    version=9,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,

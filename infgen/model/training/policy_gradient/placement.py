@@ -2,16 +2,15 @@
 
 A vehicle that is inserted off the road (into a parking lot) hits no agent and cannot leave
 the road any more, so that the other costs alone teach to insert there. The placement cost
-is the gradient of an energy score (Gneiting and Raftery 2007) of the signed distance off
-the road: the mean distance to the vehicles that the scene's log inserts less that to the
-other ones that its rollouts insert. The score is best where both have the same
-distribution, and there no place costs more than another.
+is the gradient of an energy score of the signed distance off the road: of the vehicles that
+the rollouts of a scene insert, against those that its log inserts.
 """
 
 import numpy as np
 from jaxtyping import Bool, Float32
 
 from infgen.model.batching.batch import Agents
+from infgen.model.training.policy_gradient.energy import energy_gradient
 from infgen.model.training.policy_gradient.road import Road
 from infgen.model.training.policy_gradient.rollouts import (
     HISTORY_TOKENS,
@@ -49,20 +48,6 @@ def placement_costs(
         at, off_m = _vehicles_off_m(rollouts.batch.agents, each, inserted[each], road)
         cost[each][at] = energy_gradient(off_m, logged_off_m)
     return cost
-
-
-def energy_gradient(
-    values: Float32[np.ndarray, " value"], logged: Float32[np.ndarray, " logged"]
-) -> Float32[np.ndarray, " value"]:
-    """Mean distance of each value to the logged ones less that to the other values.
-
-    Zero where there is nothing logged, or only one value.
-    """
-    others = len(values) - 1
-    if others < 1 or not len(logged):
-        return np.zeros(len(values), dtype=np.float32)
-    to_log = np.abs(values[:, None] - logged).mean(axis=1)
-    return to_log - np.abs(values[:, None] - values).sum(axis=1) / np.float32(others)
 
 
 def _vehicles_off_m(

@@ -1,11 +1,12 @@
 """Realism of simulated rollouts, agent by agent and token step by token step.
 
-Four terms, all of them costs, each at the token step at the end of which it is seen:
+Five terms, all of them costs, each at the token step at the end of which it is seen:
 
 - *overlap*: the agent runs into another one (or is inserted into it);
 - *off-road*: a vehicle leaves the road, or gets farther off it;
 - *log distance*: how far from the log's distribution of positions the agent is;
-- *placement*: how far from the log's distribution, off the road or on it, it is inserted.
+- *placement*: how far from the log's distribution, off the road or on it, it is inserted;
+- *speed*: how far from the log's distribution of speeds it drives.
 
 The first two are events, counted once. The others are gradients of an energy score
 (Gneiting and Raftery 2007), which is best for the true distribution. The log distance is
@@ -25,6 +26,7 @@ from infgen.model.batching.batch import Agents
 from infgen.model.training.policy_gradient.placement import placement_costs
 from infgen.model.training.policy_gradient.road import Road
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
+from infgen.model.training.policy_gradient.speeds import speed_costs
 from infgen.model.training_settings import LEAST_ROLLOUTS, TrainSettings
 from infgen.scene import AgentType
 from infgen.spatial.road_edges import leaves_road
@@ -47,6 +49,7 @@ class Costs:
         log_distance: Its log distance, in square roots of metres.
         energy_score: The energy score that it is a part of, in the same unit.
         placement: Placement cost of an inserted vehicle, in metres.
+        speed: Speed cost of a vehicle, in m/s.
     """
 
     overlap: Bool[Tensor, "rollout token agent"]
@@ -54,6 +57,7 @@ class Costs:
     log_distance: Float32[Tensor, "rollout token agent"]
     energy_score: Float32[Tensor, "rollout token agent"]
     placement: Float32[Tensor, "rollout token agent"]
+    speed: Float32[Tensor, "rollout token agent"]
 
     def reward(self, settings: TrainSettings) -> Float32[Tensor, "rollout token agent"]:
         """Weigh the costs."""
@@ -62,6 +66,7 @@ class Costs:
             + settings.off_road_penalty * self.off_road.float()
             + settings.log_distance_penalty * self.log_distance
             + settings.placement_penalty * self.placement
+            + settings.speed_penalty * self.speed
         )
 
 
@@ -81,6 +86,7 @@ def find_costs(
         torch.from_numpy(find_departures(seen, roads)).to(device),
         *log_distance(rollouts),
         torch.from_numpy(placement_costs(rollouts, roads)).to(device),
+        torch.from_numpy(speed_costs(rollouts)).to(device),
     )
 
 

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from infgen.model.training.policy_gradient.placement import (
-    energy_gradient,
-    placement_costs,
-)
+from infgen.model.training.policy_gradient.placement import placement_costs
 from infgen.model.training.policy_gradient.road import Road
 from infgen.model.training.simulation import INSERTED
 from infgen.scene import AgentType
@@ -70,28 +67,3 @@ def test_each_scene_has_its_own_log(drawn):
     # The first scene has the first and the third rollout: all four are off the road.
     assert cost[::2, LAST].ravel() == pytest.approx([0, 1, 1, 0, 1, 1])
     assert not cost[1::2].any()
-
-
-def test_one_alone_or_no_log_costs_nothing():
-    one, none = np.float32([1]), np.float32([])
-
-    assert energy_gradient(one, one).tolist() == [0]
-    assert energy_gradient(np.float32([1, -1]), none).tolist() == [0, 0]
-
-
-def test_the_gradient_is_zero_where_the_share_is_the_logs_and_points_to_it():
-    """Off with share q of the rollouts and p of the log: what off costs more than on."""
-
-    def excess(q, p, count=1000):
-        ours, logs = (
-            np.repeat(
-                np.float32([1, -1]), [round(share * count), count - round(share * count)]
-            )
-            for share in (q, p)
-        )
-        cost = energy_gradient(ours, logs)
-        return float(cost[0] - cost[-1])
-
-    assert excess(0.5, 0.5) == pytest.approx(0, abs=1e-5)
-    assert excess(0.7, 0.5) == pytest.approx(4 * 0.2, rel=0.01)
-    assert excess(0.2, 0.5) == pytest.approx(-4 * 0.3, rel=0.01)

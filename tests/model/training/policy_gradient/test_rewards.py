@@ -175,9 +175,13 @@ def test_costs_are_weighed_by_the_settings():
     some = torch.tensor([[[True, False]]])
     distance = torch.tensor([[[2.0, -1.0]]])
     how = TrainSettings(
-        overlap_penalty=3, off_road_penalty=5, log_distance_penalty=0.5, placement_penalty=2
+        overlap_penalty=3,
+        off_road_penalty=5,
+        log_distance_penalty=0.5,
+        placement_penalty=2,
+        speed_penalty=0.1,
     )
 
-    reward = Costs(some, ~some, distance, distance, 2 * distance).reward(how)
+    reward = Costs(some, ~some, distance, distance, 2 * distance, 10 * distance).reward(how)
 
-    assert reward.tolist() == [[[-12.0, -0.5]]]
+    assert reward.tolist() == [[[-14.0, 0.5]]]

@@ -122,7 +122,7 @@ def test_cells_and_headings_of_inserted_agents_are_learned_too(network, lessons)
 
 
 def test_without_penalties_nothing_is_better_than_anything_else(network, logged):
-    names = ("overlap", "off_road", "log_distance", "placement")
+    names = ("overlap", "off_road", "log_distance", "placement", "speed")
     free = replace(HOW, **{f"{name}_penalty": 0 for name in names})
 
     for lesson in simulate_lessons(network, logged, free, 5).lessons:
