@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -46,6 +46,7 @@ from pipeline.engine.manifest import verify as find_damage
 from pipeline.settings import described
 from pipeline.settings.request import OWN_FILE, find_file, named_weights
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
+from pipeline.stages.train.launch import leave
 from pipeline.stages.train.launch import run as run_command
 
 ENVIRONMENT = {
@@ -381,19 +382,22 @@ def demo(root: RootFolder = WORK / "demo", json_: Json = False) -> None:
 app.add_typer(tools.app)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run a command; a known error is one line and an exit code."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     words = sys.argv[1:] if arguments is None else arguments
+    code = 0
     try:
         run_command(lambda: app(args=arguments), os.environ)
+    except SystemExit as ended:  # As all commands end, with a number.
+        code = int(ended.code or 0)
     except (ValueError, OSError, signals.Stopped) as error:
         code = exit_code(error)
         typer.echo(f"infgen: {error}", err=True)
         if "--json" in words:  # For programs that collect the lines.
             print_json({"error": str(error), "exit_code": code})
-        sys.exit(code)
+    leave(code, os.environ)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,12 @@ first one trains, take part in that, and leave when it does. Light to import: wi
 ``torchrun`` none of this costs anything.
 """
 
+import atexit
+import os
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import NoReturn
 
 from pipeline.stages.train.ranks import find_rank
 
@@ -17,6 +21,21 @@ def run(command: Callable[[], None], environ: Mapping[str, str]) -> None:
     with joined(environ) as first:
         if first:
             command()
+
+
+def leave(code: int, environ: Mapping[str, str]) -> NoReturn:
+    """End this process with an exit code, after all that is due at an exit.
+
+    Among several, without the interpreter's own end: a thread of gloo lets go of a tensor
+    some time after its sum is known, and if the interpreter ends meanwhile, pybind aborts
+    the process (signal 6, torch 2.13).
+    """
+    if find_rank(environ).count == 1:
+        sys.exit(code)
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(code)
 
 
 @contextmanager

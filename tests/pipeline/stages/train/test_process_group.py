@@ -24,11 +24,11 @@ from pipeline.storage.weights import read_tensors
 HERE = Path(__file__).parents[4]
 LONGEST_S = 240
 SCRIPT = """
-import json, os, sys
+import json, os, sys, traceback
 from pathlib import Path
 from infgen.settings import build
 from pipeline.engine import signals
-from pipeline.stages.train.launch import joined
+from pipeline.stages.train.launch import joined, leave
 from pipeline.engine.stage import Unit
 from pipeline.stages.train.stage import STAGE, work
 
@@ -41,10 +41,16 @@ def tell(done, total, note=""):
     signals.raise_if_stopped()
 
 
-with joined(os.environ) as first, signals.handling_signals():
-    if first and task:
-        with signals.deferred():
-            work(Unit("weights", {}, task), Path(target), settings, tell)
+code = 0
+try:
+    with joined(os.environ) as first, signals.handling_signals():
+        if first and task:
+            with signals.deferred():
+                work(Unit("weights", {}, task), Path(target), settings, tell)
+except BaseException:
+    traceback.print_exc()
+    code = 1
+leave(code, os.environ)
 """
 
 
@@ -201,6 +207,20 @@ def test_without_torchrun_there_is_one_process():
     with joined({}) as first:
         assert first
         assert own_rank() == Rank()
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_process_leaves_with_its_code_after_all_that_is_due(count):
+    words = (
+        "import atexit; from pipeline.stages.train.launch import leave; "
+        f"atexit.register(print, 'over'); leave(7, {{'RANK': '0', 'WORLD_SIZE': '{count}'}})"
+    )
+
+    done = subprocess.run(
+        [sys.executable, "-c", words], capture_output=True, text=True, cwd=HERE, check=False
+    )
+
+    assert (done.returncode, done.stdout) == (7, "over\n"), done.stderr
 
 
 def test_an_error_among_processes_is_one_of_ours():
