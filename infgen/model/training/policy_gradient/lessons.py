@@ -8,7 +8,11 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Batch
 from infgen.model.network import Network
-from infgen.model.training.policy_gradient.returns import advantages, discounted_returns
+from infgen.model.training.policy_gradient.returns import (
+    advantages,
+    discounted_returns,
+    of_insertions,
+)
 from infgen.model.training.policy_gradient.rewards import Costs, find_costs
 from infgen.model.training.policy_gradient.road import read_roads
 from infgen.model.training.policy_gradient.rollouts import (
@@ -65,9 +69,14 @@ def simulate_lessons(
         discounted_returns(grouped(reward), settings.policy_discount),
         *map(grouped, (rollouts.moved, rollouts.inserted, rollouts.known)),
     )
+    type_reward = -settings.agent_type_penalty * costs.agent_type
+    of_type = of_insertions(grouped(type_reward), grouped(rollouts.inserted))
     lessons = [
         PolicyLesson(
-            rollouts.only(number), rollouts.moved[rollouts.rows(number)], advantage[number]
+            rollouts.only(number),
+            rollouts.moved[rollouts.rows(number)],
+            advantage[number],
+            of_type[number],
         )
         for number in range(group)
     ]

@@ -47,8 +47,15 @@ def advantages(
     of_known = known[:, :, None]
     found = _leave_one_out(returns, moved & of_known, ())
     found += _leave_one_out(returns, moved & ~of_known, (AGENT,))
-    found += _leave_one_out(returns, inserted, (TOKEN, AGENT))
-    return found
+    return found + of_insertions(returns, inserted)
+
+
+def of_insertions(
+    values: Float32[Tensor, "group scene token agent"],
+    inserted: Bool[Tensor, "group scene token agent"],
+) -> Float32[Tensor, "group scene token agent"]:
+    """Subtract from each insertion's value the mean of the other rollouts' insertions."""
+    return _leave_one_out(values, inserted, (TOKEN, AGENT))
 
 
 def _leave_one_out(returns: Tensor, mask: Tensor, within: tuple[int, ...]) -> Tensor:

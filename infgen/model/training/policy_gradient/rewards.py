@@ -12,6 +12,8 @@ The first two are events, counted once. The others are gradients of an energy sc
 (Gneiting and Raftery 2007), which is best for the true distribution. The log distance is
 the square root of the distance to the logged position, less that to the other rollouts'
 positions. Without the second part all rollouts would be drawn to one path.
+
+What the type of an inserted agent costs stands beside them, for it is not in the reward.
 """
 
 from dataclasses import dataclass
@@ -27,6 +29,7 @@ from infgen.model.training.policy_gradient.placement import placement_costs
 from infgen.model.training.policy_gradient.road import Road
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
 from infgen.model.training.policy_gradient.speeds import speed_costs
+from infgen.model.training.policy_gradient.types import type_costs
 from infgen.model.training_settings import LEAST_ROLLOUTS, TrainSettings
 from infgen.scene import AgentType
 from infgen.spatial.road_edges import leaves_road
@@ -50,6 +53,7 @@ class Costs:
         energy_score: The energy score that it is a part of, in the same unit.
         placement: Placement cost of an inserted vehicle, in metres.
         speed: Speed cost of a vehicle, in m/s.
+        agent_type: Cost of the type of an inserted agent.
     """
 
     overlap: Bool[Tensor, "rollout token agent"]
@@ -58,9 +62,10 @@ class Costs:
     energy_score: Float32[Tensor, "rollout token agent"]
     placement: Float32[Tensor, "rollout token agent"]
     speed: Float32[Tensor, "rollout token agent"]
+    agent_type: Float32[Tensor, "rollout token agent"]
 
     def reward(self, settings: TrainSettings) -> Float32[Tensor, "rollout token agent"]:
-        """Weigh the costs."""
+        """Weigh all costs but that of types."""
         return -(
             settings.overlap_penalty * self.overlap.float()
             + settings.off_road_penalty * self.off_road.float()
@@ -87,6 +92,7 @@ def find_costs(
         *log_distance(rollouts),
         torch.from_numpy(placement_costs(rollouts, roads)).to(device),
         torch.from_numpy(speed_costs(rollouts)).to(device),
+        type_costs(rollouts),
     )
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from infgen.model.batching.batch import Batch
-from infgen.model.logits import InsertionOutputs, Outputs
+from infgen.model.logits import DetailOutputs, InsertionOutputs, Outputs
 from infgen.model.network import EGO
 from infgen.model.training.losses import Term, Terms
 from infgen.model.training.policy_gradient.nucleus import log_probabilities
@@ -29,12 +29,14 @@ class PolicyLesson:
     Attributes:
         batch: The rollouts.
         moved: Agents whose motion token was sampled.
-        advantage: Of every choice, at the token step that it led to.
+        advantage: Of every choice but types, at the token step that it led to.
+        type_advantage: Of the type of every inserted agent.
     """
 
     batch: Batch
     moved: Bool[Tensor, "scene token agent"]
     advantage: Float32[Tensor, "scene token agent"]
+    type_advantage: Float32[Tensor, "scene token agent"]
 
 
 def policy_terms(
@@ -101,13 +103,12 @@ def _motion_gain(
 
 
 def _insertion_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:
-    """The same of the cells and headings of inserted agents.
+    """The same of the cells, headings and types of inserted agents.
 
-    Not of insertions themselves nor of agent types: rewards are costs, and who is not there
-    has none.
+    Not of insertions themselves: rewards are costs, and who is not there has none.
     """
     gained = outputs.motion.motion_logits.new_zeros(())
-    entries, details = lesson.batch.entries, lesson.batch.details
+    entries = lesson.batch.entries
     if outputs.entries is not None and outputs.entries.position_logits is not None:
         rows, agent = outputs.entries.rows, entries.agent
         came = rows.pack(agent) >= 0
@@ -115,13 +116,25 @@ def _insertion_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:
         likely = outputs.entries.position_logits[came].log_softmax(dim=-1)
         cell = rows.pack(entries.cell)[came][:, None]
         gained = gained + (rows.pack(advantage)[came] * likely.gather(1, cell)[:, 0]).sum()
-    if outputs.details is not None and outputs.details.heading_logits is not None:
-        rows = outputs.details.rows
-        scene = rows.at // details.present.shape[1]
-        at = scene, rows.pack(details.token), rows.pack(details.agent)
-        likely = outputs.details.heading_logits.log_softmax(dim=-1)
-        heading = rows.pack(details.heading)[:, None]
-        gained = gained + (lesson.advantage[at] * likely.gather(1, heading)[:, 0]).sum()
+    return (
+        gained
+        if outputs.details is None
+        else gained + _detail_gain(outputs.details, lesson)
+    )
+
+
+def _detail_gain(outputs: DetailOutputs, lesson: PolicyLesson) -> Tensor:
+    """The same of the types and headings."""
+    details, rows = lesson.batch.details, outputs.rows
+    scene = rows.at // details.present.shape[1]
+    at = scene, rows.pack(details.token), rows.pack(details.agent)
+    choices = [(outputs.agent_type_logits, details.agent_type, lesson.type_advantage)]
+    if outputs.heading_logits is not None:
+        choices.append((outputs.heading_logits, details.heading, lesson.advantage))
+    gained = outputs.agent_type_logits.new_zeros(())
+    for logits, chosen, advantage in choices:
+        likely = logits.log_softmax(dim=-1).gather(1, rows.pack(chosen)[:, None])[:, 0]
+        gained = gained + (advantage[at] * likely).sum()
     return gained
 
 

@@ -182,6 +182,8 @@ def test_costs_are_weighed_by_the_settings():
         speed_penalty=0.1,
     )
 
-    reward = Costs(some, ~some, distance, distance, 2 * distance, 10 * distance).reward(how)
+    reward = Costs(
+        some, ~some, distance, distance, 2 * distance, 10 * distance, distance
+    ).reward(how)
 
     assert reward.tolist() == [[[-14.0, 0.5]]]

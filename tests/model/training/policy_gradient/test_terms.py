@@ -89,7 +89,8 @@ def test_choices_with_a_positive_advantage_become_likelier(network, lessons):
     for sign in (1.0, -1.0):
         advantage = torch.zeros_like(lesson.advantage)
         advantage[tuple(chosen)] = sign
-        only = replace(lesson, advantage=advantage)
+        none = torch.zeros_like(advantage)
+        only = replace(lesson, advantage=advantage, type_advantage=none)
         student = copy.deepcopy(network)
 
         before = terms(student, network, only)["policy"].loss
@@ -121,12 +122,35 @@ def test_cells_and_headings_of_inserted_agents_are_learned_too(network, lessons)
     assert all(value > 0 for value in map(max, zip(*found, strict=True)))
 
 
+def test_types_of_inserted_agents_are_learned_by_their_own_advantage(network, lessons):
+    lesson = next(each for each in lessons.lessons if each.batch.details.present.any())
+    one, none = torch.ones_like(lesson.advantage), torch.zeros_like(lesson.advantage)
+    only = replace(lesson, advantage=none, type_advantage=one)
+    student = copy.deepcopy(network)
+    outputs = student(lesson.batch).details
+    chosen = outputs.rows.pack(lesson.batch.details.agent_type)
+
+    terms(student, network, only)["policy"].loss.backward()
+    with torch.no_grad():
+        for each in student.parameters():
+            if each.grad is not None:
+                each -= 1e-3 * each.grad
+        after = student(lesson.batch).details.agent_type_logits
+
+    before, after = (
+        logits.log_softmax(dim=-1).gather(1, chosen[:, None]).sum()
+        for logits in (outputs.agent_type_logits, after)
+    )
+    assert after > before
+
+
 def test_without_penalties_nothing_is_better_than_anything_else(network, logged):
-    names = ("overlap", "off_road", "log_distance", "placement", "speed")
+    names = ("overlap", "off_road", "log_distance", "placement", "speed", "agent_type")
     free = replace(HOW, **{f"{name}_penalty": 0 for name in names})
 
     for lesson in simulate_lessons(network, logged, free, 5).lessons:
         assert not lesson.advantage.any()
+        assert not lesson.type_advantage.any()
 
 
 def test_networks_of_all_kinds_learn_from_rollouts(variant, new_network, logged):

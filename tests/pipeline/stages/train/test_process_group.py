@@ -213,7 +213,8 @@ def test_without_torchrun_there_is_one_process():
 def test_a_process_leaves_with_its_code_after_all_that_is_due(count):
     words = (
         "import atexit; from pipeline.stages.train.launch import leave; "
-        f"atexit.register(print, 'over'); leave(7, {{'RANK': '0', 'WORLD_SIZE': '{count}'}})"
+        f"atexit.register(print, 'over'); "
+        f"leave(7, {{'RANK': '0', 'WORLD_SIZE': '{count}'}})"
     )
 
     done = subprocess.run(
