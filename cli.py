@@ -31,11 +31,11 @@ from pipeline.commands.verbs import (
     FAILED,
     STALE,
     compare_arms,
-    exit_code,
     find_statuses,
     print_json,
     print_statuses,
     run_stages,
+    tell_error,
     watch_stages,
 )
 from pipeline.engine import artefacts, signals
@@ -46,8 +46,7 @@ from pipeline.engine.manifest import verify as find_damage
 from pipeline.settings import described
 from pipeline.settings.request import OWN_FILE, find_file, named_weights
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages
-from pipeline.stages.train.launch import leave
-from pipeline.stages.train.launch import run as run_command
+from pipeline.stages.train import launch
 
 ENVIRONMENT = {
     # One thread each: results then do not depend on the worker.
@@ -389,15 +388,12 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     words = sys.argv[1:] if arguments is None else arguments
     code = 0
     try:
-        run_command(lambda: app(args=arguments), os.environ)
+        launch.run(lambda: app(args=arguments), os.environ)
     except SystemExit as ended:  # As all commands end, with a number.
         code = int(ended.code or 0)
     except (ValueError, OSError, signals.Stopped) as error:
-        code = exit_code(error)
-        typer.echo(f"infgen: {error}", err=True)
-        if "--json" in words:  # For programs that collect the lines.
-            print_json({"error": str(error), "exit_code": code})
-    leave(code, os.environ)
+        code = tell_error(error, as_json="--json" in words)
+    launch.leave(code, os.environ)
 
 
 if __name__ == "__main__":

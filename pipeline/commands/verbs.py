@@ -239,3 +239,12 @@ def exit_code(error: BaseException) -> int:
     if isinstance(error, ValueError) and ours:
         return FAILED
     raise error
+
+
+def tell_error(error: BaseException, *, as_json: bool) -> int:
+    """Print a known error as one line, with JSON as an object too; return its exit code."""
+    code = exit_code(error)
+    typer.echo(f"infgen: {error}", err=True)
+    if as_json:  # For programs that collect the lines.
+        print_json({"error": str(error), "exit_code": code})
+    return code
