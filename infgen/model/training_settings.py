@@ -166,6 +166,9 @@ class TrainSettings:
     agent_type_penalty: NonNegative = 1.0
     """Cost of the type of an inserted agent: its share among the other inserted ones less
     that among those that the scene's log inserts."""
+    count_penalty: NonNegative = 0.01
+    """Cost, for each token step, of an agent by which the number of agents, and of those
+    inserted so far, is farther from the log's than from the other rollouts'."""
     divergence_weight: NonNegative = 0.1
     """Weight of the divergence from the pretrained network: cost of a nat per motion
     token."""

@@ -12,6 +12,7 @@ from infgen.model.training.policy_gradient.returns import (
     advantages,
     discounted_returns,
     of_insertions,
+    of_rollouts,
 )
 from infgen.model.training.policy_gradient.rewards import Costs, find_costs
 from infgen.model.training.policy_gradient.road import read_roads
@@ -71,12 +72,18 @@ def simulate_lessons(
     )
     type_reward = -settings.agent_type_penalty * costs.agent_type
     of_type = of_insertions(grouped(type_reward), grouped(rollouts.inserted))
+    count_return = discounted_returns(
+        grouped(-settings.count_penalty * costs.count), settings.policy_discount
+    )
+    goes_on = (rollouts.moved | rollouts.inserted).any(dim=2)
+    of_count = of_rollouts(count_return, grouped(goes_on))
     lessons = [
         PolicyLesson(
             rollouts.only(number),
             rollouts.moved[rollouts.rows(number)],
             advantage[number],
             of_type[number],
+            of_count[number],
         )
         for number in range(group)
     ]

@@ -14,8 +14,8 @@ TOKEN, AGENT = 1, 2
 
 
 def discounted_returns(
-    reward: Float32[Tensor, "group scene token agent"], discount: float
-) -> Float32[Tensor, "group scene token agent"]:
+    reward: Float32[Tensor, "group scene token *agent"], discount: float
+) -> Float32[Tensor, "group scene token *agent"]:
     """Sum the rewards from each token step on, each discounted by its distance."""
     found = reward.clone()
     for token in range(reward.shape[2] - 2, -1, -1):
@@ -56,6 +56,14 @@ def of_insertions(
 ) -> Float32[Tensor, "group scene token agent"]:
     """Subtract from each insertion's value the mean of the other rollouts' insertions."""
     return _leave_one_out(values, inserted, (TOKEN, AGENT))
+
+
+def of_rollouts(
+    returns: Float32[Tensor, "group scene token"],
+    goes_on: Bool[Tensor, "group scene token"],
+) -> Float32[Tensor, "group scene token"]:
+    """Subtract from each rollout's return the mean of the others at the same token step."""
+    return _leave_one_out(returns, goes_on, ())
 
 
 def _leave_one_out(returns: Tensor, mask: Tensor, within: tuple[int, ...]) -> Tensor:

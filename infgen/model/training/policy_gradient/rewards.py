@@ -13,7 +13,8 @@ The first two are events, counted once. The others are gradients of an energy sc
 the square root of the distance to the logged position, less that to the other rollouts'
 positions. Without the second part all rollouts would be drawn to one path.
 
-What the type of an inserted agent costs stands beside them, for it is not in the reward.
+What the type of an inserted agent costs, and the number of agents, stands beside them, for
+it is not in the reward of an agent.
 """
 
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from torch import Tensor
 from infgen.geometry import boxes_overlap, to_local, to_world
 from infgen.model.batching.batch import Agents
 from infgen.model.training.policy_gradient.placement import placement_costs
+from infgen.model.training.policy_gradient.population import count_costs
 from infgen.model.training.policy_gradient.road import Road
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
 from infgen.model.training.policy_gradient.speeds import speed_costs
@@ -54,6 +56,7 @@ class Costs:
         placement: Placement cost of an inserted vehicle, in metres.
         speed: Speed cost of a vehicle, in m/s.
         agent_type: Cost of the type of an inserted agent.
+        count: Count cost of the whole rollout.
     """
 
     overlap: Bool[Tensor, "rollout token agent"]
@@ -63,9 +66,10 @@ class Costs:
     placement: Float32[Tensor, "rollout token agent"]
     speed: Float32[Tensor, "rollout token agent"]
     agent_type: Float32[Tensor, "rollout token agent"]
+    count: Float32[Tensor, "rollout token"]
 
     def reward(self, settings: TrainSettings) -> Float32[Tensor, "rollout token agent"]:
-        """Weigh all costs but that of types."""
+        """Weigh the costs of an agent but that of its type."""
         return -(
             settings.overlap_penalty * self.overlap.float()
             + settings.off_road_penalty * self.off_road.float()
@@ -93,6 +97,7 @@ def find_costs(
         torch.from_numpy(placement_costs(rollouts, roads)).to(device),
         torch.from_numpy(speed_costs(rollouts)).to(device),
         type_costs(rollouts),
+        count_costs(rollouts),
     )
 
 

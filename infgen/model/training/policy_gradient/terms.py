@@ -15,11 +15,12 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from infgen.model.batching.batch import Batch
+from infgen.model.batching.batch import Batch, Insertions
 from infgen.model.logits import DetailOutputs, InsertionOutputs, Outputs
 from infgen.model.network import EGO
 from infgen.model.training.losses import Term, Terms
 from infgen.model.training.policy_gradient.nucleus import log_probabilities
+from infgen.tokens.scene_tokens import Presence
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,14 +30,18 @@ class PolicyLesson:
     Attributes:
         batch: The rollouts.
         moved: Agents whose motion token was sampled.
-        advantage: Of every choice but types, at the token step that it led to.
+        advantage: Of motion tokens, and of the cells and headings of inserted agents, at
+            the token step that they led to.
         type_advantage: Of the type of every inserted agent.
+        count_advantage: Of a rollout from a token step on: of its insertions there, and of
+            the removals of the step before, whose agents are gone by then.
     """
 
     batch: Batch
     moved: Bool[Tensor, "scene token agent"]
     advantage: Float32[Tensor, "scene token agent"]
     type_advantage: Float32[Tensor, "scene token agent"]
+    count_advantage: Float32[Tensor, "scene token"]
 
 
 def policy_terms(
@@ -58,6 +63,7 @@ def policy_terms(
     count = lesson.moved.sum().float()
     gained = _motion_gain(outputs, lesson, stationary, top_p)
     gained = gained + _insertion_gain(outputs, lesson)
+    gained = gained + _count_gain(outputs, lesson)
     nothing = gained.new_zeros(())
 
     def term(loss: Tensor) -> Term:
@@ -76,14 +82,11 @@ def divergence(outputs: Outputs, pretrained: Outputs, lesson: PolicyLesson) -> T
     one, other = outputs.motion, pretrained.motion
     found = _of_choice(one.motion_logits[moves], other.motion_logits[moves])
     if one.remove_logit is not None and other.remove_logit is not None:
-        removable = lesson.moved.clone()
-        removable[:, :, EGO] = False
-        asked = rows.pack(_next(removable))
+        asked = rows.pack(_next(_removable(lesson)))
         found = found + _of_event(one.remove_logit[asked], other.remove_logit[asked])
     if outputs.entries is not None and pretrained.entries is not None:
-        slot = torch.arange(entries.agent.shape[2], device=found.device)
-        count = outputs.entries.rows.pack(entries.count)[:, None]
-        found = found + _of_insertions(outputs.entries, pretrained.entries, slot <= count)
+        decided = _decided(outputs.entries, entries)
+        found = found + _of_insertions(outputs.entries, pretrained.entries, decided)
     return found + _of_details(outputs, pretrained)
 
 
@@ -103,10 +106,7 @@ def _motion_gain(
 
 
 def _insertion_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:
-    """The same of the cells, headings and types of inserted agents.
-
-    Not of insertions themselves: rewards are costs, and who is not there has none.
-    """
+    """The same of the cells, headings and types of inserted agents."""
     gained = outputs.motion.motion_logits.new_zeros(())
     entries = lesson.batch.entries
     if outputs.entries is not None and outputs.entries.position_logits is not None:
@@ -136,6 +136,47 @@ def _detail_gain(outputs: DetailOutputs, lesson: PolicyLesson) -> Tensor:
         likely = logits.log_softmax(dim=-1).gather(1, rows.pack(chosen)[:, None])[:, 0]
         gained = gained + (advantage[at] * likely).sum()
     return gained
+
+
+def _count_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:
+    """The same of insertions and removals, with the advantages of whole rollouts.
+
+    Rewards of agents say nothing of them: they are costs, and who is not there has none.
+    """
+    motion, agents = outputs.motion, lesson.batch.agents
+    gained = motion.motion_logits.new_zeros(())
+    if motion.remove_logit is not None:
+        asked = motion.rows.pack(_next(_removable(lesson)))
+        leaves = motion.rows.pack(_next(agents.presence == int(Presence.REMOVED)))
+        after = _next(_next(lesson.count_advantage))[..., None]
+        advantage = motion.rows.pack(after.expand(agents.presence.shape))
+        likely = _log_event(motion.remove_logit, leaves)
+        gained = gained + (advantage * likely)[asked].sum()
+    if outputs.entries is not None:
+        rows, entries = outputs.entries.rows, lesson.batch.entries
+        decided = _decided(outputs.entries, entries)
+        advantage = rows.pack(lesson.count_advantage)[:, None]
+        likely = _log_event(outputs.entries.add_logit, rows.pack(entries.add))
+        gained = gained + (advantage * likely)[decided].sum()
+    return gained
+
+
+def _removable(lesson: PolicyLesson) -> Bool[Tensor, "scene token agent"]:
+    """Agents that might have been removed: those that moved, but for egos."""
+    removable = lesson.moved.clone()
+    removable[:, :, EGO] = False
+    return removable
+
+
+def _decided(outputs: InsertionOutputs, entries: Insertions) -> Bool[Tensor, "row slot"]:
+    """Turns in which an insertion was decided on: all that there were, and one more."""
+    slot = torch.arange(entries.agent.shape[2], device=entries.agent.device)
+    return slot <= outputs.rows.pack(entries.count)[:, None]
+
+
+def _log_event(logit: Tensor, happens: Tensor) -> Tensor:
+    """Log-probability of what happened."""
+    return logsigmoid(torch.where(happens, logit, -logit))
 
 
 def _of_insertions(

@@ -182,8 +182,16 @@ def test_costs_are_weighed_by_the_settings():
         speed_penalty=0.1,
     )
 
-    reward = Costs(
-        some, ~some, distance, distance, 2 * distance, 10 * distance, distance
-    ).reward(how)
+    costs = Costs(
+        overlap=some,
+        off_road=~some,
+        log_distance=distance,
+        energy_score=distance,
+        placement=2 * distance,
+        speed=10 * distance,
+        agent_type=distance,
+        count=distance[..., 0],
+    )
+    reward = costs.reward(how)
 
     assert reward.tolist() == [[[-14.0, 0.5]]]

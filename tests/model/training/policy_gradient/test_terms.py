@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.nn.functional import logsigmoid
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
@@ -15,6 +16,7 @@ from infgen.model.training.policy_gradient.lessons import (
 )
 from infgen.model.training.policy_gradient.rollouts import HISTORY_TOKENS
 from infgen.model.training.policy_gradient.terms import divergence, policy_terms
+from infgen.tokens.scene_tokens import Presence
 
 HOW = TrainSettings(policy_gradient_rollouts=3, policy_top_p=0.9)
 ROUNDING = 1e-6
@@ -37,11 +39,33 @@ def steepest(part):
     return max(map(float, found), default=0.0)
 
 
+def likely(logits, chosen):
+    """Log-probability of what was chosen, summed."""
+    return logits.log_softmax(dim=-1).gather(1, chosen).sum()
+
+
 def terms(network, pretrained, lesson):
     stationary = torch.from_numpy(network.motion_vocabulary().stationary)
     with torch.no_grad():
         before = pretrained(lesson.batch)
     return policy_terms(network(lesson.batch), before, lesson, stationary, HOW.policy_top_p)
+
+
+def worthless(lesson):
+    """The same lesson, in which no choice is better than another."""
+    names = ("advantage", "type_advantage", "count_advantage")
+    return replace(lesson, **{x: torch.zeros_like(getattr(lesson, x)) for x in names})
+
+
+def after_a_step(network, lesson):
+    """A copy of the network after a step along the gradient of the policy term."""
+    student = copy.deepcopy(network)
+    terms(student, network, lesson)["policy"].loss.backward()
+    with torch.no_grad():
+        for each in student.parameters():
+            if each.grad is not None:
+                each -= 1e-3 * each.grad
+    return student
 
 
 def test_there_is_a_lesson_for_every_rollout_and_choices_have_advantages(lessons, logged):
@@ -87,19 +111,13 @@ def test_choices_with_a_positive_advantage_become_likelier(network, lessons):
     lesson = lessons.lessons[0]
     chosen = lesson.moved.nonzero()[10]
     for sign in (1.0, -1.0):
-        advantage = torch.zeros_like(lesson.advantage)
-        advantage[tuple(chosen)] = sign
-        none = torch.zeros_like(advantage)
-        only = replace(lesson, advantage=advantage, type_advantage=none)
-        student = copy.deepcopy(network)
+        only = worthless(lesson)
+        only.advantage[tuple(chosen)] = sign
 
-        before = terms(student, network, only)["policy"].loss
-        before.backward()
-        with torch.no_grad():
-            for each in student.parameters():
-                if each.grad is not None:
-                    each -= 1e-3 * each.grad
-        after = terms(student, network, only)["policy"].loss
+        before, after = (
+            terms(each, network, only)["policy"].loss
+            for each in (network, after_a_step(network, only))
+        )
 
         # The loss is minus the log-probability, times the sign.
         assert after < before
@@ -114,7 +132,7 @@ def test_cells_and_headings_of_inserted_agents_are_learned_too(network, lessons)
         for scene, token, slot in at.tolist():
             advantage[scene, token, agents[scene, token, slot]] = 1.0
         network.zero_grad()
-        only = replace(lesson, advantage=advantage)
+        only = replace(worthless(lesson), advantage=advantage)
         terms(network, network, only)["policy"].loss.backward()
         found.append([steepest(head) for head in (network.cells, network.details)])
         network.zero_grad(set_to_none=True)
@@ -124,33 +142,67 @@ def test_cells_and_headings_of_inserted_agents_are_learned_too(network, lessons)
 
 def test_types_of_inserted_agents_are_learned_by_their_own_advantage(network, lessons):
     lesson = next(each for each in lessons.lessons if each.batch.details.present.any())
-    one, none = torch.ones_like(lesson.advantage), torch.zeros_like(lesson.advantage)
-    only = replace(lesson, advantage=none, type_advantage=one)
-    student = copy.deepcopy(network)
-    outputs = student(lesson.batch).details
-    chosen = outputs.rows.pack(lesson.batch.details.agent_type)
-
-    terms(student, network, only)["policy"].loss.backward()
-    with torch.no_grad():
-        for each in student.parameters():
-            if each.grad is not None:
-                each -= 1e-3 * each.grad
-        after = student(lesson.batch).details.agent_type_logits
+    only = worthless(lesson)
+    only.type_advantage[:] = 1.0
 
     before, after = (
-        logits.log_softmax(dim=-1).gather(1, chosen[:, None]).sum()
-        for logits in (outputs.agent_type_logits, after)
+        each(lesson.batch).details for each in (network, after_a_step(network, only))
     )
-    assert after > before
+
+    chosen = before.rows.pack(lesson.batch.details.agent_type)[:, None]
+    assert likely(after.agent_type_logits, chosen) > likely(
+        before.agent_type_logits, chosen
+    )
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_insertions_and_removals_become_as_likely_as_their_rollouts_are_good(
+    network, lessons, sign
+):
+    """More insertions where those that there were were good, and fewer where bad."""
+    lesson = next(each for each in lessons.lessons if each.batch.entries.add.any())
+    entries, removed = (
+        lesson.batch.entries,
+        lesson.batch.agents.presence == Presence.REMOVED,
+    )
+    scene, token = entries.add.any(dim=2).nonzero()[0].tolist()
+    only = worthless(lesson)
+    only.count_advantage[scene, token] = sign
+
+    before, after = (each(lesson.batch) for each in (network, after_a_step(network, only)))
+
+    def inserts(outputs):
+        count = entries.count[scene, token]
+        logits = outputs.entries.rows.spread(outputs.entries.add_logit)[scene, token]
+        return logsigmoid(logits[:count]).sum() + logsigmoid(-logits[count])
+
+    def removes(outputs):
+        logits = outputs.motion.rows.spread(outputs.motion.remove_logit)
+        may = lesson.moved[scene, token - 1, 1:]
+        logits = logits[scene, token - 2, 1:][may]
+        happened = removed[scene, token - 1, 1:][may]
+        return logsigmoid(torch.where(happened, logits, -logits)).sum()
+
+    gain = sum(part(after) - part(before) for part in (inserts, removes))
+    assert sign * gain > 0
 
 
 def test_without_penalties_nothing_is_better_than_anything_else(network, logged):
-    names = ("overlap", "off_road", "log_distance", "placement", "speed", "agent_type")
+    names = (
+        "overlap",
+        "off_road",
+        "log_distance",
+        "placement",
+        "speed",
+        "agent_type",
+        "count",
+    )
     free = replace(HOW, **{f"{name}_penalty": 0 for name in names})
 
     for lesson in simulate_lessons(network, logged, free, 5).lessons:
         assert not lesson.advantage.any()
         assert not lesson.type_advantage.any()
+        assert not lesson.count_advantage.any()
 
 
 def test_networks_of_all_kinds_learn_from_rollouts(variant, new_network, logged):

@@ -122,6 +122,7 @@ def test_no_step_is_done_where_nothing_is_better_than_anything_else(tuned, books
         placement_penalty=0,
         speed_penalty=0,
         agent_type_penalty=0,
+        count_penalty=0,
         off_road_penalty=0,
         log_distance_penalty=0,
         weight_decay=0,
