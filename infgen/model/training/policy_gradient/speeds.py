@@ -1,7 +1,7 @@
 """How fast vehicles drive, beside how fast the log's do.
 
-Who is slow hits nobody, so that the other costs alone teach to be slow. The speed cost is
-the gradient of an energy score of the speeds of one scene, each kind of vehicle by itself:
+Slow vehicles collide less, so that the other costs alone teach low speeds. The speed cost
+is the gradient of an energy score of the speeds of one scene, each of these by itself:
 
 - vehicles of the history, at one token step;
 - vehicles inserted since, in their first token step, of all token steps together;

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from infgen.model.batching.batch import Batch, Insertions
+from infgen.model.batching.supervision import following
 from infgen.model.logits import DetailOutputs, InsertionOutputs, Outputs
 from infgen.model.network import EGO
 from infgen.model.training.losses import Term, Terms
@@ -78,11 +79,11 @@ def policy_terms(
 def divergence(outputs: Outputs, pretrained: Outputs, lesson: PolicyLesson) -> Tensor:
     """Sum the divergence from the pretrained network over all choices."""
     rows, entries = outputs.motion.rows, lesson.batch.entries
-    moves = rows.pack(_next(lesson.moved))
+    moves = rows.pack(following(lesson.moved, False))
     one, other = outputs.motion, pretrained.motion
     found = _of_choice(one.motion_logits[moves], other.motion_logits[moves])
     if one.remove_logit is not None and other.remove_logit is not None:
-        asked = rows.pack(_next(_removable(lesson)))
+        asked = rows.pack(following(_removable(lesson), False))
         found = found + _of_event(one.remove_logit[asked], other.remove_logit[asked])
     if outputs.entries is not None and pretrained.entries is not None:
         decided = _decided(outputs.entries, entries)
@@ -95,9 +96,9 @@ def _motion_gain(
 ) -> Tensor:
     """Advantages times log-probabilities of motion tokens, summed."""
     rows, agents = outputs.motion.rows, lesson.batch.agents
-    moves = rows.pack(_next(lesson.moved))
-    chosen = rows.pack(_next(agents.motion_token))[moves]
-    advantage = rows.pack(_next(lesson.advantage))[moves]
+    moves = rows.pack(following(lesson.moved, False))
+    chosen = rows.pack(following(agents.motion_token, 0))[moves]
+    advantage = rows.pack(following(lesson.advantage, 0))[moves]
     agent_type = agents.agent_type[:, None].expand(agents.presence.shape)
     apart = stationary[rows.pack(agent_type)[moves]]
     logits = outputs.motion.motion_logits[moves]
@@ -146,9 +147,11 @@ def _count_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:
     motion, agents = outputs.motion, lesson.batch.agents
     gained = motion.motion_logits.new_zeros(())
     if motion.remove_logit is not None:
-        asked = motion.rows.pack(_next(_removable(lesson)))
-        leaves = motion.rows.pack(_next(agents.presence == int(Presence.REMOVED)))
-        after = _next(_next(lesson.count_advantage))[..., None]
+        asked = motion.rows.pack(following(_removable(lesson), False))
+        leaves = motion.rows.pack(
+            following(agents.presence == int(Presence.REMOVED), False)
+        )
+        after = following(following(lesson.count_advantage, 0), 0)[..., None]
         advantage = motion.rows.pack(after.expand(agents.presence.shape))
         likely = _log_event(motion.remove_logit, leaves)
         gained = gained + (advantage * likely)[asked].sum()
@@ -225,8 +228,3 @@ def _of_event(logit: Tensor, other: Tensor) -> Tensor:
 
 def _of_mean(gap: Tensor) -> Tensor:
     return gap.square().sum() / 2
-
-
-def _next(values: Tensor) -> Tensor:
-    """Shift values by one token step, so that each stands where it is predicted from."""
-    return torch.cat([values[:, 1:], torch.zeros_like(values[:, :1])], dim=1)

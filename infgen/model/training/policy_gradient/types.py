@@ -22,8 +22,8 @@ from infgen.scene import AgentType
 def type_costs(rollouts: SimulatedRollouts) -> Float32[Tensor, "rollout token agent"]:
     """Compute the cost of the type of every inserted agent, a difference of two shares.
 
-    Zero for other agents, and in scenes where the log inserts nobody or the rollouts fewer
-    than two.
+    Zero for other agents, and in scenes where the log inserts no agent or the rollouts
+    fewer than two.
     """
     agents, logged, scenes = rollouts.batch.agents, rollouts.logged, rollouts.scenes
     inserted = rollouts.inserted
