@@ -162,7 +162,7 @@ class TrainSettings:
     ones."""
     speed_penalty: NonNegative = 0.05
     """Cost, for each token step, of a metre per second by which the speed of a vehicle is
-    farther from those of the log's vehicles than from those of other simulated ones."""
+    farther from the log's than from that of the other rollouts."""
     agent_type_penalty: NonNegative = 1.0
     """Cost of the type of an inserted agent: its share among the other inserted ones less
     that among those that the scene's log inserts."""

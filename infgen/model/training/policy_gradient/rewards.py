@@ -26,13 +26,14 @@ from torch import Tensor
 
 from infgen.geometry import boxes_overlap, to_local, to_world
 from infgen.model.batching.batch import Agents
+from infgen.model.training.policy_gradient.energy import energy_by_agent
 from infgen.model.training.policy_gradient.placement import placement_costs
 from infgen.model.training.policy_gradient.population import count_costs
 from infgen.model.training.policy_gradient.road import Road
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
 from infgen.model.training.policy_gradient.speeds import speed_costs
 from infgen.model.training.policy_gradient.types import type_costs
-from infgen.model.training_settings import LEAST_ROLLOUTS, TrainSettings
+from infgen.model.training_settings import TrainSettings
 from infgen.scene import AgentType
 from infgen.spatial.road_edges import leaves_road
 from infgen.tokens.vocabulary import MotionVocabulary
@@ -95,7 +96,7 @@ def find_costs(
         torch.from_numpy(find_departures(seen, roads)).to(device),
         *log_distance(rollouts),
         torch.from_numpy(placement_costs(rollouts, roads)).to(device),
-        torch.from_numpy(speed_costs(rollouts)).to(device),
+        speed_costs(rollouts),
         type_costs(rollouts),
         count_costs(rollouts),
     )
@@ -231,29 +232,17 @@ def find_departures(
 def log_distance(rollouts: SimulatedRollouts) -> tuple[Tensor, Tensor]:
     """Compare the positions of rollouts with those of the log, and with each other.
 
-    Of the agents that the log and the rollouts have. With n rollouts that have the agent,
-    the distance of one to the others is summed up and divided by n - 2, not by their number
-    n - 1: the mean cost of the others, which ``advantages`` subtracts, holds the same
-    distances once more. With fewer than three rollouts that part is left out.
+    Of the agents that the log and the rollouts have.
 
     Returns:
         Costs, and energy scores, whose mean they lower [rollout, token, agent].
     """
-    agents, logged, group = rollouts.batch.agents, rollouts.logged, rollouts.count
-    counts = rollouts.moved & rollouts.known[:, None] & logged.observed
-    gap_m = (agents.pose[..., :2] - logged.pose[..., :2]).norm(dim=-1)
-    xy_m = agents.pose[..., :2].reshape(group, -1, *gap_m.shape[1:], 2)
-    there = counts.view(group, -1, *gap_m.shape[1:])
-    between = torch.zeros_like(gap_m)
-    for number in range(group):
-        away_m = (xy_m - xy_m[number]).norm(dim=-1)
-        both = there & there[number]
-        between += (away_m.sqrt() * both).flatten(0, 1)
-    count = there.sum(dim=0).expand_as(there).flatten(0, 1)
-    spread = between / (count - (LEAST_ROLLOUTS - 1)).clamp(min=1)
-    spread = torch.where(count >= LEAST_ROLLOUTS, spread, 0.0)
-    score = gap_m.sqrt() - between / (2 * (count - 1)).clamp(min=1)
-    return (
-        torch.where(counts, gap_m.sqrt() - spread, 0.0),
-        torch.where(counts, score, 0.0),
+    counts = rollouts.moved & rollouts.known[:, None] & rollouts.logged.observed
+    xy_m, logged_xy_m = (
+        agents.pose[..., :2] for agents in (rollouts.batch.agents, rollouts.logged)
     )
+    return energy_by_agent(xy_m, logged_xy_m, counts, rollouts.count, _root_distance)
+
+
+def _root_distance(xy_m: Tensor, other_m: Tensor) -> Tensor:
+    return (xy_m - other_m).norm(dim=-1).sqrt()
