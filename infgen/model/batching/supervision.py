@@ -121,7 +121,7 @@ def motion_mask(agents: Agents) -> Tensor:
     there = agents.observed
     known = following(agents.label, -1) >= 0
     mask = known & following(there, False)
-    mask &= entering | (there & _before(there | entering))
+    mask &= entering | (there & preceding(there | entering))
     return mask & agents.near[:, None]
 
 
@@ -146,5 +146,6 @@ def following(values: Tensor, last: int | bool) -> Tensor:
     return torch.cat([values[:, 1:], torch.full_like(values[:, :1], last)], dim=1)
 
 
-def _before(values: Tensor) -> Tensor:
+def preceding(values: Tensor) -> Tensor:
+    """Shift values [scene, token, ...] to the next token; the first has none."""
     return torch.cat([torch.zeros_like(values[:, :1]), values[:, :-1]], dim=1)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from infgen.clock import CLOCK
 from infgen.model.batching.batch import Agents
+from infgen.model.batching.supervision import preceding
 from infgen.model.training.policy_gradient.energy import energy_by_agent, energy_gradient
 from infgen.model.training.policy_gradient.rollouts import (
     HISTORY_TOKENS,
@@ -33,14 +34,14 @@ def speed_costs(rollouts: SimulatedRollouts) -> Float32[Tensor, "rollout token a
     log_inserts = (logged.presence == INSERTED) & logged.visible
     own_mps, logged_mps = _speed_mps(agents), _speed_mps(logged)
     own = rollouts.moved & _vehicles(agents)
-    log = logged.observed & _behind(logged.visible[:, :-1]) & _vehicles(logged)
+    log = logged.observed & preceding(logged.visible) & _vehicles(logged)
     log[:, :HISTORY_TOKENS] = False
     log &= ~log_inserts
     known = rollouts.known[:, None]
     cost, _ = energy_by_agent(
         own_mps, logged_mps, own & log & known, rollouts.count, _difference
     )
-    firsts = _behind(rollouts.inserted[:, :-1]), _behind(log_inserts[:, :-1])
+    firsts = preceding(rollouts.inserted), preceding(log_inserts)
     for first in (True, False):
         of_own, of_log = (
             each & ~known & (begins == first)
@@ -68,8 +69,8 @@ def _by_scene(
 
 def _speed_mps(agents: Agents) -> Float32[Tensor, "rollout token agent"]:
     """Mean speeds over token steps; zero in the first."""
-    way_m = (agents.pose[:, 1:, :, :2] - agents.pose[:, :-1, :, :2]).norm(dim=-1)
-    return _behind(way_m / CLOCK.token_s)
+    xy_m = agents.pose[..., :2]
+    return xy_m.diff(dim=1, prepend=xy_m[:, :1]).norm(dim=-1) / CLOCK.token_s
 
 
 def _vehicles(agents: Agents) -> Tensor:
@@ -78,8 +79,3 @@ def _vehicles(agents: Agents) -> Tensor:
 
 def _difference(speed_mps: Tensor, other_mps: Tensor) -> Tensor:
     return (speed_mps - other_mps).abs()
-
-
-def _behind(values: Tensor) -> Tensor:
-    """Shift values to the next token step; the first has none."""
-    return torch.cat([torch.zeros_like(values[:, :1]), values], dim=1)
