@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from infgen.model.layers import AttentionSources, embedding_mlp, gather
+from infgen.model.layers import AttentionSources, embedding_mlp, gather, mlp
 from infgen.model.neighbours import MapFeatures, grid_place
 from infgen.model.relations import wrap_angle
 from infgen.tokens.grid import Grid
@@ -27,6 +27,9 @@ ROAD_MIDDLE_M = 2.5
 """From the first point of a map token to about its middle."""
 BIN_REACH = 2
 """Bins to each side that what lies in a bin speaks to."""
+LATERAL_REACH_M = 4.0
+LATERAL_STEP_M = 0.25
+"""Lateral offsets from a map token are told apart so finely, up to so far on either side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +175,101 @@ class HeadingFeatures(nn.Module):
         return (first[..., None] == bins) * (1 - share[..., None]) + (
             second[..., None] == bins
         ) * share[..., None]
+
+
+class OffsetEmbedding(nn.Module):
+    """Embedding of the offset bin of an agent, for what is given it."""
+
+    offset_m: Tensor
+
+    def __init__(self, width: int, grid: Grid) -> None:
+        super().__init__()
+        offset_m = torch.from_numpy(grid.offset_m.copy())
+        self.register_buffer("offset_m", offset_m, persistent=False)
+        self.embed = nn.Embedding(len(offset_m), width)
+
+    def begin_at_zero(self) -> None:
+        """Change nothing until it is trained."""
+        nn.init.zeros_(self.embed.weight)
+
+    def forward(self, offset: Tensor) -> Tensor:
+        """Embed offset bins [N]: [N, D]."""
+        embedded: Tensor = self.embed(offset)
+        return embedded
+
+
+class OffsetFeatures(nn.Module):
+    """Logits of the offset bins of a cell, given the agent type.
+
+    Each map token around has a say by how far a bin is to its side: the middle of a lane,
+    the kerb. What it says depends on the token and on the query.
+    """
+
+    offset_m: Tensor
+
+    def __init__(self, width: int, cell_feature_width: int, grid: Grid) -> None:
+        super().__init__()
+        offset_m = torch.from_numpy(grid.offset_m.copy())
+        self.register_buffer("offset_m", offset_m, persistent=False)
+        self.alone = mlp(width, width, len(offset_m))
+        self.steps = round(2 * LATERAL_REACH_M / LATERAL_STEP_M)
+        features = cell_feature_width
+        self.road = nn.Linear(width, features) if features else None
+        self.turned = nn.Linear(2, features, bias=False) if features else None
+        self.asked = nn.Linear(width, features) if features else None
+        self.lateral = nn.Embedding(self.steps + 1, features) if features else None
+        self.say = nn.Linear(features, 1, bias=False) if features else None
+
+    def begin_at_zero(self) -> None:
+        """Take all bins for equally likely until they are trained."""
+        last = self.alone[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        if self.say is not None:
+            nn.init.zeros_(self.say.weight)
+
+    def forward(self, x: Tensor, pose: Tensor, roads: CellSources) -> Tensor:
+        """Say how much queries [N, D] at poses [N, 3] are for each bin [N, offset].
+
+        Args:
+            x: Features of the queries, given the agent type.
+            pose: Poses of the queries: at the centre of the cell, facing as the ego.
+            roads: Map tokens that the queries see.
+        """
+        logits: Tensor = self.alone(x)
+        if self.road is None:
+            return logits
+        assert self.turned is not None
+        assert self.asked is not None
+        assert self.lateral is not None
+        assert self.say is not None
+        turned_rad = roads.pose[..., 2] - pose[:, None, 2]
+        features = gather(self.road(roads.features), roads.row)
+        features = features + self.turned(_unit(turned_rad))
+        features = features + self.asked(x)[:, None]  # [N, K, C]
+        said = functional.relu(features[:, :, None] + self.lateral.weight)
+        profile = self.say(said)[..., 0]  # [N, K, lateral]
+        return logits + self._along(profile, turned_rad, pose, roads)
+
+    def _along(
+        self, profile: Tensor, turned_rad: Tensor, pose: Tensor, roads: CellSources
+    ) -> Tensor:
+        """Add up what the map tokens say of the bins beside them [N, offset]."""
+        first_m = grid_place(roads.pose, pose[:, None])
+        away_m = self.offset_m - first_m[:, :, None]  # [N, K, offset, 2]
+        sin, cos = turned_rad.sin()[..., None], turned_rad.cos()[..., None]
+        x_m, y_m = away_m.unbind(-1)
+        along_m, left_m = cos * y_m - sin * x_m, -cos * x_m - sin * y_m
+        at = (left_m + LATERAL_REACH_M) / LATERAL_STEP_M
+        at = at.clamp(0, self.steps)
+        lower = at.floor().clamp(max=self.steps - 1)
+        share, lower = at - lower, lower.long()
+        said = profile.gather(2, lower) * (1 - share)
+        said = said + profile.gather(2, lower + 1) * share
+        beyond_m = (along_m - ROAD_MIDDLE_M).abs() - ROAD_MIDDLE_M
+        beside = (1 - beyond_m / ROAD_MIDDLE_M).clamp(0, 1)
+        return (said * beside * roads.present[..., None]).sum(dim=1)
 
 
 def _chosen(inside: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -10,11 +10,17 @@ import torch
 from torch import Tensor, nn
 
 from infgen.model.agents import KINDS
-from infgen.model.cell_features import CellFeatures, CellSources, HeadingFeatures
+from infgen.model.cell_features import (
+    CellFeatures,
+    CellSources,
+    HeadingFeatures,
+    OffsetEmbedding,
+    OffsetFeatures,
+)
 from infgen.model.layers import Attention, AttentionSources, embedding_mlp, mlp
 from infgen.model.logits import DetailOutputs, InsertionOutputs
 from infgen.model.long_memory import Density, DensityFeatures
-from infgen.model.neighbours import NeighbourSpec
+from infgen.model.neighbours import NeighbourSpec, cell_pose
 from infgen.model.relations import Rows, relation_embedding
 from infgen.model.settings import ModelSettings
 from infgen.tokens.grid import Grid
@@ -176,11 +182,15 @@ class DetailStack(nn.Module):
         by_bin = settings.heading_token
         self.heading = mlp(width, width, grid.num_headings) if by_bin else None
         self.turn = None if by_bin else mlp(width, width, 1)
-        self.offset = mlp(width, width, 2) if settings.position_token else None
+        regressed = settings.position_token and not settings.offset_token
+        self.offset = mlp(width, width, 2) if regressed else None
         features = settings.cell_feature_width if by_bin else 0
         self.bearings = (
             HeadingFeatures(width, features, grid.num_headings) if features else None
         )
+        features, binned = settings.cell_feature_width, settings.offset_token
+        self.offset_bins = OffsetFeatures(width, features, grid) if binned else None
+        self.given_offset = OffsetEmbedding(width, grid) if binned else None
 
     def map_reach(self) -> NeighbourSpec:
         """How the query sees roads."""
@@ -208,12 +218,50 @@ class DetailStack(nn.Module):
     def query_pose(self, cell: Tensor, offset_m: Tensor) -> Tensor:
         """Position of the query of a known inserted agent in the grid frame [N, 2]."""
         centre_m = self.centre_m[cell]
-        return centre_m if self.offset is not None else centre_m + offset_m
+        return centre_m if self.settings.position_token else centre_m + offset_m
+
+    def offset_logits(
+        self, x: Tensor, agent_type: Tensor, pose: Tensor, roads: CellSources
+    ) -> Tensor:
+        """Return logits of the offset bins [N, offset].
+
+        Args:
+            x: Updated features [N, D].
+            agent_type: ``AgentType`` of each.
+            pose: Pose of the query [N, 3] ...
+            roads: ... and the map tokens seen from there.
+        """
+        assert self.offset_bins is not None
+        logits: Tensor = self.offset_bins(x + self.given_kind(agent_type), pose, roads)
+        return logits
+
+    def heading_logits(
+        self,
+        x: Tensor,
+        agent_type: Tensor,
+        offset: Tensor,
+        pose: Tensor,
+        roads: CellSources,
+    ) -> Tensor:
+        """Return logits of headings [N, heading] at known offset bins [N].
+
+        The other arguments are those of ``offset_logits``.
+        """
+        assert self.given_offset is not None
+        assert self.heading is not None
+        offset_m = self.given_offset.offset_m[offset]
+        given = x + self.given_kind(agent_type) + self.given_offset(offset)
+        logits: Tensor = self.heading(given)
+        if self.bearings is not None:
+            logits = logits + self.bearings(given, cell_pose(pose, offset_m), roads)
+        return logits
 
     def answer(
         self, rows: Rows, x: Tensor, agent_type: Tensor, pose: Tensor, roads: CellSources
     ) -> DetailOutputs:
         """Return logits of the type, and size, heading and offset per type.
+
+        Without headings and offsets where these are bins: see ``offset_logits``.
 
         Args:
             rows: What the features are of.
@@ -224,7 +272,8 @@ class DetailStack(nn.Module):
         """
         given = x + self.given_kind(agent_type)
         turn, offset = self.turn, self.offset
-        heading = None if self.heading is None else self.heading(given)
+        is_last = self.offset_bins is None  # The heading is not given the offset.
+        heading = self.heading(given) if self.heading is not None and is_last else None
         if self.bearings is not None and heading is not None:
             heading = heading + self.bearings(given, pose, roads)
         return DetailOutputs(

@@ -54,7 +54,9 @@ class DetailOutputs:
         heading_logits: Given the agent type [row, heading] ...
         turned_rad: ... or the heading itself, relative to the ego's [row].
         offset_m: From the cell's centre, in the ego's grid frame, given the agent type
-            [row, 2]; None where places are regressed.
+            [row, 2]; None where places are regressed ...
+        offset_logits: ... or bins of it, given the agent type [row, offset]; headings are
+            then given the offset as well.
     """
 
     rows: Rows
@@ -63,6 +65,7 @@ class DetailOutputs:
     heading_logits: Tensor | None
     turned_rad: Tensor | None
     offset_m: Tensor | None
+    offset_logits: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from infgen.clock import CLOCK
 from infgen.model.agents import AgentContext, AgentEmbedding, AgentRows, MotionStack
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import Agents, Batch
-from infgen.model.cell_features import CellSources
+from infgen.model.cell_features import CellSources, OffsetEmbedding, OffsetFeatures
 from infgen.model.device.index import BatchIndex
 from infgen.model.device.together import launched_together
 from infgen.model.insertion import CellStack, DetailStack
@@ -52,6 +52,9 @@ EGO = 0
 """Row of the ego, in batches as in simulation."""
 
 
+AddedPart = DensityFeatures | StandingFeatures | OffsetEmbedding | OffsetFeatures
+"""Parts that may be added to trained weights."""
+
 class Network(nn.Module):
     """Roads, agents and inserted agents in one network (SPEC 4).
 
@@ -85,7 +88,7 @@ class Network(nn.Module):
             DetailStack(settings, cells) if settings.insertion_and_removal else None
         )
         self.apply(initialise)
-        for part in self.long_memory().values():
+        for part in self.added_parts().values():
             part.begin_at_zero()
 
     @property
@@ -93,12 +96,15 @@ class Network(nn.Module):
         """Grid of cells and heading bins."""
         return make_grid(self.grid_settings)
 
-    def long_memory(self) -> dict[str, DensityFeatures | StandingFeatures]:
-        """Return the parts, by name, that change no logit before they are trained."""
+    def added_parts(self) -> dict[str, AddedPart]:
+        """Return the parts, by name, that may be added to trained weights.
+
+        Before they are trained they change no logit, and offset bins are equally likely.
+        """
         return {
             name: part
             for name, part in self.named_modules()
-            if isinstance(part, DensityFeatures | StandingFeatures)
+            if isinstance(part, AddedPart)
         }
 
     def motion_vocabulary(self) -> MotionVocabulary:
@@ -316,8 +322,16 @@ def _details(
     reach = stack.map_reach()
     map_seen = find_map_neighbours(reach, each, pose[:, None], roads, scene)
     x = stack(cell, map_seen, around.seen(shown))
-    agent_type = wanted.pack(details.agent_type)
-    return stack.answer(wanted, x, agent_type, pose, CellSources.near(roads, map_seen))
+    agent_type, offset = wanted.pack(details.agent_type), wanted.pack(details.offset)
+    near = CellSources.near(roads, map_seen)
+    said = stack.answer(wanted, x, agent_type, pose, near)
+    if stack.offset_bins is None:
+        return said
+    return replace(
+        said,
+        offset_logits=stack.offset_logits(x, agent_type, pose, near),
+        heading_logits=stack.heading_logits(x, agent_type, offset, pose, near),
+    )
 
 
 def _tokens(agents: Agents, rows: Rows) -> Tensor:

@@ -77,6 +77,10 @@ class ModelSettings:
     """Whether positions of inserted agents are a cell and an offset, not regressed."""
     heading_token: Bool = True
     """Whether headings of inserted agents are bins, not regressed."""
+    offset_token: Bool = False
+    """Whether the offset of an inserted agent within its cell is one of 144 bins of 0.25 m,
+    and its heading is sampled given that. Otherwise the offset is regressed, as in the
+    reference: to the middle of a lane and the kerb where both are in one cell of 3 m."""
     validity_pattern_tokens: Bool = False
     """Whether the network predicts at which steps of the next token step a log would show
     the agent: detections flicker."""
@@ -119,6 +123,11 @@ class ModelSettings:
             )
         if self.relations == "rotary":
             self._check_rotary()
+        if self.offset_token and not (self.position_token and self.heading_token):
+            raise ValueError(
+                "offset_token needs position_token and heading_token; set both to true, or "
+                "offset_token=false"
+            )
         if self.signal_ahead_m and not self.signals_each_step:
             raise ValueError(
                 f"signal_ahead_m is {self.signal_ahead_m:g}, which needs "

@@ -46,7 +46,13 @@ from infgen.model.network import EGO, Network
 from infgen.model.relations import Rows, describe_pairs, within_radius
 from infgen.model.rotary.turns import turned, turned_back
 from infgen.model.step_memory import Insertions, StepMemory
-from infgen.model.token_step import InsertionDetails, MotionStep, PositionOutputs, TokenStep
+from infgen.model.token_step import (
+    DetailQuery,
+    InsertionDetails,
+    MotionStep,
+    PositionOutputs,
+    TokenStep,
+)
 from infgen.tokens.scene_tokens import Presence
 
 
@@ -302,13 +308,38 @@ class Stepper:
         near = CellSources.near(entries.map, roads)
         with _full_precision(x):
             said = details.answer(rows, x[:, None].float(), kinds, pose[:, 0], near)
+        sampled = details.offset_bins is not None
         return InsertionDetails(
             said.agent_type_logits[:, 0],
             said.size_log_m.exp(),
             said.heading_logits,
             said.turned_rad,
             said.offset_m,
+            DetailQuery(x, pose[:, 0], near) if sampled else None,
         )
+
+    @torch.no_grad()
+    def entry_offset(
+        self, query: DetailQuery, agent_type: Int64[Tensor, " active"]
+    ) -> Float32[Tensor, "active offset"]:
+        """Query the offset bin of an inserted agent, whose type is known."""
+        x, details = query.features.float(), self._asked().details
+        with _full_precision(x):
+            return details.offset_logits(x, agent_type, query.pose, query.roads)
+
+    @torch.no_grad()
+    def entry_heading(
+        self,
+        query: DetailQuery,
+        agent_type: Int64[Tensor, " active"],
+        offset: Int64[Tensor, " active"],
+    ) -> Float32[Tensor, "active heading"]:
+        """Query the heading bin of an inserted agent, whose offset bin is known too."""
+        x, details = query.features.float(), self._asked().details
+        with _full_precision(x):
+            return details.heading_logits(
+                x, agent_type, offset, query.pose, query.roads
+            )
 
     def _cell_features(self, entries: Insertions) -> Tensor | None:
         """Describe the cells around every ego, before any inserted agent."""

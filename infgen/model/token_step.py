@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
+from infgen.model.cell_features import CellSources
 from infgen.model.logits import MotionOutputs
 from infgen.tokens.scene_tokens import Presence
 
@@ -135,6 +136,21 @@ class PositionOutputs:
 
 
 @dataclass(frozen=True, slots=True)
+class DetailQuery:
+    """The query of an inserted agent's details.
+
+    Attributes:
+        features: Its features.
+        pose: Its pose.
+        roads: Map tokens that it sees.
+    """
+
+    features: Float32[Tensor, "rollout width"]
+    pose: Float32[Tensor, "rollout 3"]
+    roads: CellSources
+
+
+@dataclass(frozen=True, slots=True)
 class InsertionDetails:
     """Details of an inserted agent: sample a type, then take its row of the others.
 
@@ -145,6 +161,8 @@ class InsertionDetails:
         turned_rad: ... or the heading itself, relative to the ego.
         offset_m: Position less the cell's centre, in the ego's grid frame, given the agent
             type; None where the place was known already.
+        query: Where the offset is sampled, and the heading given the offset, neither is
+            here: they are queried by this.
     """
 
     agent_type_logits: Float32[Tensor, "rollout agent_type"]
@@ -152,3 +170,4 @@ class InsertionDetails:
     heading_logits: Float32[Tensor, "rollout agent_type heading"] | None
     turned_rad: Float32[Tensor, "rollout agent_type"] | None
     offset_m: Float32[Tensor, "rollout agent_type 2"] | None
+    query: DetailQuery | None = None

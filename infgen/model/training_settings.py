@@ -91,6 +91,8 @@ class TrainSettings:
     """Weight of the loss of inserted agents' types."""
     offset_weight: NonNegative = 1.0
     """Weight of the loss of offsets within a cell."""
+    offset_token_weight: NonNegative = 1.0
+    """Weight of the loss of offset tokens (`model.offset_token`)."""
     map_weight: NonNegative = 1.0
     """Weight of the map loss."""
     position_regression_weight: NonNegative = 10.0
@@ -132,6 +134,9 @@ class TrainSettings:
     initial_weights: Annotated[str, NOT_IN_KEY] = ""  # Its fingerprint is a source.
     """Weights to start from: a folder, a key of stage `train`, or `builtin` for those of
     the package; empty for random ones."""
+    trained_parts: str = ""
+    """Only parameters whose names begin with one of these, separated by commas, change:
+    `details.offset_bins`, say, to add a part to trained weights; empty for all."""
     closed_loop_top_k: Count = 0
     """Scenes are simulated before they are learned from, with the one of so many most
     likely motion tokens that is nearest to the log (CatK, SPEC 7.1); 0 for scenes as

@@ -177,7 +177,7 @@ def _sample_agents(
     rollouts: Int64[np.ndarray, " active"],
     numbers: Float64[np.ndarray, "purpose active"],
 ) -> tuple[InsertedAgents, Int64[np.ndarray, " active"]]:
-    """Sample position, type, size and heading; return them and the cells.
+    """Sample cell, type, size, heading and offset; return them and the cells.
 
     Everything is sampled where the network is, and fetched at once.
     """
@@ -191,10 +191,9 @@ def _sample_agents(
     entries = turns.some_entries(rollouts)
     details = simulator.stepper.entry_details(entries, cell, regressed_m)
     agent_type = choose(details.agent_type_logits, uniforms(Purpose.AGENT_TYPE))
-    heading = sample_heading(simulator, details, agent_type, uniforms)
-    offset_m = None if details.offset_m is None else of_type(details.offset_m, agent_type)
+    offset, heading = sample_offset_and_heading(simulator, details, agent_type, uniforms)
     size_lwh_m = of_type(details.size_lwh_m, agent_type)
-    more = offset_m if regressed_m is None else regressed_m
+    more = offset if regressed_m is None else regressed_m
     parts = [cell, agent_type, size_lwh_m, heading, *([] if more is None else [more])]
     cells, types, sizes, headings, *rest = simulator.fetch(*parts)
 
@@ -202,8 +201,9 @@ def _sample_agents(
     if regressed_m is not None:
         position_m = rest[0]
     elif rest:
-        position_m = _within(position_m + rest[0], grid)
-    if details.heading_logits is not None:
+        offset_m = rest[0] if details.query is None else grid.offset_m[rest[0]]
+        position_m = _within(position_m + offset_m, grid)
+    if details.turned_rad is None:
         headings = decode_heading(headings.astype(np.int16), grid)
     found = InsertedAgents(
         who=np.ones(len(cells), dtype=bool),
@@ -243,21 +243,33 @@ def _within(position_m: np.ndarray, grid: Grid) -> np.ndarray:
     return position_m / np.maximum(far, np.float32(1))[:, None]
 
 
-def sample_heading(
+def sample_offset_and_heading(
     simulator: Simulator,
     details: InsertionDetails,
     agent_type: Tensor,
     uniforms: UniformNumbers,
-) -> Tensor:
-    """Sample the heading of every inserted agent: its bin, or relative to the ego."""
-    if details.heading_logits is None:
+) -> tuple[Tensor | None, Tensor]:
+    """Sample the offset and the heading of every inserted agent.
+
+    Returns:
+        The bin of the offset in its cell if ``details.query`` is there, else the offset in
+        metres, or None; and the heading: relative to the ego if ``details.turned_rad`` is
+        there, else its bin.
+    """
+    query, logits = details.query, details.heading_logits
+    offset = None if details.offset_m is None else of_type(details.offset_m, agent_type)
+    if query is not None:
+        said = simulator.stepper.entry_offset(query, agent_type)
+        offset = choose(said, uniforms(Purpose.OFFSET))
+        by_type = simulator.stepper.entry_heading(query, agent_type, offset)
+    elif logits is not None:
+        by_type = of_type(logits, agent_type)
+    else:
         assert details.turned_rad is not None
-        return of_type(details.turned_rad, agent_type)
-    return choose(
-        of_type(details.heading_logits, agent_type),
-        uniforms(Purpose.HEADING),
-        temperature=simulator.settings.heading_temperature,
-    )
+        return offset, of_type(details.turned_rad, agent_type)
+    temperature = simulator.settings.heading_temperature
+    heading = choose(by_type, uniforms(Purpose.HEADING), temperature=temperature)
+    return offset, heading
 
 
 def of_type(values: Tensor, agent_type: Tensor) -> Tensor:

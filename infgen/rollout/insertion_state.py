@@ -17,7 +17,10 @@ from infgen.rollout.simulator import Simulator
 from infgen.tokens.grid import encode_cell, to_grid
 from infgen.tokens.scene_tokens import NO_CELL
 
-TURN_PURPOSES = (Purpose.ADD, Purpose.CELL, Purpose.AGENT_TYPE, Purpose.HEADING)
+TURN_PURPOSES = (
+    *(Purpose.ADD, Purpose.CELL, Purpose.AGENT_TYPE, Purpose.HEADING),
+    Purpose.OFFSET,
+)
 """What is sampled in one insertion."""
 TURNS_AT_ONCE = 4
 """Turns whose random numbers are drawn together."""

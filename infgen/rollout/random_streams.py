@@ -38,6 +38,7 @@ class Purpose(IntEnum):
     AGENT_TYPE = 4
     HEADING = 5
     PATTERN = 6
+    OFFSET = 7
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,8 @@ from infgen.tokens.scene_tokens import NO_CELL
 from infgen.tokens.settings import TokenSettings
 
 _QUARTER_TURN_RAD = np.float32(np.pi / 2)
+OFFSET_BINS_ACROSS = 12
+"""A cell has so many offset bins along each of its sides."""
 _AROUND = np.array([[x, y] for y in (1, 0, -1) for x in (-1, 0, 1)])
 """The squares around one, and itself, in the order of cells."""
 
@@ -53,6 +55,19 @@ class Grid:
         return self.num_cells // 2
 
     @property
+    def offset_step_m(self) -> float:
+        """Side of an offset bin."""
+        return self.step_m / OFFSET_BINS_ACROSS
+
+    @property
+    def offset_m(self) -> Float32[np.ndarray, "offset 2"]:
+        """Middle of each offset bin less the centre of its cell, in the grid frame.
+
+        Row by row from the rear of the cell, each from left to right.
+        """
+        return _offset_middles_m(self.step_m)
+
+    @property
     def heading_step_rad(self) -> float:
         """Width of a heading bin."""
         return 2 * math.pi / self.num_headings
@@ -67,6 +82,13 @@ class Grid:
 def _heading_centres_rad(count: int) -> Float32[np.ndarray, " heading"]:
     bins = np.arange(count) + 0.5
     return (bins * (2 * math.pi / count) - np.pi).astype(np.float32)
+
+
+@lru_cache(maxsize=16)
+def _offset_middles_m(step_m: float) -> Float32[np.ndarray, "offset 2"]:
+    middles_m = ((np.arange(OFFSET_BINS_ACROSS) + 0.5) / OFFSET_BINS_ACROSS - 0.5) * step_m
+    y_m, x_m = np.meshgrid(middles_m, middles_m, indexing="ij")
+    return np.stack([x_m, y_m], axis=-1).reshape(-1, 2).astype(np.float32)
 
 
 @lru_cache(maxsize=16)
@@ -171,3 +193,23 @@ def decode_heading(
 ) -> Float32[np.ndarray, "*batch"]:
     """Return the heading at the middle of each bin, relative to the ego."""
     return grid.heading_centre_rad[heading]
+
+
+def encode_offset(
+    offset_m: Float32[np.ndarray, "*batch 2"], grid: Grid
+) -> Int16[np.ndarray, "*batch"]:
+    """Find the offset bin of positions less the centre of their cell, in the grid frame.
+
+    At the rim of the grid a position may be outside its cell: it gets the nearest bin.
+    """
+    bins = np.floor(offset_m / np.float32(grid.offset_step_m)) + OFFSET_BINS_ACROSS // 2
+    column, row = np.clip(bins, 0, OFFSET_BINS_ACROSS - 1).astype(np.int16).T
+    found: np.ndarray = (row * OFFSET_BINS_ACROSS + column).T
+    return found
+
+
+def decode_offset(
+    offset: Int16[np.ndarray, "*batch"], grid: Grid
+) -> Float32[np.ndarray, "*batch 2"]:
+    """Return the middle of each offset bin less the centre of its cell."""
+    return grid.offset_m[offset]

@@ -118,8 +118,8 @@ def load_vocabularies(folder: Path) -> tuple[MotionVocabulary, MapVocabulary]:
 def copy_weights(network: Network, folder: Path) -> None:
     """Give a network the weights in a folder, made with the same vocabularies.
 
-    Other tensors in the folder are ignored. Parts that change no logit before they are
-    trained (``Network.long_memory``) may be missing there.
+    Other tensors in the folder are ignored. Parts that may be added to trained weights
+    (``Network.added_parts``) may be missing there.
 
     Raises:
         StoreError: naming the parameters that are missing there or of another shape; or if
@@ -141,7 +141,7 @@ def copy_weights(network: Network, folder: Path) -> None:
     tensors = read_tensors(folder / WEIGHTS)
     new = {
         f"{part}.{name}"
-        for part, module in network.long_memory().items()
+        for part, module in network.added_parts().items()
         for name, _ in module.named_parameters()
     } - tensors.keys()
     parameters = {k: p for k, p in network.named_parameters() if k not in new}

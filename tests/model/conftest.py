@@ -67,6 +67,8 @@ VARIANTS = {
     },
     "narrow relations": {"relation_width": 6},
     "rotary": {"relations": "rotary", "map_agent_lateral_offset": False},
+    "offset token": {"offset_token": True},
+    "offset token, the paper's features": {"offset_token": True, "cell_feature_width": 0},
     "long memory": {"density_features": True, "standing_features": True},
     "smart with patterns": {
         "insertion_and_removal": False,

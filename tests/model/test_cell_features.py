@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from infgen.model.cell_features import CellFeatures, CellSources, HeadingFeatures
+from infgen.model.cell_features import CellFeatures, CellSources, HeadingFeatures, OffsetFeatures
 from infgen.model.neighbours import cell_pose
 from infgen.tokens.grid import make_grid
 
@@ -148,3 +148,62 @@ def test_no_query_is_no_answer(cell_features, bearings):
         FEATURES,
     )
     assert bearings(torch.randn(0, WIDTH), EGO[:0], nobody).shape[0] == 0
+
+
+@pytest.fixture
+def offsets(grid):
+    """Offset bins that only the side of a road decides: its left at 1 m, most of all."""
+    torch.manual_seed(0)
+    offsets = OffsetFeatures(WIDTH, FEATURES, grid).eval()
+    offsets.begin_at_zero()
+    with torch.no_grad():
+        for part in (offsets.road, offsets.asked, offsets.turned):
+            part.weight.zero_()
+        torch.nn.init.zeros_(offsets.lateral.weight)
+        left_m = torch.linspace(-4, 4, 33)
+        offsets.lateral.weight[:, 0] = (4 - (left_m - 1).abs()).clamp(min=0)
+        offsets.say.weight[0, 0] = 1.0
+        for part in (offsets.road, offsets.asked):
+            part.bias.zero_()
+    return offsets
+
+
+def bins_of(offsets, roads):
+    with torch.no_grad():
+        return offsets(torch.zeros((1, WIDTH)), EGO, roads)[0]
+
+
+@pytest.mark.parametrize(("along_deg", "place"), [(0.0, (-0.5, None)), (90.0, (None, -0.5))])
+def test_an_offset_bin_is_told_by_how_far_it_lies_beside_a_road(
+    offsets, grid, along_deg, place
+):
+    # Through 0.5 m right of the centre of the cell, 2 m before it; or turned by 90 degrees.
+    x_m, y_m = (0.5, -2.0) if along_deg == 0 else (2.0, 0.5)
+    x, y, ego_rad = cell_pose(EGO[0], torch.tensor([x_m, y_m])).tolist()
+    road = lying((x, y, ego_rad + math.radians(along_deg)))
+
+    logits = bins_of(offsets, road)
+
+    best_m = grid.offset_m[logits.argmax()]
+    for found_m, wanted_m in zip(best_m, place, strict=True):
+        assert wanted_m is None or abs(found_m - wanted_m) <= grid.offset_step_m / 2 + 1e-6
+    left_m = 0.5 - grid.offset_m[:, 0] if along_deg == 0 else 0.5 - grid.offset_m[:, 1]
+    wanted = torch.from_numpy(4 - abs(left_m - 1))
+    torch.testing.assert_close(logits, wanted, atol=1e-5, rtol=0)
+
+
+def test_a_road_that_ends_before_the_cell_says_nothing_of_its_offsets(offsets):
+    x, y, ego_rad = cell_pose(EGO[0], torch.tensor([0.0, 5.0])).tolist()
+
+    assert not bins_of(offsets, lying((x, y, ego_rad))).abs().max() > 1e-6
+    assert bins_of(offsets, lying((x, y, ego_rad + math.pi))).abs().max() > 1
+
+
+def test_untrained_offset_bins_are_equally_likely(grid):
+    offsets = OffsetFeatures(WIDTH, FEATURES, grid)
+    offsets.begin_at_zero()
+
+    logits = bins_of(offsets, lying((0.0, 0.0, 0.0)))
+
+    assert len(logits) == len(grid.offset_m)
+    assert torch.equal(logits, logits[:1].expand_as(logits))

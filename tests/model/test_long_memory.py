@@ -112,12 +112,12 @@ def test_untrained_features_change_no_logit(tiny, new_network, batch):
     wide = replace(tiny, density_features=True, standing_features=True)
     network = new_network(wide).eval()
     network.load_state_dict(plain.state_dict(), strict=False)
-    for part in network.long_memory().values():
+    for part in network.added_parts().values():
         part.begin_at_zero()
 
     one, two = plain(batch), network(batch)
 
-    assert len(network.long_memory()) == 3
+    assert len(network.added_parts()) == 3
     assert torch.equal(one.motion.motion_logits, two.motion.motion_logits)
     assert torch.equal(one.motion.remove_logit, two.motion.remove_logit)
     assert torch.equal(one.entries.add_logit, two.entries.add_logit)
@@ -127,7 +127,7 @@ def test_insertion_and_removal_see_density_and_motion_does_not(tiny, new_network
     network = new_network(replace(tiny, density_features=True)).eval()
     before = network(batch)
     with torch.no_grad():
-        for part in network.long_memory().values():
+        for part in network.added_parts().values():
             part.embed[-1].bias += 1
 
     after = network(batch)

@@ -78,8 +78,13 @@ def records(record):
 
 
 @pytest.fixture(scope="module")
-def both(variant, new_network, records, limits):
-    network = new_network(variant).eval()
+def stepped(variant, new_network):
+    return new_network(variant).eval()
+
+
+@pytest.fixture(scope="module")
+def both(stepped, records, limits):
+    network = stepped
     batch = collate(records, limits, draw=0)
     with torch.no_grad():
         outputs = network(batch)
@@ -110,14 +115,14 @@ def test_queries_for_newcomers_are_the_same_step_by_step(both):
             same(of(getattr(query, name), seen), of(wanted, seen, token, slot))
 
 
-def test_details_of_newcomers_are_the_same_step_by_step(both):
+def test_details_of_newcomers_are_the_same_step_by_step(both, stepped):
     batch, outputs, (_, _, details) = both
     found, wanted = outputs.details, batch.details
     if found is None:
         return
     pack = found.rows.pack
     scene = found.rows.at // wanted.present.shape[1]
-    compared = 0
+    compared, stepper = 0, Stepper(stepped)
     for row in pack(wanted.inserted).nonzero()[:, 0].tolist():
         token, turn = int(pack(wanted.token)[row]), int(pack(wanted.turn)[row])
         step, agent_type = details[token, turn], int(pack(wanted.agent_type)[row])
@@ -125,7 +130,17 @@ def test_details_of_newcomers_are_the_same_step_by_step(both):
         same(step.agent_type_logits[at], found.agent_type_logits[row])
         same(step.size_lwh_m[at, agent_type].log(), found.size_log_m[row])
         for name in ("heading_logits", "turned_rad", "offset_m"):
+            if name == "heading_logits" and step.query is not None:
+                continue  # Given the offset: below.
             same(of(getattr(step, name), at, agent_type), of(getattr(found, name), row))
+        assert (step.query is None) == (found.offset_logits is None)
+        if step.query is not None:
+            each = torch.ones(len(step.agent_type_logits), dtype=torch.int64)
+            offset = int(pack(wanted.offset)[row])
+            said = stepper.entry_offset(step.query, agent_type * each)
+            same(said[at], found.offset_logits[row])
+            said = stepper.entry_heading(step.query, agent_type * each, offset * each)
+            same(said[at], found.heading_logits[row])
         compared += 1
     assert compared >= 3
 

@@ -243,6 +243,7 @@ def _details(network, played):
         size_lwh_m=torch.ones((*token.shape, 3)),
         heading=torch.zeros_like(token),
         offset_m=offset_m,
+        offset=torch.zeros_like(token),
     )
 
 
@@ -282,6 +283,8 @@ class Gaps:
         for at, one in enumerate(played.details):
             number = said.rows.number[one.rollout[:, None], at * len(KINDS) + kinds]
             for name in DETAIL_LOGITS:
+                if name == "heading_logits" and one.said.query is not None:
+                    continue  # Given the offset that was sampled.
                 told = said.size_log_m.exp() if name == "size_lwh_m" else None
                 told = getattr(said, name) if told is None else told
                 heard = getattr(one.said, name)

@@ -84,6 +84,7 @@ def test_every_logit_of_thirty_seconds_is_that_of_a_plain_pass(starts, listening
         ({"validity_pattern_tokens": True}, {"validity_patterns": True}),
         ({"remove_token": False, "position_token": False}, {"removal_radius_m": 40.0}),
         ({"heading_token": False, "motion_blocks": 2, "scene_blocks": 2}, {}),
+        ({"offset_token": True, "cell_feature_width": 8}, {"add_bias": 2.0}),
         ({"relations": "rotary", "cell_feature_width": 8}, {"add_bias": 2.0}),
     ],
 )

@@ -24,6 +24,7 @@ VARIANTS = {
     "no cell token": {"position_token": False},
     "no heading token": {"heading_token": False},
     "no leave, no cell token": {"remove_token": False, "position_token": False},
+    "offset token": {"offset_token": True, "cell_feature_width": 4},
     "patterns": {"validity_pattern_tokens": True},
     "rotary": {"relations": "rotary"},
 }

@@ -252,6 +252,10 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {**FEATURES, "density_features": True, "standing_features": True},
         {"motion_noise_neighbours": 5, "closed_loop_population": True},
     ),
+    "offset-token": (
+        {**FEATURES, "offset_token": True},
+        {"closed_loop_population": True, "trained_parts": "details, motion"},
+    ),
     "accumulated": ({}, {"gradient_accumulation": 2}),
     "smart": ({"insertion_and_removal": False}, {}),
     "no-remove-token": ({"remove_token": False}, {}),

@@ -11,8 +11,10 @@ from infgen.errors import ConfigError
 from infgen.tokens.grid import (
     decode_cell,
     decode_heading,
+    decode_offset,
     encode_cell,
     encode_heading,
+    encode_offset,
     from_grid,
     make_grid,
     to_grid,
@@ -143,3 +145,27 @@ def test_no_heading_is_farther_than_half_a_bin_from_its_bins_middle(relative_rad
 def test_a_grid_too_fine_to_be_numbered_is_refused():
     with pytest.raises(ConfigError, match="too many cells"):
         make_grid(dataclasses.replace(TokenSettings(), grid_cell_m=0.5))
+
+
+@given(arrays(np.float32, (20, 2), elements=st.floats(-1.5, 1.5, width=32)))
+def test_an_offset_is_at_most_half_a_bin_from_the_middle_of_its_own(offset_m):
+    found_m = decode_offset(encode_offset(offset_m, GRID), GRID)
+
+    assert (np.abs(found_m - offset_m) <= GRID.offset_step_m / 2 + 1e-6).all()
+
+
+def test_offset_bins_are_numbered_row_by_row_from_the_rear_and_decoding_is_the_inverse():
+    bins = np.arange(len(GRID.offset_m)).astype(np.int16)
+
+    np.testing.assert_array_equal(encode_offset(decode_offset(bins, GRID), GRID), bins)
+    assert len(bins) == 144
+    first_m = decode_offset(bins[[0, 1, 12]], GRID)
+    np.testing.assert_allclose(
+        first_m, [[-1.375, -1.375], [-1.125, -1.375], [-1.375, -1.125]]
+    )
+
+
+def test_an_offset_beyond_its_cell_gets_the_nearest_bin():
+    found = encode_offset(f32(9.0, 0.1)[None], GRID)
+
+    np.testing.assert_allclose(decode_offset(found, GRID), [[1.375, 0.125]])

@@ -175,7 +175,8 @@ class Details:
         agent_type: ``AgentType``.
         size_lwh_m: Its box.
         heading: Heading bin relative to the ego.
-        offset_m: Position less the cell's centre, in the ego's grid frame.
+        offset_m: Position less the cell's centre, in the ego's grid frame ...
+        offset: ... and the bin of that.
     """
 
     present: Bool[Tensor, "scene detail"]
@@ -188,6 +189,7 @@ class Details:
     size_lwh_m: Float32[Tensor, "scene detail 3"]
     heading: Int64[Tensor, "scene detail"]
     offset_m: Float32[Tensor, "scene detail 2"]
+    offset: Int64[Tensor, "scene detail"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from jaxtyping import Float32, Int16, Integer
 
 from infgen.model.batching.crop import SceneWindow
 from infgen.model.batching.padding import NO_AGENT, Arrays
-from infgen.tokens.grid import Grid, encode_heading, to_grid
+from infgen.tokens.grid import Grid, encode_heading, encode_offset, to_grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence
 
 OUTSIDE = 1 << 15
@@ -19,10 +19,15 @@ def describe(
     ego_pose: Float32[np.ndarray, "*batch 3"],
     cell: Integer[np.ndarray, "*batch"],
     grid: Grid,
-) -> tuple[Int16[np.ndarray, "*batch"], Float32[np.ndarray, "*batch 2"]]:
-    """Return heading bins and offsets within their cells of agents beside egos."""
+) -> tuple[
+    Int16[np.ndarray, "*batch"],
+    Float32[np.ndarray, "*batch 2"],
+    Int16[np.ndarray, "*batch"],
+]:
+    """Return heading bins of agents beside egos, offsets within their cells, their bins."""
     heading = encode_heading(pose[..., 2] - ego_pose[..., 2], grid)
-    return heading, to_grid(pose[..., :2], ego_pose) - grid.centre_m[cell]
+    offset_m = to_grid(pose[..., :2], ego_pose) - grid.centre_m[cell]
+    return heading, offset_m, encode_offset(offset_m, grid)
 
 
 def insertion_turns(window: SceneWindow) -> np.ndarray:
@@ -74,7 +79,7 @@ def detail_arrays(
     tokens = np.concatenate([token, players[:, 1]])
     pose, ego_pose = window.pose[rows, tokens], window.pose[0, tokens]
     cell = window.cell[rows, tokens]
-    heading, offset_m = describe(pose, ego_pose, cell, grid)
+    heading, offset_m, offset = describe(pose, ego_pose, cell, grid)
     return {
         "present": np.ones(len(rows), dtype=bool),
         "inserted": np.arange(len(rows)) < len(row),
@@ -86,4 +91,5 @@ def detail_arrays(
         "size_lwh_m": window.size_lwh_m[rows],
         "heading": heading,
         "offset_m": offset_m,
+        "offset": offset,
     }

@@ -18,7 +18,8 @@ OF_ROLLOUTS = ("policy", "divergence")
 TERMS = (
     *("motion", "keep", "validity_pattern"),
     *("add", "position", "position_regression"),
-    *("agent_type", "size", "heading", "heading_regression", "offset"),
+    *("agent_type", "size", "heading", "heading_regression"),
+    *("offset", "offset_token"),
     "map",
     *OF_ROLLOUTS,
 )
@@ -87,7 +88,8 @@ def _counts(batch: Batch, masks: AgentMasks) -> Tensor:
         "add": _decided(batch),
         **dict.fromkeys(("position", "position_regression"), num_inserted),
         **dict.fromkeys(("agent_type", "size"), real),
-        **dict.fromkeys(("heading", "heading_regression", "offset"), described),
+        **dict.fromkeys(("heading", "heading_regression"), described),
+        **dict.fromkeys(("offset", "offset_token"), described),
         "map": batch.roads.predicted.sum(),
         **dict.fromkeys(OF_ROLLOUTS, num_inserted.new_zeros(())),
     }

@@ -195,11 +195,12 @@ def _tell_details(details: Details, agents: Agents, off: Tensor, grid: Grid) -> 
     told = describe(
         pose.numpy(force=True), ego_pose.numpy(force=True), cell.numpy(force=True), grid
     )
-    heading = torch.from_numpy(told[0]).to(cell)
+    heading, offset = (torch.from_numpy(bins).to(cell) for bins in told[::2])
     offset_m = torch.from_numpy(told[1]).to(pose)
     return replace(
         details,
         cell=cell,
         heading=torch.where(changed, heading, details.heading),
         offset_m=torch.where(changed[..., None], offset_m, details.offset_m),
+        offset=torch.where(changed, offset, details.offset),
     )

@@ -211,6 +211,9 @@ def _details(outputs: DetailOutputs, batch: Batch) -> Terms:
         terms["heading_regression"] = _distance(ALL, gap_rad[:, None] / math.pi)
     if outputs.offset_m is not None:
         terms["offset"] = _distance(ALL, outputs.offset_m - pack(details.offset_m))
+    if outputs.offset_logits is not None:
+        offset = pack(details.offset)
+        terms["offset_token"] = _choice(ALL, outputs.offset_logits, offset, 0.0)
     return terms
 
 

@@ -90,18 +90,22 @@ def sample_agent(
     details = stepper.entry_details(entries, cell, regressed_m)
     agent_type = choose_among(details.agent_type_logits, uniforms.draw(count))
     each = torch.arange(count, device=cell.device)
+    if details.query is None:
+        offset_m = None if details.offset_m is None else details.offset_m[each, agent_type]
+        turned_rad = _turned(details, each, agent_type, uniforms, grid)
+    else:
+        logits = stepper.entry_offset(details.query, agent_type)
+        offset = choose_among(logits, uniforms.draw(count))
+        offset_m = torch.from_numpy(grid.offset_m).to(cell.device)[offset]
+        logits = stepper.entry_heading(details.query, agent_type, offset)
+        turned_rad = _heading_rad(logits, uniforms, grid)
     position_m = regressed_m
     if position_m is None:
-        centre_m = torch.from_numpy(grid.centre_m).to(cell.device)[cell]
-        offset_m = details.offset_m
-        position_m = (
-            centre_m
-            if offset_m is None
-            else _within(centre_m + offset_m[each, agent_type], grid)
-        )
+        position_m = torch.from_numpy(grid.centre_m).to(cell.device)[cell]
+        if offset_m is not None:
+            position_m = _within(position_m + offset_m, grid)
     ego_pose = entries.active(entries.token_step.pose)[:, EGO]
     pose = cell_pose(ego_pose, position_m)
-    turned_rad = _turned(details, each, agent_type, uniforms, grid)
     pose[:, 2] = wrap_angle(ego_pose[:, 2] + turned_rad)
     return InsertedAgent(cell, pose, agent_type, details.size_lwh_m[each, agent_type])
 
@@ -117,8 +121,12 @@ def _turned(
     if details.heading_logits is None:
         assert details.turned_rad is not None
         return details.turned_rad[each, agent_type]
-    logits = details.heading_logits[each, agent_type]
-    bins = choose_among(logits, uniforms.draw(len(each)))
+    return _heading_rad(details.heading_logits[each, agent_type], uniforms, grid)
+
+
+def _heading_rad(logits: Tensor, uniforms: UniformNumbers, grid: Grid) -> Tensor:
+    """Sample headings relative to the ego."""
+    bins = choose_among(logits, uniforms.draw(len(logits)))
     return (bins + 0.5) * (2 * math.pi / grid.num_headings) - math.pi
 
 

@@ -107,6 +107,7 @@ def inserted_details(entries: Insertions, played: Agents) -> Details:
         size_lwh_m=played.size_lwh_m[scene, row],
         heading=torch.zeros_like(agent),
         offset_m=played.pose.new_zeros((*agent.shape, 2)),
+        offset=torch.zeros_like(agent),
     )
 
 
@@ -130,10 +131,11 @@ def describe_details(details: Details, agents: Agents, grid: Grid) -> Details:
         details.cell.numpy(force=True),
         grid,
     )
-    heading = torch.from_numpy(told[0]).to(details.heading)
+    heading, offset = (torch.from_numpy(bins).to(details.heading) for bins in told[::2])
     offset_m = torch.from_numpy(told[1]).to(details.offset_m)
     return replace(
         details,
         heading=torch.where(details.present, heading, 0),
         offset_m=torch.where(details.present[..., None], offset_m, 0),
+        offset=torch.where(details.present, offset, 0),
     )

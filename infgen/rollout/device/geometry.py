@@ -67,6 +67,7 @@ class DeviceGrid:
         """Bring the tables of a grid to a device."""
         self.grid = grid
         self.centre_m = torch.from_numpy(grid.centre_m.copy()).to(device)
+        self.offset_m = torch.from_numpy(grid.offset_m.copy()).to(device)
         self.heading_rad = torch.from_numpy(grid.heading_centre_rad).to(device)
         self._cell_at = torch.from_numpy(grid.cell_at.copy()).to(device)
 

@@ -23,7 +23,7 @@ from infgen.model.token_step import PositionOutputs, TokenStep
 from infgen.rollout.device.geometry import DeviceGrid, wrap_angle
 from infgen.rollout.device.positions import DeviceMask
 from infgen.rollout.device.random_numbers import DeviceStreams
-from infgen.rollout.insertion import INSIDE, of_type, sample_heading
+from infgen.rollout.insertion import INSIDE, of_type, sample_offset_and_heading
 from infgen.rollout.insertion_state import TURN_PURPOSES, InsertionRequest
 from infgen.rollout.population import InsertedAgents, Population, insertion_pose
 from infgen.rollout.random_streams import WORDS, Purpose
@@ -219,14 +219,16 @@ class DeviceInsertion:
         cell, position_m = self._sample_cell(running, query, uniforms(Purpose.CELL))
         details = simulator.stepper.entry_details(entries, cell, position_m)
         agent_type = choose(details.agent_type_logits, uniforms(Purpose.AGENT_TYPE))
-        turned_rad = sample_heading(simulator, details, agent_type, uniforms)
-        if details.heading_logits is not None:
+        offset, turned_rad = sample_offset_and_heading(
+            simulator, details, agent_type, uniforms
+        )
+        if details.turned_rad is None:
             turned_rad = grid.heading_rad[turned_rad]
         if position_m is None:
             position_m = grid.centre_m[cell]
-            if details.offset_m is not None:
-                position_m = position_m + of_type(details.offset_m, agent_type)
-                position_m = grid.within(position_m, INSIDE)
+            if offset is not None:
+                offset_m = offset if details.query is None else grid.offset_m[offset]
+                position_m = grid.within(position_m + offset_m, INSIDE)
         ego_pose = entries.active(entries.token_step.pose)[:, EGO]
         xy_m = cell_pose(ego_pose, position_m)[:, :2]
         heading_rad = wrap_angle(turned_rad + ego_pose[:, 2])

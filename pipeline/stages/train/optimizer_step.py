@@ -87,7 +87,8 @@ class OptimizerStep:
     ) -> None:
         self._training, self._settings, self._process_group = training, settings, group
         self.forward = Pass(training.network, settings)
-        self._parameters = parameters = list(training.network.parameters())
+        trained = (p for p in training.network.parameters() if p.requires_grad)
+        self._parameters = parameters = list(trained)
         sizes = [p.numel() for p in parameters]
         tail = [len(TERMS) * len(FIGURES), 2, len(SUMS), parts]
         self._sums = parameters[0].new_zeros(sum(sizes) + sum(tail))

@@ -103,13 +103,15 @@ def begin(
 
     Raises:
         StoreError: if the weights to begin with do not fit.
+        TrainingError: if no parameter is to be trained.
     """
     torch.manual_seed(setup.train.seed)
     network = Network(setup.model, motion, roads, setup.grid)
     if setup.start is not None:
         copy_weights(network, setup.start)
     network = network.to(own_device())
-    parameters = list(network.parameters())
+    _choose_trained(network, setup.train.trained_parts)
+    parameters = [p for p in network.parameters() if p.requires_grad]
     decay = setup.train.weight_decay
     optimiser = torch.optim.AdamW(
         [
@@ -126,6 +128,19 @@ def begin(
         optimiser,
         _frozen(network) if setup.train.policy_gradient_rollouts else None,
     )
+
+
+def _choose_trained(network: Network, parts: str) -> None:
+    """Keep all parameters as they are but those of the named parts, if parts are named."""
+    names = tuple(part.strip() for part in parts.split(",") if part.strip())
+    for name, parameter in network.named_parameters():
+        parameter.requires_grad_(not names or name.startswith(names))
+    if not any(parameter.requires_grad for parameter in network.parameters()):
+        known = sorted({name.split(".")[0] for name, _ in network.named_parameters()})
+        raise TrainingError(
+            f"no parameter's name begins with train.trained_parts={parts!r}; names begin "
+            f"with {', '.join(known)}"
+        )
 
 
 def _frozen(network: Network) -> Network:

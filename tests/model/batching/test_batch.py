@@ -218,7 +218,8 @@ def test_noise_changes_only_what_agents_do_and_where_they_are(pair):
         for field in fields(part)
         if not torch.equal(getattr(part, field.name), getattr(other, field.name))
     }
-    told = {"Insertions.cell", "Details.cell", "Details.heading", "Details.offset_m"}
+    told = {f"Details.{name}" for name in ("cell", "heading", "offset_m", "offset")}
+    told.add("Insertions.cell")
     asked = {"Details.agent", "Details.token", "Details.agent_type", "Details.size_lwh_m"}
     agents = {"Agents.pose", "Agents.motion_token", "Agents.label", "Agents.cell"}
     assert agents | {"Details.offset_m", "MapTokens.token"} <= changed

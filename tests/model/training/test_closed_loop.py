@@ -181,6 +181,7 @@ def test_who_comes_goes_and_is_not_seen_is_the_logs(logged, played):
         "Details.cell",
         "Details.heading",
         "Details.offset_m",
+        "Details.offset",
     }
     still = ~logged.agents.observed
     for name in ("pose", "motion_token", "label"):

@@ -137,7 +137,7 @@ def test_parts_without_effect_may_be_missing_in_weights_to_begin_with():
     parameters = dict(network.named_parameters())
     for name, parameter in plain.named_parameters():
         assert torch.equal(parameters.pop(name), parameter), name
-    parts = tuple(network.long_memory())
+    parts = tuple(network.added_parts())
     assert len(parts) == 3
     assert all(name.startswith(parts) for name in parameters)
 

@@ -2,9 +2,9 @@
 
 The policy term is minus the sum of advantage times log-probability (Williams 1992); the
 divergence is the Kullback-Leibler divergence from the network to the pretrained one, summed
-over all choices of the rollout: motion tokens, removals, insertions, and the cells, types
-and headings of inserted agents. Sizes and offsets, which are not sampled, count as means of
-normal distributions of variance one. Both terms are divided by the number of motion tokens,
+over all choices of the rollout: motion tokens, removals, insertions, and the cells, types,
+headings and offset tokens of inserted agents. Sizes and regressed offsets, which are not
+sampled, count as means of normal distributions of variance one. Both terms are divided by the number of motion tokens,
 so ``divergence_weight`` is in rewards per nat.
 """
 
@@ -31,8 +31,8 @@ class PolicyLesson:
     Attributes:
         batch: The rollouts.
         moved: Agents whose motion token was sampled.
-        advantage: Of motion tokens, and of the cells and headings of inserted agents, at
-            the token step that they led to.
+        advantage: Of motion tokens, and of the cells, headings and offset tokens of
+            inserted agents, at the token step that they led to.
         type_advantage: Of the type of every inserted agent.
         count_advantage: Of a rollout from a token step on: of its insertions there, and of
             the removals of the step before, whose agents are gone by then.
@@ -107,7 +107,7 @@ def _motion_gain(
 
 
 def _insertion_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:
-    """The same of the cells, headings and types of inserted agents."""
+    """The same of the cells, headings, offset tokens and types of inserted agents."""
     gained = outputs.motion.motion_logits.new_zeros(())
     entries = lesson.batch.entries
     if outputs.entries is not None and outputs.entries.position_logits is not None:
@@ -125,13 +125,15 @@ def _insertion_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:
 
 
 def _detail_gain(outputs: DetailOutputs, lesson: PolicyLesson) -> Tensor:
-    """The same of the types and headings."""
+    """The same of the types, headings and offset tokens."""
     details, rows = lesson.batch.details, outputs.rows
     scene = rows.at // details.present.shape[1]
     at = scene, rows.pack(details.token), rows.pack(details.agent)
     choices = [(outputs.agent_type_logits, details.agent_type, lesson.type_advantage)]
     if outputs.heading_logits is not None:
         choices.append((outputs.heading_logits, details.heading, lesson.advantage))
+    if outputs.offset_logits is not None:
+        choices.append((outputs.offset_logits, details.offset, lesson.advantage))
     gained = outputs.agent_type_logits.new_zeros(())
     for logits, chosen, advantage in choices:
         likely = logits.log_softmax(dim=-1).gather(1, rows.pack(chosen)[:, None])[:, 0]
@@ -204,8 +206,12 @@ def _of_details(outputs: Outputs, pretrained: Outputs) -> Tensor:
         return outputs.motion.motion_logits.new_zeros(())
     found = _of_choice(one.agent_type_logits, other.agent_type_logits)
     found = found + _of_mean(one.size_log_m - other.size_log_m)
-    if one.heading_logits is not None and other.heading_logits is not None:
-        found = found + _of_choice(one.heading_logits, other.heading_logits)
+    for logits, others in (
+        (one.heading_logits, other.heading_logits),
+        (one.offset_logits, other.offset_logits),
+    ):
+        if logits is not None and others is not None:
+            found = found + _of_choice(logits, others)
     for own, theirs in (
         (one.turned_rad, other.turned_rad),
         (one.offset_m, other.offset_m),

@@ -155,6 +155,31 @@ def test_types_of_inserted_agents_are_learned_by_their_own_advantage(network, le
     )
 
 
+def test_offset_tokens_of_inserted_agents_are_learned_too(new_network, tiny, logged):
+    network = new_network(replace(tiny, offset_token=True)).eval()
+    lesson = next(
+        each
+        for each in simulate_lessons(network, logged, HOW, 5).lessons
+        if each.batch.details.present.any()
+    )
+    only = worthless(lesson)
+    only.advantage[:] = 1.0
+
+    after = after_a_step(network, only)(lesson.batch)
+    before = network(lesson.batch)
+
+    chosen = before.details.rows.pack(lesson.batch.details.offset)[:, None]
+    assert likely(after.details.offset_logits, chosen) > likely(
+        before.details.offset_logits, chosen
+    )
+    moved = copy.deepcopy(network)
+    with torch.no_grad():
+        moved.details.offset_bins.alone[-1].bias[0] += 2.0
+    other = moved(lesson.batch)
+    assert divergence(before, before, lesson) == 0
+    assert divergence(other, before, lesson) > 0
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_insertions_and_removals_become_as_likely_as_their_rollouts_are_good(
     network, lessons, sign

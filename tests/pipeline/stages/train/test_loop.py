@@ -131,6 +131,30 @@ def test_the_loss_goes_down(setup, books, quiet):
     assert lines[-1]["motion_perplexity"] < lines[0]["motion_perplexity"]
 
 
+def test_only_the_named_parts_are_trained(setup, books, quiet):
+    some = replace(setup, train=replace(setup.train, trained_parts="cells, details.heading"))
+    before = dict(begin(some, *books).network.named_parameters())
+    training = begin(some, *books)
+
+    train(some, training, quiet)
+
+    changed = {
+        name
+        for name, parameter in training.network.named_parameters()
+        if not torch.equal(parameter, before[name])
+    }
+    assert changed
+    assert {name.split(".")[0] for name in changed} == {"cells", "details"}
+    assert all(name.startswith(("cells", "details.heading")) for name in changed)
+
+
+def test_parts_that_there_are_not_are_named(setup, books):
+    some = replace(setup, train=replace(setup.train, trained_parts="wheels"))
+
+    with pytest.raises(TrainingError, match="'wheels'; names begin with .*details"):
+        begin(some, *books)
+
+
 def test_a_log_forgets_what_lies_beyond_the_checkpoint(tmp_path):
     path = tmp_path / "train.jsonl"
     path.write_text('{"step": 1}\n{"step": 2}\n{"step": 3}\n{"ste')
