@@ -29,7 +29,8 @@ from infgen.metrics.kinematics import speed
 from infgen.metrics.traffic import Traffic, from_rollout, observe_log
 from infgen.rollout.rules.off_road import Lanes, lane_segments
 from infgen.scene import AgentType
-from infgen.spatial.lanes import nearest_by_cells, project
+from infgen.spatial.nearest import nearest_by_cells
+from infgen.spatial.road_edges import project
 from pipeline.commands.screen import show_table
 from pipeline.storage.rollouts import read_rollouts
 from pipeline.storage.scene_lookup import open_scene_lookup, unit_folders
@@ -68,7 +69,7 @@ def take(side: Side, traffic: Traffic, lanes: Lanes) -> None:
     """Measure one log or rollout."""
     motion, now = traffic.motion, traffic.now
     side.count += 1
-    known = motion.valid[0, :, : now + 1].any(axis=1)
+    known: np.ndarray = np.asarray(motion.valid[0, :, : now + 1].any(axis=1))
     speed_mps = np.nan_to_num(speed(motion.x_m, motion.y_m)[0])
     hit = np.zeros((len(known), len(known), motion.valid.shape[2] - now - 1), dtype=bool)
     for at in range(hit.shape[2]):
@@ -111,9 +112,7 @@ def overlaps(traffic: Traffic, step: int) -> tuple[np.ndarray, np.ndarray]:
     return there[one[meet]], there[other[meet]]
 
 
-def beside_lanes(
-    traffic: Traffic, rows: np.ndarray, step: int, lanes: Lanes
-) -> np.ndarray:
+def beside_lanes(traffic: Traffic, rows: np.ndarray, step: int, lanes: Lanes) -> np.ndarray:
     """Distance from the nearest lane, in metres, and angle to it, in degrees [row, 2]."""
     start_m, along_m = lanes
     motion = traffic.motion
@@ -163,7 +162,8 @@ def report(logs: Side, played: Side) -> dict[str, Any]:
     for who, side in sides.items():
         found[who] = {name: side.kinds[name] / side.count for name in (*COLUMNS, *types)}
         found[who]["median, s"] = float(np.median(side.lasted_s or [0.0]))
-    rows = [(who, *(f"{value:.2f}" for value in one.values())) for who, one in found.items()]
+    cells = {who: [f"{value:.2f}" for value in one.values()] for who, one in found.items()}
+    rows = [(who, *told) for who, told in cells.items()]
     show_table("contacts of each", ("", *found["logs"]), rows)
     rows = []
     for who, side in sides.items():
@@ -171,8 +171,8 @@ def report(logs: Side, played: Side) -> dict[str, Any]:
             values = np.concatenate(parts)
             if len(values):
                 found[f"{who}: {name}"] = numbers = _spread(values)
-                cells = (format(value, ".3g") for value in numbers.values())
-                rows.append((f"{who}: {name}", *cells))
+                told = [format(value, ".3g") for value in numbers.values()]
+                rows.append((f"{who}: {name}", *told))
     show_table("vehicles beside lanes", ("", *WHERE), rows)
     return found
 

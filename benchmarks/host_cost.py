@@ -25,19 +25,19 @@ from measuring import in_own_process
 from rollout import LENGTH_S, PLAYED, Case, make_session
 
 from infgen.clock import CLOCK
+from infgen.model.insertion import DetailQuery
 from infgen.model.stepping import Stepper
 from infgen.rollout import insertion, motion_sampler
 from infgen.rollout.session import Session
 from pipeline.commands.screen import show_table
 
-NETWORK = (
-    "begin",
-    "motion_step",
-    "entry_begin",
-    "entry_add",
-    "entry_query",
-    "entry_details",
-)
+NETWORK = {
+    Stepper: (
+        *("begin", "motion_step", "entry_begin", "entry_add"),
+        *("entry_query", "entry_details"),
+    ),
+    DetailQuery: ("offset_logits", "heading_logits"),
+}
 """Calls of the network."""
 SAMPLING = {
     insertion: ("choose", "sample_event"),
@@ -80,9 +80,7 @@ def measure(batch: int, played: str, seconds: float, lines: int) -> dict[str, fl
     """Measure one row, in this process."""
     torch.set_num_threads(1)
     excluded = Excluded()
-    for name in NETWORK:
-        setattr(Stepper, name, excluded.wrap(getattr(Stepper, name)))
-    for module, names in SAMPLING.items():
+    for module, names in (*NETWORK.items(), *SAMPLING.items()):
         for name in names:
             setattr(module, name, excluded.wrap(getattr(module, name)))
     motion_only = played == "motion only"

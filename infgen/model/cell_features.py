@@ -29,7 +29,7 @@ BIN_REACH = 2
 """Bins to each side that what lies in a bin speaks to."""
 LATERAL_REACH_M = 4.0
 LATERAL_STEP_M = 0.25
-"""Lateral offsets from a map token are told apart so finely, up to so far on either side."""
+"""Lateral offsets from a map token are told apart so finely, so far on either side."""
 
 
 @dataclass(frozen=True, slots=True)

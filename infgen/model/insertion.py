@@ -17,7 +17,13 @@ from infgen.model.cell_features import (
     OffsetEmbedding,
     OffsetFeatures,
 )
-from infgen.model.layers import Attention, AttentionSources, embedding_mlp, mlp
+from infgen.model.layers import (
+    Attention,
+    AttentionSources,
+    embedding_mlp,
+    full_precision,
+    mlp,
+)
 from infgen.model.logits import DetailOutputs, InsertionOutputs
 from infgen.model.long_memory import Density, DensityFeatures
 from infgen.model.neighbours import NeighbourSpec, cell_pose
@@ -284,6 +290,37 @@ class DetailStack(nn.Module):
             None if turn is None else math.pi * torch.tanh(turn(given)[..., 0]),
             None if offset is None else self.reach_m * torch.tanh(offset(given)),
         )
+
+
+@dataclass(frozen=True, slots=True)
+class DetailQuery:
+    """The query of inserted agents' details, to go on with once more of them is known.
+
+    Attributes:
+        stack: What is queried.
+        features: Features of the query [N, D].
+        pose: Its pose [N, 3].
+        roads: Map tokens that it sees.
+    """
+
+    stack: DetailStack
+    features: Tensor
+    pose: Tensor
+    roads: CellSources
+
+    @torch.no_grad()
+    def offset_logits(self, agent_type: Tensor) -> Tensor:
+        """Return logits of offset bins [N, offset] given agent types [N]."""
+        x = self.features.float()
+        with full_precision(x):
+            return self.stack.offset_logits(x, agent_type, self.pose, self.roads)
+
+    @torch.no_grad()
+    def heading_logits(self, agent_type: Tensor, offset: Tensor) -> Tensor:
+        """Return logits of heading bins [N, heading] given offset bins [N] as well."""
+        x = self.features.float()
+        with full_precision(x):
+            return self.stack.heading_logits(x, agent_type, offset, self.pose, self.roads)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ of relations, H heads, C width of one head, F scalars, P nodes of a table.
 
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import torch
@@ -45,6 +46,15 @@ def embedding_mlp(inputs: int, width: int) -> nn.Sequential:
 def normed(x: Tensor) -> Tensor:
     """Bring features [..., D] to mean 0 and variance 1, without a learned gain."""
     return functional.layer_norm(x, x.shape[-1:])
+
+
+def full_precision(x: Tensor) -> AbstractContextManager[object]:
+    """Compute logits in float32 under autocast too: rounded ones choose otherwise.
+
+    With heads in bf16 one in four choices of motion tokens differs from float32; with heads
+    in float32 it is one in 25 (``tests/rollout/test_precision``).
+    """
+    return torch.autocast(x.device.type, enabled=False)
 
 
 def gather(features_ND: Tensor, index: Tensor) -> Tensor:

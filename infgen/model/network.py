@@ -55,6 +55,7 @@ EGO = 0
 AddedPart = DensityFeatures | StandingFeatures | OffsetEmbedding | OffsetFeatures
 """Parts that may be added to trained weights."""
 
+
 class Network(nn.Module):
     """Roads, agents and inserted agents in one network (SPEC 4).
 
@@ -102,9 +103,7 @@ class Network(nn.Module):
         Before they are trained they change no logit, and offset bins are equally likely.
         """
         return {
-            name: part
-            for name, part in self.named_modules()
-            if isinstance(part, AddedPart)
+            name: part for name, part in self.named_modules() if isinstance(part, AddedPart)
         }
 
     def motion_vocabulary(self) -> MotionVocabulary:

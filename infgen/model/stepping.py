@@ -20,7 +20,6 @@ Row 0 is always the ego. A row that is ABSENT costs nothing. A row that is INSER
 with an empty past, so a freed row can be given to an inserted agent as it is.
 """
 
-from contextlib import AbstractContextManager
 from dataclasses import replace
 
 import torch
@@ -31,8 +30,8 @@ from infgen.model.agents import AgentContext, AgentRows
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import MapTokens
 from infgen.model.cell_features import CellSources
-from infgen.model.insertion import InsertionBlocks
-from infgen.model.layers import AttentionSources, normed
+from infgen.model.insertion import DetailQuery, InsertionBlocks
+from infgen.model.layers import AttentionSources, full_precision, normed
 from infgen.model.long_memory import Density, Standing, count_around, standing_after
 from infgen.model.map_grid import MapGrid
 from infgen.model.neighbours import (
@@ -46,23 +45,8 @@ from infgen.model.network import EGO, Network
 from infgen.model.relations import Rows, describe_pairs, within_radius
 from infgen.model.rotary.turns import turned, turned_back
 from infgen.model.step_memory import Insertions, StepMemory
-from infgen.model.token_step import (
-    DetailQuery,
-    InsertionDetails,
-    MotionStep,
-    PositionOutputs,
-    TokenStep,
-)
+from infgen.model.token_step import InsertionDetails, MotionStep, PositionOutputs, TokenStep
 from infgen.tokens.scene_tokens import Presence
-
-
-def _full_precision(x: Tensor) -> AbstractContextManager[object]:
-    """Compute logits in float32 under autocast too: rounded ones choose otherwise.
-
-    With heads in bf16 one in four choices of motion tokens differs from float32; with heads
-    in float32 it is one in 25 (``tests/rollout/test_precision``).
-    """
-    return torch.autocast(x.device.type, enabled=False)
 
 
 class Stepper:
@@ -165,7 +149,7 @@ class Stepper:
             memory.count(self._count(token_step))
         memory.columns += 1
         agent_type = rows.pack(token_step.agent_type)
-        with _full_precision(x):
+        with full_precision(x):
             return MotionStep(
                 motion.foretell(rows, x.float(), agent_type, self._shapes, sight)
             )
@@ -263,7 +247,7 @@ class Stepper:
         x = cells(occupied[:, None], roads, agents, average)[:, 0]
         each = torch.arange(len(x), device=x.device)
         rows, queries = Rows(each, each), x[:, None].float()
-        with _full_precision(x):
+        with full_precision(x):
             said = cells.answer(rows, queries, cell_features)
         return PositionOutputs(
             said.add_logit[:, 0],
@@ -306,7 +290,7 @@ class Stepper:
         x = details(cell, roads, around.seen(entries.raw.flatten(0, 1)))
         kinds = torch.arange(details.given_kind.num_embeddings, device=cell.device)
         near = CellSources.near(entries.map, roads)
-        with _full_precision(x):
+        with full_precision(x):
             said = details.answer(rows, x[:, None].float(), kinds, pose[:, 0], near)
         sampled = details.offset_bins is not None
         return InsertionDetails(
@@ -315,31 +299,8 @@ class Stepper:
             said.heading_logits,
             said.turned_rad,
             said.offset_m,
-            DetailQuery(x, pose[:, 0], near) if sampled else None,
+            DetailQuery(details, x, pose[:, 0], near) if sampled else None,
         )
-
-    @torch.no_grad()
-    def entry_offset(
-        self, query: DetailQuery, agent_type: Int64[Tensor, " active"]
-    ) -> Float32[Tensor, "active offset"]:
-        """Query the offset bin of an inserted agent, whose type is known."""
-        x, details = query.features.float(), self._asked().details
-        with _full_precision(x):
-            return details.offset_logits(x, agent_type, query.pose, query.roads)
-
-    @torch.no_grad()
-    def entry_heading(
-        self,
-        query: DetailQuery,
-        agent_type: Int64[Tensor, " active"],
-        offset: Int64[Tensor, " active"],
-    ) -> Float32[Tensor, "active heading"]:
-        """Query the heading bin of an inserted agent, whose offset bin is known too."""
-        x, details = query.features.float(), self._asked().details
-        with _full_precision(x):
-            return details.heading_logits(
-                x, agent_type, offset, query.pose, query.roads
-            )
 
     def _cell_features(self, entries: Insertions) -> Tensor | None:
         """Describe the cells around every ego, before any inserted agent."""

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from infgen.model.cell_features import CellSources
+from infgen.model.insertion import DetailQuery
 from infgen.model.logits import MotionOutputs
 from infgen.tokens.scene_tokens import Presence
 
@@ -133,21 +133,6 @@ class PositionOutputs:
             own, new = getattr(self, each.name), getattr(others, each.name)
             if own is not None:
                 own.index_copy_(0, rollouts, new)
-
-
-@dataclass(frozen=True, slots=True)
-class DetailQuery:
-    """The query of an inserted agent's details.
-
-    Attributes:
-        features: Its features.
-        pose: Its pose.
-        roads: Map tokens that it sees.
-    """
-
-    features: Float32[Tensor, "rollout width"]
-    pose: Float32[Tensor, "rollout 3"]
-    roads: CellSources
 
 
 @dataclass(frozen=True, slots=True)

@@ -259,9 +259,9 @@ def sample_offset_and_heading(
     query, logits = details.query, details.heading_logits
     offset = None if details.offset_m is None else of_type(details.offset_m, agent_type)
     if query is not None:
-        said = simulator.stepper.entry_offset(query, agent_type)
+        said = query.offset_logits(agent_type)
         offset = choose(said, uniforms(Purpose.OFFSET))
-        by_type = simulator.stepper.entry_heading(query, agent_type, offset)
+        by_type = query.heading_logits(agent_type, offset)
     elif logits is not None:
         by_type = of_type(logits, agent_type)
     else:

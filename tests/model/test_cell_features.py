@@ -5,7 +5,12 @@ import math
 import pytest
 import torch
 
-from infgen.model.cell_features import CellFeatures, CellSources, HeadingFeatures, OffsetFeatures
+from infgen.model.cell_features import (
+    CellFeatures,
+    CellSources,
+    HeadingFeatures,
+    OffsetFeatures,
+)
 from infgen.model.neighbours import cell_pose
 from infgen.tokens.grid import make_grid
 
@@ -173,7 +178,9 @@ def bins_of(offsets, roads):
         return offsets(torch.zeros((1, WIDTH)), EGO, roads)[0]
 
 
-@pytest.mark.parametrize(("along_deg", "place"), [(0.0, (-0.5, None)), (90.0, (None, -0.5))])
+@pytest.mark.parametrize(
+    ("along_deg", "place"), [(0.0, (-0.5, None)), (90.0, (None, -0.5))]
+)
 def test_an_offset_bin_is_told_by_how_far_it_lies_beside_a_road(
     offsets, grid, along_deg, place
 ):

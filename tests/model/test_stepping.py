@@ -78,13 +78,8 @@ def records(record):
 
 
 @pytest.fixture(scope="module")
-def stepped(variant, new_network):
-    return new_network(variant).eval()
-
-
-@pytest.fixture(scope="module")
-def both(stepped, records, limits):
-    network = stepped
+def both(variant, new_network, records, limits):
+    network = new_network(variant).eval()
     batch = collate(records, limits, draw=0)
     with torch.no_grad():
         outputs = network(batch)
@@ -115,14 +110,14 @@ def test_queries_for_newcomers_are_the_same_step_by_step(both):
             same(of(getattr(query, name), seen), of(wanted, seen, token, slot))
 
 
-def test_details_of_newcomers_are_the_same_step_by_step(both, stepped):
+def test_details_of_newcomers_are_the_same_step_by_step(both):
     batch, outputs, (_, _, details) = both
     found, wanted = outputs.details, batch.details
     if found is None:
         return
     pack = found.rows.pack
     scene = found.rows.at // wanted.present.shape[1]
-    compared, stepper = 0, Stepper(stepped)
+    compared = 0
     for row in pack(wanted.inserted).nonzero()[:, 0].tolist():
         token, turn = int(pack(wanted.token)[row]), int(pack(wanted.turn)[row])
         step, agent_type = details[token, turn], int(pack(wanted.agent_type)[row])
@@ -137,9 +132,9 @@ def test_details_of_newcomers_are_the_same_step_by_step(both, stepped):
         if step.query is not None:
             each = torch.ones(len(step.agent_type_logits), dtype=torch.int64)
             offset = int(pack(wanted.offset)[row])
-            said = stepper.entry_offset(step.query, agent_type * each)
+            said = step.query.offset_logits(agent_type * each)
             same(said[at], found.offset_logits[row])
-            said = stepper.entry_heading(step.query, agent_type * each, offset * each)
+            said = step.query.heading_logits(agent_type * each, offset * each)
             same(said[at], found.heading_logits[row])
         compared += 1
     assert compared >= 3

@@ -166,8 +166,7 @@ class Details:
 
     Attributes:
         present: False for padding.
-        inserted: Whether the agent is truly inserted; else it is present already and plays
-            the part.
+        inserted: Whether it is truly inserted; else it is present already.
         agent: Row of the agent, hidden from its own query.
         token: When.
         turn: Inserted agents of this turn and later are hidden as well.
@@ -175,8 +174,8 @@ class Details:
         agent_type: ``AgentType``.
         size_lwh_m: Its box.
         heading: Heading bin relative to the ego.
-        offset_m: Position less the cell's centre, in the ego's grid frame ...
-        offset: ... and the bin of that.
+        offset_m: Position less the cell's centre, in the ego's grid frame.
+        offset: Its bin.
     """
 
     present: Bool[Tensor, "scene detail"]

@@ -94,10 +94,10 @@ def sample_agent(
         offset_m = None if details.offset_m is None else details.offset_m[each, agent_type]
         turned_rad = _turned(details, each, agent_type, uniforms, grid)
     else:
-        logits = stepper.entry_offset(details.query, agent_type)
+        logits = details.query.offset_logits(agent_type)
         offset = choose_among(logits, uniforms.draw(count))
         offset_m = torch.from_numpy(grid.offset_m).to(cell.device)[offset]
-        logits = stepper.entry_heading(details.query, agent_type, offset)
+        logits = details.query.heading_logits(agent_type, offset)
         turned_rad = _heading_rad(logits, uniforms, grid)
     position_m = regressed_m
     if position_m is None:

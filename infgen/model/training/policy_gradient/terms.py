@@ -4,8 +4,8 @@ The policy term is minus the sum of advantage times log-probability (Williams 19
 divergence is the Kullback-Leibler divergence from the network to the pretrained one, summed
 over all choices of the rollout: motion tokens, removals, insertions, and the cells, types,
 headings and offset tokens of inserted agents. Sizes and regressed offsets, which are not
-sampled, count as means of normal distributions of variance one. Both terms are divided by the number of motion tokens,
-so ``divergence_weight`` is in rewards per nat.
+sampled, count as means of normal distributions of variance one. Both terms are divided by
+the number of motion tokens, so ``divergence_weight`` is in rewards per nat.
 """
 
 from dataclasses import dataclass

@@ -132,7 +132,8 @@ def test_the_loss_goes_down(setup, books, quiet):
 
 
 def test_only_the_named_parts_are_trained(setup, books, quiet):
-    some = replace(setup, train=replace(setup.train, trained_parts="cells, details.heading"))
+    how = replace(setup.train, trained_parts="cells, details.heading")
+    some = replace(setup, train=how)
     before = dict(begin(some, *books).network.named_parameters())
     training = begin(some, *books)
 
@@ -151,7 +152,7 @@ def test_only_the_named_parts_are_trained(setup, books, quiet):
 def test_parts_that_there_are_not_are_named(setup, books):
     some = replace(setup, train=replace(setup.train, trained_parts="wheels"))
 
-    with pytest.raises(TrainingError, match="'wheels'; names begin with .*details"):
+    with pytest.raises(TrainingError, match=r"'wheels'; names begin with .*details"):
         begin(some, *books)
 
 
