@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float32
 from torch import Tensor, nn
 
 from infgen.model.agents import KINDS
@@ -321,6 +322,29 @@ class DetailQuery:
         x = self.features.float()
         with full_precision(x):
             return self.stack.heading_logits(x, agent_type, offset, self.pose, self.roads)
+
+
+@dataclass(frozen=True, slots=True)
+class InsertionDetails:
+    """Details of an inserted agent: sample a type, then take its row of the others.
+
+    Attributes:
+        agent_type_logits: ``AgentType`` given the cell.
+        size_lwh_m: Box, given the agent type.
+        heading_logits: Heading bin relative to the ego, given the agent type ...
+        turned_rad: ... or the heading itself, relative to the ego.
+        offset_m: Position less the cell's centre, in the ego's grid frame, given the agent
+            type; None where the place was known already.
+        query: Where the offset is sampled, and the heading given the offset, neither is
+            here: they are queried by this.
+    """
+
+    agent_type_logits: Float32[Tensor, "rollout agent_type"]
+    size_lwh_m: Float32[Tensor, "rollout agent_type 3"]
+    heading_logits: Float32[Tensor, "rollout agent_type heading"] | None
+    turned_rad: Float32[Tensor, "rollout agent_type"] | None
+    offset_m: Float32[Tensor, "rollout agent_type 2"] | None
+    query: DetailQuery | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ from infgen.model.agents import AgentContext, AgentRows
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import MapTokens
 from infgen.model.cell_features import CellSources
-from infgen.model.insertion import DetailQuery, InsertionBlocks
+from infgen.model.insertion import DetailQuery, InsertionBlocks, InsertionDetails
 from infgen.model.layers import AttentionSources, full_precision, normed
 from infgen.model.long_memory import Density, Standing, count_around, standing_after
 from infgen.model.map_grid import MapGrid
@@ -45,7 +45,7 @@ from infgen.model.network import EGO, Network
 from infgen.model.relations import Rows, describe_pairs, within_radius
 from infgen.model.rotary.turns import turned, turned_back
 from infgen.model.step_memory import Insertions, StepMemory
-from infgen.model.token_step import InsertionDetails, MotionStep, PositionOutputs, TokenStep
+from infgen.model.token_step import MotionStep, PositionOutputs, TokenStep
 from infgen.tokens.scene_tokens import Presence
 
 

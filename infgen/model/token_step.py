@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from infgen.model.insertion import DetailQuery
 from infgen.model.logits import MotionOutputs
 from infgen.tokens.scene_tokens import Presence
 
@@ -133,26 +132,3 @@ class PositionOutputs:
             own, new = getattr(self, each.name), getattr(others, each.name)
             if own is not None:
                 own.index_copy_(0, rollouts, new)
-
-
-@dataclass(frozen=True, slots=True)
-class InsertionDetails:
-    """Details of an inserted agent: sample a type, then take its row of the others.
-
-    Attributes:
-        agent_type_logits: ``AgentType`` given the cell.
-        size_lwh_m: Box, given the agent type.
-        heading_logits: Heading bin relative to the ego, given the agent type ...
-        turned_rad: ... or the heading itself, relative to the ego.
-        offset_m: Position less the cell's centre, in the ego's grid frame, given the agent
-            type; None where the place was known already.
-        query: Where the offset is sampled, and the heading given the offset, neither is
-            here: they are queried by this.
-    """
-
-    agent_type_logits: Float32[Tensor, "rollout agent_type"]
-    size_lwh_m: Float32[Tensor, "rollout agent_type 3"]
-    heading_logits: Float32[Tensor, "rollout agent_type heading"] | None
-    turned_rad: Float32[Tensor, "rollout agent_type"] | None
-    offset_m: Float32[Tensor, "rollout agent_type 2"] | None
-    query: DetailQuery | None = None

@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
+from infgen.model.insertion import InsertionDetails
 from infgen.model.step_memory import Insertions, StepMemory
-from infgen.model.token_step import InsertionDetails, PositionOutputs
+from infgen.model.token_step import PositionOutputs
 from infgen.rollout.insertion_state import (
     TURN_PURPOSES,
     InsertionRequest,

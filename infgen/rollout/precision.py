@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from infgen.model.batching.tensors import in_float32
+from infgen.model.insertion import InsertionDetails
 from infgen.model.neighbours import MapFeatures
 from infgen.model.network import Network
 from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.stepping import Stepper
-from infgen.model.token_step import InsertionDetails, MotionStep, PositionOutputs
+from infgen.model.token_step import MotionStep, PositionOutputs
 
 Precision = Literal["auto", "float32", "bf16"]
 

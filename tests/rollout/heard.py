@@ -14,9 +14,10 @@ from torch import Tensor
 from infgen.model.agents import KINDS
 from infgen.model.batching.batch import Agents, Batch, Details, Insertions, collate_maps
 from infgen.model.batching.insertion_targets import OUTSIDE
+from infgen.model.insertion import InsertionDetails
 from infgen.model.logits import DetailOutputs, InsertionOutputs, MotionOutputs
 from infgen.model.stepping import Stepper
-from infgen.model.token_step import InsertionDetails, MotionStep, PositionOutputs, TokenStep
+from infgen.model.token_step import MotionStep, PositionOutputs, TokenStep
 from infgen.rollout.population import place_logged_agents
 from infgen.rollout.recording import NO_AGENT
 from infgen.rollout.session import Session

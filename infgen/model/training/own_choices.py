@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from infgen.model.insertion import InsertionDetails
 from infgen.model.neighbours import cell_pose
 from infgen.model.network import EGO
 from infgen.model.relations import wrap_angle
 from infgen.model.step_memory import Insertions
 from infgen.model.stepping import Stepper
-from infgen.model.token_step import InsertionDetails, PositionOutputs
+from infgen.model.token_step import PositionOutputs
 from infgen.tokens.grid import Grid, encode_cell
 
 INSIDE = 0.999
