@@ -9,7 +9,8 @@ how many one had been inserted, in how many one stood (slower than 0.5 m/s) when
 and between which types; and how long they lasted. Pairs that overlap from now on count.
 The second has vehicles every 5 s: how far from the middle of the nearest lane, and at which
 angle to it, those stand and drive that were inserted, and all others. A vehicle between
-0.75 and 1.75 m stands neither in a lane nor beside the road, and is driven into. The last
+0.75 and 1.75 m stands neither in a lane nor beside the road, and is driven into. "Against"
+is the share of those in a lane (1 m) that no lane there leads the way they face. The last
 line is one JSON object.
 """
 
@@ -24,12 +25,11 @@ from typing import Any
 
 import numpy as np
 
-from infgen.geometry import boxes_overlap
+from infgen.geometry import boxes_overlap, wrap_angle
 from infgen.metrics.kinematics import speed
 from infgen.metrics.traffic import Traffic, from_rollout, observe_log
 from infgen.rollout.rules.off_road import Lanes, lane_segments
 from infgen.scene import AgentType
-from infgen.spatial.nearest import nearest_by_cells
 from infgen.spatial.road_edges import project
 from pipeline.commands.screen import show_table
 from pipeline.storage.rollouts import read_rollouts
@@ -42,9 +42,15 @@ EVERY_STEPS = 50
 NEAR_LANE_M = 6.0
 """Vehicles farther from every lane are left out of the second table."""
 BETWEEN_M = (0.75, 1.75)
+IN_LANE_M = 1.0
+ALONG_RAD = np.radians(45)
+"""A lane leads the way of a vehicle if they are no farther turned from each other."""
 NAMES = ("vehicles", "pedestrians", "cyclists")
 COLUMNS = ("contacts", "one inserted", "one stands", "both stand", "both move")
-WHERE = ("vehicles", "0.75 to 1.75 m", "median, m", "90 %, m", "median angle", "90 %")
+WHERE = (
+    *("vehicles", "0.75 to 1.75 m", "against", "median, m", "90 %, m"),
+    *("median angle", "90 %"),
+)
 
 
 @dataclass(slots=True)
@@ -55,8 +61,8 @@ class Side:
         count: How many.
         kinds: Contacts by kind.
         lasted_s: Duration of each contact.
-        beside: Distance from and angle to the nearest lane of vehicles, in metres and
-            degrees, by where they come from and whether they stand.
+        beside: What ``beside_lanes`` tells of vehicles, by where they come from and
+            whether they stand.
     """
 
     count: int = 0
@@ -113,20 +119,28 @@ def overlaps(traffic: Traffic, step: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def beside_lanes(traffic: Traffic, rows: np.ndarray, step: int, lanes: Lanes) -> np.ndarray:
-    """Distance from the nearest lane, in metres, and angle to it, in degrees [row, 2]."""
+    """Tell where vehicles are to lanes, but for those far from all of them [row, 3].
+
+    Distance from the nearest lane in metres; angle to it, either way, in degrees; distance
+    from the nearest one that leads their way.
+    """
     start_m, along_m = lanes
     motion = traffic.motion
     points_m = np.zeros((len(rows), 3), dtype=np.float32)
     points_m[:, 0], points_m[:, 1] = motion.x_m[0, rows, step], motion.y_m[0, rows, step]
     if not len(rows) or not len(start_m):
-        return np.zeros((0, 2))
-    nearest = nearest_by_cells(points_m, start_m, along_m)
-    way_m, away_m = along_m[nearest, :2], (points_m - start_m[nearest])[:, :2]
+        return np.zeros((0, 3))
+    away_m = (points_m[:, None] - start_m)[..., :2]  # [row, segment, 2]
+    way_m = np.broadcast_to(along_m[:, :2], away_m.shape)
     share = np.clip(project(away_m, way_m), 0, 1)
-    distance_m = np.linalg.norm(away_m - share[:, None] * way_m, axis=1)
-    turned_rad = motion.heading_rad[0, rows, step] - np.arctan2(way_m[:, 1], way_m[:, 0])
-    angle_deg = np.degrees(np.abs((turned_rad + np.pi / 2) % np.pi - np.pi / 2))
-    return np.stack([distance_m, angle_deg], axis=1)[distance_m < NEAR_LANE_M]
+    distance_m = np.linalg.norm(away_m - share[..., None] * way_m, axis=2)
+    lane_rad = np.arctan2(along_m[:, 1], along_m[:, 0])
+    turned_rad = np.abs(wrap_angle(motion.heading_rad[0, rows, step, None] - lane_rad))
+    same_way_m = np.where(turned_rad < ALONG_RAD, distance_m, np.inf).min(axis=1)
+    at = np.arange(len(rows)), distance_m.argmin(axis=1)
+    either_way_rad = np.minimum(turned_rad, np.pi - turned_rad)[at]
+    told = np.stack([distance_m[at], np.degrees(either_way_rad), same_way_m], axis=1)
+    return told[distance_m[at] < NEAR_LANE_M]
 
 
 def measure(root: Path, count: int) -> tuple[Side, Side]:
@@ -178,10 +192,11 @@ def report(logs: Side, played: Side) -> dict[str, Any]:
 
 
 def _spread(values: np.ndarray) -> dict[str, float]:
-    distance_m, angle_deg = values.T
+    distance_m, angle_deg, same_way_m = values.T
+    against = (same_way_m > IN_LANE_M)[distance_m < IN_LANE_M]
     between = (distance_m >= BETWEEN_M[0]) & (distance_m < BETWEEN_M[1])
     quantiles = (np.quantile(each, (0.5, 0.9)) for each in (distance_m, angle_deg))
-    told = [len(values), between.mean(), *np.concatenate(list(quantiles))]
+    told = [len(values), between.mean(), against.mean(), *np.concatenate(list(quantiles))]
     return dict(zip(WHERE, map(float, told), strict=True))
 
 
