@@ -31,6 +31,7 @@ class SceneWindow:
         after: Token steps that the log goes on for afterwards.
         label: The motion token to learn for each token: ``motion_token`` until agents are
             led astray.
+        off: Where they have been: not at the pose that the log has.
         roads: Rows of the record's map tokens that are kept, ascending.
         shown: ``SignalClass`` of each of the record's lights at each token's end, or what
             it showed when it was last looked at, ``REMEMBERED``.
@@ -53,6 +54,7 @@ class SceneWindow:
     label: Int16[np.ndarray, "agent token"]
     presence: Int8[np.ndarray, "agent token"]
     observed: Bool[np.ndarray, "agent token"]
+    off: Bool[np.ndarray, "agent token"]
     pattern: UInt8[np.ndarray, "agent token"]
     cell: Int16[np.ndarray, "agent token"]
     entry_row: Int64[np.ndarray, " entry"]
@@ -89,6 +91,7 @@ def cut_window(
         label=motion_token[rows],
         presence=presence[rows],
         observed=observed[rows],
+        off=np.zeros_like(observed[rows]),
         pattern=np.where(presence == Presence.ABSENT, np.uint8(0), pattern)[rows],
         cell=record.cell[rows, start:stop],
         entry_row=row_of[record.insertion_agent[kept]],
@@ -137,6 +140,7 @@ def _astray(window: SceneWindow, strays: PerturbedMotion, grid: Grid) -> SceneWi
         pose=strays.pose,
         motion_token=strays.motion_token,
         label=strays.label,
+        off=strays.off,
         cell=cell,
         insertion_cell=cell[window.entry_row, window.insertion_token],
     )

@@ -65,15 +65,20 @@ def insertion_arrays(window: SceneWindow, turn: np.ndarray, limit: int) -> Array
 def detail_arrays(
     window: SceneWindow, entries: Arrays, grid: Grid, random: np.random.Generator
 ) -> Arrays:
-    """Return inserted agents in order, then pseudo-insertions."""
+    """Return inserted agents in order, then pseudo-insertions.
+
+    Agents that were led astray would teach places where none is inserted.
+    """
     token, turn = np.nonzero(entries["agent"] >= 0)
     row = entries["agent"][token, turn]
     there = (window.presence == Presence.PRESENT) & window.observed
     there &= window.cell != NO_CELL
     there[0], there[:, 0] = False, False
     players = np.argwhere(there)  # [player, (agent, token)]
-    few = min(len(players), PSEUDO_PER_TOKEN * (there.shape[1] - 1))
-    players = players[np.sort(random.permutation(len(players))[:few])]
+    order = random.permutation(len(players))  # Of all, whoever is led astray.
+    order = order[~window.off[tuple(players[order].T)]]
+    few = min(len(order), PSEUDO_PER_TOKEN * (there.shape[1] - 1))
+    players = players[np.sort(order[:few])]
 
     rows = np.concatenate([row, players[:, 0]])
     tokens = np.concatenate([token, players[:, 1]])

@@ -221,7 +221,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=9,
+    version=10,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,

@@ -221,9 +221,23 @@ def test_noise_changes_only_what_agents_do_and_where_they_are(pair):
     told = {f"Details.{name}" for name in ("cell", "heading", "offset_m", "offset")}
     told.add("Insertions.cell")
     asked = {"Details.agent", "Details.token", "Details.agent_type", "Details.size_lwh_m"}
+    asked |= {f"Details.{name}" for name in ("present", "inserted", "turn")}
     agents = {"Agents.pose", "Agents.motion_token", "Agents.label", "Agents.cell"}
     assert agents | {"Details.offset_m", "MapTokens.token"} <= changed
     assert changed <= agents | told | asked | {"MapTokens.token"}
+
+
+def test_agents_that_noise_led_astray_are_no_pseudo_insertions(pair):
+    plain, noisy = pair
+    details = noisy.details
+    pseudo = details.present & ~details.inserted
+
+    scene, place = pseudo.nonzero(as_tuple=True)
+    at = scene, details.token[scene, place], details.agent[scene, place]
+    here, logged = noisy.agents.pose[at], plain.agents.pose[at]
+
+    assert 0 < len(scene) <= (plain.details.present & ~plain.details.inserted).sum()
+    assert torch.equal(here, logged)
 
 
 def test_noise_moves_the_ego_but_nobody_who_is_absent_entering_or_unseen(pair):
