@@ -24,6 +24,8 @@ from pipeline.storage.weights import (
     load_network,
     load_vocabularies,
     read_description,
+    save_network,
+    state_dict_of,
 )
 from pipeline.storage.weights import vocabulary_fingerprint as fingerprint
 from pipeline.storage.zarr_store import write_records
@@ -118,28 +120,28 @@ def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_i
     assert len(message) < 1000
 
 
-def test_parts_without_effect_may_be_missing_in_weights_to_begin_with():
-    with_memory = dataclasses.replace(
-        load_network(builtin_weights()).settings,
-        density_features=True,
-        standing_features=True,
-    )
-    plain = load_network(builtin_weights())
-    network = Network(
-        with_memory,
-        plain.motion_vocabulary(),
-        plain.map_vocabulary(),
-        plain.grid_settings,
-    )
+ADDED = {"density_features": True, "standing_features": True, "offset_token": True}
 
-    copy_weights(network, builtin_weights())
 
-    parameters = dict(network.named_parameters())
-    for name, parameter in plain.named_parameters():
-        assert torch.equal(parameters.pop(name), parameter), name
+def test_added_parts_may_be_missing_in_weights_to_begin_with(tmp_path):
+    builtin = load_network(builtin_weights())
+    vocabularies = builtin.motion_vocabulary(), builtin.map_vocabulary()
+    without = dataclasses.replace(builtin.settings, **dict.fromkeys(ADDED, False))
+    plain = Network(without, *vocabularies, builtin.grid_settings)
+    save_network(tmp_path, plain, state_dict_of(plain), step=0)
+    every = dataclasses.replace(without, **ADDED)
+    network = Network(every, *vocabularies, builtin.grid_settings)
+
+    copy_weights(network, tmp_path)
+
+    found, own = dict(network.named_parameters()), dict(plain.named_parameters())
     parts = tuple(network.added_parts())
-    assert len(parts) == 3
-    assert all(name.startswith(parts) for name in parameters)
+    assert len(parts) == 5
+    added = found.keys() - own.keys()
+    assert added
+    assert all(name.startswith(parts) for name in added)
+    for name in found.keys() & own.keys():
+        assert torch.equal(found[name], own[name]), name
 
 
 def test_vocabularies_are_those_of_the_weights_and_measured_on_the_records(tmp_path, drive):
