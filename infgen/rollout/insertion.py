@@ -257,19 +257,23 @@ def sample_offset_and_heading(
         metres, or None; and the heading: relative to the ego if ``details.turned_rad`` is
         there, else its bin.
     """
-    query, logits = details.query, details.heading_logits
+    settings, query, logits = simulator.settings, details.query, details.heading_logits
     offset = None if details.offset_m is None else of_type(details.offset_m, agent_type)
     if query is not None:
         said = query.offset_logits(agent_type)
-        offset = choose(said, uniforms(Purpose.OFFSET))
+        offset = choose(said, uniforms(Purpose.OFFSET), nucleus=settings.offset_top_p)
         by_type = query.heading_logits(agent_type, offset)
     elif logits is not None:
         by_type = of_type(logits, agent_type)
     else:
         assert details.turned_rad is not None
         return offset, of_type(details.turned_rad, agent_type)
-    temperature = simulator.settings.heading_temperature
-    heading = choose(by_type, uniforms(Purpose.HEADING), temperature=temperature)
+    heading = choose(
+        by_type,
+        uniforms(Purpose.HEADING),
+        nucleus=settings.heading_top_p,
+        temperature=settings.heading_temperature,
+    )
     return offset, heading
 
 

@@ -120,6 +120,11 @@ class RolloutSettings:
     each and keep their probability, so that an agent that seldom sets off still does."""
     position_top_p: Nucleus = 1.0
     """The same for position tokens."""
+    offset_top_p: Nucleus = 1.0
+    """The same for offset tokens (`model.offset_token`). What is beyond the nucleus lies
+    between the lane and the kerb, where none stands."""
+    heading_top_p: Nucleus = 1.0
+    """The same for heading tokens."""
     rules: RuleName = "none"
     """Rules over the network's choices. `none`: what it samples is simulated. `safe`:
     agents avoid collisions, stay on the road, do not stall, keep their number, and are
