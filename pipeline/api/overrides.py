@@ -30,6 +30,8 @@ class RolloutOverrides(TypedDict, total=False):
     position_top_k: int
     motion_top_p: float
     position_top_p: float
+    offset_top_p: float
+    heading_top_p: float
     rules: RuleName
     max_motion_samples: int | None
     reject_off_road: bool | None

@@ -43,6 +43,8 @@ OF_ENTRIES = (
     "max_insertions",
     "position_top_k",
     "position_top_p",
+    "offset_top_p",
+    "heading_top_p",
     "position_temperature",
     "heading_temperature",
 )

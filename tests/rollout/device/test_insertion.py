@@ -21,7 +21,10 @@ VARIANTS = {
     "density control": ({}, only(**MASK, density_control=2.0)),
     "regressed positions": ({"position_token": False}, {}),
     "regressed headings": ({"heading_token": False}, {"position_top_p": 0.9}),
-    "offset tokens": ({"offset_token": True, "cell_feature_width": 8}, {}),
+    "offset tokens": (
+        {"offset_token": True, "cell_feature_width": 8},
+        {"offset_top_p": 0.5, "heading_top_p": 0.9},
+    ),
     "features": ({"cell_feature_width": 8, "ego_embedding": True}, {}),
     "rotary": ({"relations": "rotary", "cell_feature_width": 8}, {}),
 }
