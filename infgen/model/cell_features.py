@@ -202,7 +202,7 @@ class OffsetFeatures(nn.Module):
     """Logits of the offset bins of a cell, given the agent type.
 
     Each map token around has a say by how far a bin is to its side: the middle of a lane,
-    the kerb. What it says depends on the token and on the query.
+    the road edge. What it says depends on the token and on the query.
     """
 
     offset_m: Tensor

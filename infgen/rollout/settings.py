@@ -122,7 +122,7 @@ class RolloutSettings:
     """The same for position tokens."""
     offset_top_p: Nucleus = 1.0
     """The same for offset tokens (`model.offset_token`). What is beyond the nucleus lies
-    between the lane and the kerb, where none stands."""
+    between the lane and the road edge, where none stands."""
     heading_top_p: Nucleus = 1.0
     """The same for heading tokens."""
     rules: RuleName = "none"

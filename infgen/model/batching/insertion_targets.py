@@ -75,7 +75,8 @@ def detail_arrays(
     there &= window.cell != NO_CELL
     there[0], there[:, 0] = False, False
     players = np.argwhere(there)  # [player, (agent, token)]
-    order = random.permutation(len(players))  # Of all, whoever is led astray.
+    # Of all of them, so that noise changes no other draw.
+    order = random.permutation(len(players))
     order = order[~window.off[tuple(players[order].T)]]
     few = min(len(order), PSEUDO_PER_TOKEN * (there.shape[1] - 1))
     players = players[np.sort(order[:few])]
