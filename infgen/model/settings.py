@@ -80,7 +80,7 @@ class ModelSettings:
     offset_token: Bool = False
     """Whether the offset of an inserted agent within its cell is one of 144 bins of 0.25 m,
     and its heading is sampled given that. Otherwise the offset is regressed, as in the
-    reference: to the middle of a lane and the road edge where both are in one cell of 3 m."""
+    reference: to between a lane and the road edge where both are in one cell of 3 m."""
     validity_pattern_tokens: Bool = False
     """Whether the network predicts at which steps of the next token step a log would show
     the agent: detections flicker."""
