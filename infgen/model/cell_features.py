@@ -30,6 +30,8 @@ BIN_REACH = 2
 LATERAL_REACH_M = 4.0
 LATERAL_STEP_M = 0.25
 """Lateral offsets from a map token are told apart so finely, so far on either side."""
+LAST_SHARE = 1e-4
+"""Of a step: so far from the last lateral offset, one further is always there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,12 +151,19 @@ class HeadingFeatures(nn.Module):
         self.beside = nn.Conv1d(cell_feature_width, cell_feature_width, size, bias=False)
         self.say = nn.Conv1d(cell_feature_width, 1, size, bias=False)
 
-    def forward(self, x: Tensor, pose: Tensor, roads: CellSources) -> Tensor:
-        """Say how much queries [N, ..., D] at poses [N, 3] are for each heading."""
+    def forward(
+        self, x: Tensor, pose: Tensor, roads: CellSources, offset_m: Tensor | None = None
+    ) -> Tensor:
+        """Say how much queries [N, ..., D] at poses [N, 3] are for each heading.
+
+        With ``offset_m`` [N, 2] they are that far from these poses, in their grid frames.
+        """
         queries = x.flatten(1, -2) if x.dim() > 2 else x[:, None]  # [N, S, D]
-        road = gather(self.road(roads.features), roads.row) + self.apart(
-            grid_place(roads.pose, pose[:, None]) / ROAD_MIDDLE_M
-        )
+        place_m = grid_place(roads.pose, pose[:, None])
+        if offset_m is not None:
+            place_m = place_m - offset_m[:, None]
+        road = gather(self.road(roads.features), roads.row)
+        road = road + self.apart(place_m / ROAD_MIDDLE_M)
         features = functional.relu(road[:, None] + self.asked(queries)[:, :, None])
         features = features * roads.present[:, None, :, None]  # [N, S, K, C]
         turned_rad = wrap_angle(roads.pose[..., 2] - pose[:, None, 2])
@@ -245,30 +254,31 @@ class OffsetFeatures(nn.Module):
         assert self.lateral is not None
         assert self.say is not None
         turned_rad = roads.pose[..., 2] - pose[:, None, 2]
-        features = gather(self.road(roads.features), roads.row)
-        features = features + self.turned(_unit(turned_rad))
+        along = _unit(turned_rad)
+        features = gather(self.road(roads.features), roads.row) + self.turned(along)
         features = features + self.asked(x)[:, None]  # [N, K, C]
         said = functional.relu(features[:, :, None] + self.lateral.weight)
         profile = self.say(said)[..., 0]  # [N, K, lateral]
-        return logits + self._along(profile, turned_rad, pose, roads)
+        return logits + self._along(profile, along, pose, roads)
 
     def _along(
-        self, profile: Tensor, turned_rad: Tensor, pose: Tensor, roads: CellSources
+        self, profile: Tensor, along: Tensor, pose: Tensor, roads: CellSources
     ) -> Tensor:
-        """Add up what the map tokens say of the bins beside them [N, offset]."""
+        """Add up what the map tokens say of the bins beside them [N, offset].
+
+        ``along`` is their direction, from where the query faces [N, K, 2].
+        """
         first_m = grid_place(roads.pose, pose[:, None])
         away_m = self.offset_m - first_m[:, :, None]  # [N, K, offset, 2]
-        sin, cos = turned_rad.sin()[..., None], turned_rad.cos()[..., None]
+        cos, sin = along[..., None].unbind(-2)
         x_m, y_m = away_m.unbind(-1)
         along_m, left_m = cos * y_m - sin * x_m, -cos * x_m - sin * y_m
         at = (left_m + LATERAL_REACH_M) / LATERAL_STEP_M
-        at = at.clamp(0, self.steps)
-        lower = at.floor().clamp(max=self.steps - 1)
+        at = at.clamp(0, self.steps - LAST_SHARE)
+        lower = at.floor()
         share, lower = at - lower, lower.long()
-        said = profile.gather(2, lower) * (1 - share)
-        said = said + profile.gather(2, lower + 1) * share
-        beyond_m = (along_m - ROAD_MIDDLE_M).abs() - ROAD_MIDDLE_M
-        beside = (1 - beyond_m / ROAD_MIDDLE_M).clamp(0, 1)
+        said = torch.lerp(profile.gather(2, lower), profile.gather(2, lower + 1), share)
+        beside = (2 - (along_m / ROAD_MIDDLE_M - 1).abs()).clamp(0, 1)
         return (said * beside * roads.present[..., None]).sum(dim=1)
 
 

@@ -27,7 +27,7 @@ from infgen.model.layers import (
 )
 from infgen.model.logits import DetailOutputs, InsertionOutputs
 from infgen.model.long_memory import Density, DensityFeatures
-from infgen.model.neighbours import NeighbourSpec, cell_pose
+from infgen.model.neighbours import NeighbourSpec
 from infgen.model.relations import Rows, relation_embedding
 from infgen.model.settings import ModelSettings
 from infgen.tokens.grid import Grid
@@ -256,11 +256,11 @@ class DetailStack(nn.Module):
         """
         assert self.given_offset is not None
         assert self.heading is not None
-        offset_m = self.given_offset.offset_m[offset]
         given = x + self.given_kind(agent_type) + self.given_offset(offset)
         logits: Tensor = self.heading(given)
         if self.bearings is not None:
-            logits = logits + self.bearings(given, cell_pose(pose, offset_m), roads)
+            offset_m = self.given_offset.offset_m[offset]
+            logits = logits + self.bearings(given, pose, roads, offset_m)
         return logits
 
     def answer(

@@ -2,7 +2,8 @@
 
 The most kernels and waits of one token step of three rollouts; to be lowered, never raised.
 (Density and standing features, which the package's weights have since 2026-11-24, launch 76
-of them; without these there were 645, 3,008 and 3,150.)
+of them; without these there were 645, 3,008 and 3,150. Offset tokens, which they have since
+2026-11-25, launch 78; without these there were 3,202 and 3,344.)
 A pass of insertion launches all its kernels, also for rollouts that are done: it could be
 captured as a graph, and so is one launch and one wait.
 """
@@ -11,8 +12,8 @@ import pytest
 
 MOST = {
     ("motion-only", "mask"): (721, 1),
-    ("long", "mask"): (3202, 3),
-    ("long", "rules"): (3344, 10),
+    ("long", "mask"): (3280, 3),
+    ("long", "rules"): (3422, 10),
 }
 
 
