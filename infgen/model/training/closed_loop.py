@@ -12,6 +12,7 @@ Where the log says an agent is means its quantised pose, as batches hold it.
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -195,7 +196,7 @@ def _tell_details(details: Details, agents: Agents, off: Tensor, grid: Grid) -> 
     told = describe(
         pose.numpy(force=True), ego_pose.numpy(force=True), cell.numpy(force=True), grid
     )
-    heading, offset = (torch.from_numpy(bins).to(cell) for bins in told[::2])
+    heading, offset = torch.from_numpy(np.stack(told[::2])).to(cell)
     offset_m = torch.from_numpy(told[1]).to(pose)
     return replace(
         details,

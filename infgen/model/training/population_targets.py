@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -131,7 +132,7 @@ def describe_details(details: Details, agents: Agents, grid: Grid) -> Details:
         details.cell.numpy(force=True),
         grid,
     )
-    heading, offset = (torch.from_numpy(bins).to(details.heading) for bins in told[::2])
+    heading, offset = torch.from_numpy(np.stack(told[::2])).to(details.heading)
     offset_m = torch.from_numpy(told[1]).to(details.offset_m)
     return replace(
         details,

@@ -100,8 +100,11 @@ class OptimizerStep:
         for parameter, own in zip(parameters, self._own, strict=True):
             parameter.grad = own
         factors = [settings.loss_weight(name) for name in TERMS]
-        # Filled one by one, as the host would wait for a copy.
-        self._factors = torch.stack([parameters[0].new_full((), x) for x in factors])
+        # Filled, most of them at once, as the host would wait for a copy.
+        self._factors = parameters[0].new_ones(len(factors))
+        for at, factor in enumerate(factors):
+            if factor != 1:
+                self._factors[at] = factor
         self._on_cpu = self._sums.device.type == "cpu"
 
     def step(
