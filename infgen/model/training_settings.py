@@ -168,6 +168,9 @@ class TrainSettings:
     speed_penalty: NonNegative = 0.05
     """Cost, for each token step, of a metre per second by which the speed of a vehicle is
     farther from the log's than from that of the other rollouts."""
+    ego_speed_penalty: NonNegative = 0.05
+    """The same of the ego, in place of `speed_penalty`: it is one of many vehicles, most of
+    which stand."""
     agent_type_penalty: NonNegative = 1.0
     """Cost of the type of an inserted agent: its share among the other inserted ones less
     that among those that the scene's log inserts."""

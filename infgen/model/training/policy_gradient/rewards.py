@@ -26,6 +26,7 @@ from torch import Tensor
 
 from infgen.geometry import boxes_overlap, to_local, to_world
 from infgen.model.batching.batch import Agents
+from infgen.model.network import EGO
 from infgen.model.training.policy_gradient.energy import energy_by_agent
 from infgen.model.training.policy_gradient.placement import placement_costs
 from infgen.model.training.policy_gradient.population import count_costs
@@ -71,12 +72,14 @@ class Costs:
 
     def reward(self, settings: TrainSettings) -> Float32[Tensor, "rollout token agent"]:
         """Weigh the costs of an agent but that of its type."""
+        speed = settings.speed_penalty * self.speed
+        speed[..., EGO] = settings.ego_speed_penalty * self.speed[..., EGO]
         return -(
             settings.overlap_penalty * self.overlap.float()
             + settings.off_road_penalty * self.off_road.float()
             + settings.log_distance_penalty * self.log_distance
             + settings.placement_penalty * self.placement
-            + settings.speed_penalty * self.speed
+            + speed
         )
 
 

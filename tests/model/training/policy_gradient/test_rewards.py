@@ -180,6 +180,7 @@ def test_costs_are_weighed_by_the_settings():
         log_distance_penalty=0.5,
         placement_penalty=2,
         speed_penalty=0.1,
+        ego_speed_penalty=0.2,
     )
 
     costs = Costs(
@@ -194,4 +195,4 @@ def test_costs_are_weighed_by_the_settings():
     )
     reward = costs.reward(how)
 
-    assert reward.tolist() == [[[-14.0, 0.5]]]
+    assert reward.tolist() == [[[-16.0, 0.5]]]  # The first agent is the ego.

@@ -121,6 +121,7 @@ def test_no_step_is_done_where_nothing_is_better_than_anything_else(tuned, books
         overlap_penalty=0,
         placement_penalty=0,
         speed_penalty=0,
+        ego_speed_penalty=0,
         agent_type_penalty=0,
         count_penalty=0,
         off_road_penalty=0,
