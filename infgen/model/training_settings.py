@@ -152,6 +152,9 @@ class TrainSettings:
     policy_top_p: Nucleus = 0.9
     """Motion tokens of these rollouts are sampled from the nucleus, as with
     `rollout.motion_top_p`; 1 for all."""
+    policy_insertion_mask: Bool = False
+    """Agents of these rollouts are inserted at free positions only, as by the rule
+    `insertion_mask` of rollouts but for its distance to lanes."""
     policy_discount: Share = 0.9
     """Factor on rewards for each token step that they come later."""
     overlap_penalty: NonNegative = 1.0

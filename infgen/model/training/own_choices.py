@@ -1,7 +1,7 @@
 """What a network chooses while scenes are simulated to be learned from."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -70,6 +70,10 @@ class InsertedAgent:
     pose: Tensor
     agent_type: Tensor
     size_lwh_m: Tensor
+
+    def take(self, rollouts: Tensor) -> "InsertedAgent":
+        """Go on with some rollouts only."""
+        return InsertedAgent(*(getattr(self, each.name)[rollouts] for each in fields(self)))
 
 
 def sample_agent(

@@ -18,7 +18,7 @@ from infgen.model.network import EGO, Network
 from infgen.model.relations import Rows
 from infgen.model.step_memory import Insertions as StepInsertions
 from infgen.model.stepping import Stepper
-from infgen.model.token_step import TokenStep
+from infgen.model.token_step import PositionOutputs, TokenStep
 from infgen.model.training.closed_loop import token_step_at
 from infgen.model.training.nearest_tokens import MotionTokenEnds, to_world
 from infgen.model.training.own_choices import InsertedAgent, UniformNumbers, sample_agent
@@ -114,13 +114,24 @@ class Simulation(ABC):
                 return
             active, query = active[places], query.take(places)
             entries, following = entries.take(places), following.take(places)
-            invented = sample_agent(
-                self.stepper, entries, query, self.uniforms, self.network.grid
-            )
+            invented, free = self.sample_agent(token, active, entries, query)
+            if free is not None and not free.all():
+                places = free.nonzero()[:, 0]
+                if not len(places):
+                    return
+                active, invented = active[places], invented.take(places)
+                entries, following = entries.take(places), following.take(places)
             at = active, following.row
             self._place(token, turn, at, following.logged, invented)
             self.is_inserted(token, turn, at)
             entries = self._show(entries, token, at)
+
+    def sample_agent(
+        self, token: int, active: Tensor, entries: StepInsertions, query: PositionOutputs
+    ) -> tuple[InsertedAgent, Tensor | None]:
+        """Sample agents for the scenes ``active``, and tell which may be inserted (all)."""
+        grid = self.network.grid
+        return sample_agent(self.stepper, entries, query, self.uniforms, grid), None
 
     def token_step(self, token: int) -> TokenStep:
         """Take the agents of one token step."""

@@ -58,7 +58,8 @@ def simulate_lessons(
         seed: Of everything that is sampled.
     """
     group, top_p = settings.policy_gradient_rollouts, settings.policy_top_p
-    rollouts = simulate_rollouts(network, batch, group, top_p, seed)
+    mask = settings.policy_insertion_mask
+    rollouts = simulate_rollouts(network, batch, group, top_p, seed, mask)
     roads = read_roads(batch.roads, network.map_vocabulary())
     costs = find_costs(rollouts, network.motion_vocabulary(), roads)
     reward = costs.reward(settings)

@@ -15,7 +15,13 @@ from torch import Tensor
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.batching.tensors import map_tensors
 from infgen.model.network import Network
-from infgen.model.token_step import MotionStep
+from infgen.model.step_memory import Insertions
+from infgen.model.token_step import MotionStep, PositionOutputs
+from infgen.model.training.own_choices import InsertedAgent
+from infgen.model.training.policy_gradient.insertion_mask import (
+    find_free,
+    sample_free_agent,
+)
 from infgen.model.training.policy_gradient.nucleus import log_probabilities, sample
 from infgen.model.training.population_targets import (
     describe_details,
@@ -76,7 +82,12 @@ class SimulatedRollouts:
 
 @torch.no_grad()
 def simulate_rollouts(
-    network: Network, batch: Batch, count: int, top_p: float, seed: int
+    network: Network,
+    batch: Batch,
+    count: int,
+    top_p: float,
+    seed: int,
+    insertion_mask: bool = False,
 ) -> SimulatedRollouts:
     """Simulate rollouts of every scene of a batch.
 
@@ -86,10 +97,11 @@ def simulate_rollouts(
         count: Rollouts of each scene.
         top_p: Share of the probability that motion tokens are sampled from.
         seed: Of everything that is sampled.
+        insertion_mask: Whether agents are inserted at free positions only.
     """
     learning = network.training
     try:
-        simulation = _FreeSimulation(network, batch, count, top_p, seed)
+        simulation = _FreeSimulation(network, batch, count, top_p, seed, insertion_mask)
         for token in range(1, simulation.logged.pose.shape[1]):
             simulation.move(token)
             simulation.insert(token)
@@ -103,6 +115,7 @@ class _FreeSimulation(Simulation):
 
     Attributes:
         top_p: Share of the probability that motion tokens are sampled from.
+        end_pose: End poses of motion tokens, for the insertion mask; None without.
         stationary: Motion tokens that stand still, by agent type.
         goes_on: Token steps that the log has [rollout, token].
         moved: Agents whose motion token was sampled [rollout, token, agent].
@@ -113,15 +126,23 @@ class _FreeSimulation(Simulation):
     """
 
     def __init__(
-        self, network: Network, batch: Batch, count: int, top_p: float, seed: int
+        self,
+        network: Network,
+        batch: Batch,
+        count: int,
+        top_p: float,
+        seed: int,
+        insertion_mask: bool,
     ) -> None:
         """Begin with the history as logged."""
         super().__init__(network, batch, seed, count)
         logged, last = self.logged, min(HISTORY_TOKENS, self.logged.pose.shape[1]) - 1
         presence = logged.presence[:, last]
         stays = (presence == PRESENT) | (presence == INSERTED)
-        stationary = network.motion_vocabulary().stationary
+        vocabulary = network.motion_vocabulary()
+        stationary = vocabulary.stationary
         self.top_p = top_p
+        self.end_pose = vocabulary.end_pose if insertion_mask else None
         self.stationary = torch.from_numpy(stationary).to(presence.device)
         self.goes_on = _until_the_last(logged.visible.any(dim=2))
         self.moved = torch.zeros_like(logged.observed)
@@ -156,6 +177,21 @@ class _FreeSimulation(Simulation):
         row = self.vacant[active, used.clamp(max=last)]
         none = torch.zeros_like(row, dtype=torch.bool)
         return NextInsertions(row, none, used < self.room[active])
+
+    def sample_agent(
+        self, token: int, active: Tensor, entries: Insertions, query: PositionOutputs
+    ) -> tuple[InsertedAgent, Tensor | None]:
+        """Sample agents, at free positions if there is an insertion mask."""
+        end_pose = self.end_pose
+        if end_pose is None:
+            return super().sample_agent(token, active, entries, query)
+
+        def is_free(agent: InsertedAgent, places: Tensor) -> Tensor:
+            return find_free(self.played, token, active[places], agent, end_pose)
+
+        return sample_free_agent(
+            self.stepper, entries, query, self.uniforms, self.network.grid, is_free
+        )
 
     def is_inserted(self, token: int, turn: int, at: tuple[Tensor, Tensor]) -> None:
         """Write down the turn."""

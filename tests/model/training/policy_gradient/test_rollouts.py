@@ -2,16 +2,23 @@
 
 from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
+from infgen.geometry import boxes_overlap
 from infgen.model.batching.batch import collate
+from infgen.model.batching.tensors import map_tensors
+from infgen.model.training.own_choices import InsertedAgent
+from infgen.model.training.policy_gradient.insertion_mask import find_free
 from infgen.model.training.policy_gradient.nucleus import log_probabilities
 from infgen.model.training.policy_gradient.rollouts import (
     HISTORY_TOKENS,
     simulate_rollouts,
 )
-from infgen.tokens.scene_tokens import Presence
+from infgen.scene import AgentType
+from infgen.tokens.scene_tokens import FIRST_MOTION_TOKEN, Presence
 
 EGO, COUNT, TOP_P = 0, 3, 0.8
 
@@ -148,3 +155,50 @@ def test_a_scene_of_a_single_token_step_has_no_choices(new_network, record, limi
     found = simulate_rollouts(new_network(), batch, COUNT, TOP_P, 0)
 
     assert not found.moved.any()
+
+
+def test_with_an_insertion_mask_no_inserted_agent_overlaps_another(restless, logged):
+    def overlapping(mask):
+        found = simulate_rollouts(restless, logged, COUNT, TOP_P, 5, insertion_mask=mask)
+        agents, share = found.batch.agents, []
+        for rollout, token, row in found.inserted.nonzero().tolist():
+            turn = agents.turn[rollout, token]
+            before = agents.visible[rollout, token].clone()
+            before &= ~found.inserted[rollout, token] | (turn < turn[row])
+            before[row] = False
+            walks = agents.agent_type[rollout] == int(AgentType.PEDESTRIAN)
+            before &= ~(walks & walks[row])
+            pose = agents.pose[rollout, token].numpy()
+            size_lw_m = agents.size_lwh_m[rollout, :, :2].numpy()
+            own = pose[[row]], size_lw_m[[row]]
+            meets = boxes_overlap(*own, pose, size_lw_m)
+            share.append((meets & before.numpy()).any())
+        assert len(share) > 20
+        return np.mean(share)
+
+    assert overlapping(False) > 0
+    assert overlapping(True) == 0
+
+
+def test_an_agent_that_goes_on_as_it_does_makes_its_way_unfree(logged, new_network):
+    vocabulary = new_network().motion_vocabulary()
+    agents = map_tensors(logged.agents, Tensor.clone)
+    agents = replace(agents, presence=torch.zeros_like(agents.presence))
+    agents.presence[0, 0, 0] = int(Presence.PRESENT)
+    fast = int(np.argmax(vocabulary.end_pose[0, :, 0]))
+    ahead_m = float(vocabulary.end_pose[0, fast, 0])
+    agents.pose[0, 0, 0] = torch.tensor([5.0, -3.0, 0.0])
+    agents.agent_type[0, 0] = int(AgentType.VEHICLE)
+    agents.size_lwh_m[0, 0] = torch.tensor([2.0, 1.0, 1.5])
+    box = torch.tensor([[2.0, 1.0, 1.5]])
+    vehicle = torch.tensor([int(AgentType.VEHICLE)])
+    there = InsertedAgent(vehicle, torch.tensor([[5 + ahead_m, -3.0, 0.0]]), vehicle, box)
+
+    def free(motion_token):
+        agents.motion_token[0, 0, 0] = motion_token
+        found = find_free(agents, 0, torch.tensor([0]), there, vocabulary.end_pose)
+        return found.tolist()
+
+    assert ahead_m > 4
+    assert free(fast) == [False]
+    assert free(FIRST_MOTION_TOKEN) == [True]

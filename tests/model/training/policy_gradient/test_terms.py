@@ -219,6 +219,7 @@ def test_without_penalties_nothing_is_better_than_anything_else(network, logged)
         "log_distance",
         "placement",
         "speed",
+        "ego_speed",
         "agent_type",
         "count",
     )
