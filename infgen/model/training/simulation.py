@@ -115,7 +115,7 @@ class Simulation(ABC):
             active, query = active[places], query.take(places)
             entries, following = entries.take(places), following.take(places)
             invented, free = self.sample_agent(token, active, entries, query)
-            if free is not None and not free.all():
+            if free is not None and not free.all():  # The others insert no more.
                 places = free.nonzero()[:, 0]
                 if not len(places):
                     return
