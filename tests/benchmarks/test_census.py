@@ -16,9 +16,6 @@ from pipeline.storage.scenes import read_scenes
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 SMALL = ("--files", "2", "--scenes", "3", "2", "--rollouts", "3", "--seconds", "8")
 PER_UNIT = ("--scenes-per-unit", "1")
-RUN_BYTES = 40
-"""By so much the ``run.json`` of units of the same bytes may differ in size: a time of
-0.4 s is shorter than one of 0.412 s."""
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +100,6 @@ def test_two_versions_of_the_code_are_measured_on_the_same_records():
     figures = json.loads(done.stdout.splitlines()[-1])
     older, newer = figures["older"], figures["newer"]
     assert older["unit"].keys() == newer["unit"].keys() == {"ingest", "tokenize"}
-    (files, size_bytes), other = older["unit"]["tokenize"], newer["unit"]["tokenize"]
-    assert other == [files, pytest.approx(size_bytes, abs=RUN_BYTES)]
+    assert older["unit"]["tokenize"] == newer["unit"]["tokenize"]
     assert all(cpu_s > 0 for (cpu_s,) in newer["cpu_s"].values())
     assert {"status", "plan", "verify", "gc", "train, one step"} < newer["cpu_s"].keys()
