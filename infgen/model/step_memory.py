@@ -141,7 +141,7 @@ class Insertions:
     Attributes:
         token: The token step.
         rollout: Rollouts whose insertion turns go on, by their index in the batch, in
-            order [active].
+            order [active]; one that is queried at several cells is named as often.
         map: Encoded maps.
         scene: Map of each rollout.
         before: Poses [rollout, row, 3] one token step earlier ...
@@ -158,6 +158,7 @@ class Insertions:
         roads: Map tokens around the ego.
         cell_features: Features of the cells around it, if they are used
             [rollout, cell, C].
+        all_active: Whether every rollout of the batch goes on, each once.
     """
 
     token: int
@@ -174,15 +175,14 @@ class Insertions:
     within: Tensor
     roads: AttentionSources
     cell_features: Tensor | None
+    all_active: bool = True
 
     def take(self, places: Int64[Tensor, " kept"]) -> "Insertions":
-        """Go on with some of the rollouts only: nothing more is computed for the others."""
-        return replace(self, rollout=self.rollout[places])
+        """Go on with some of the rollouts only, each as often as it is named.
 
-    @property
-    def all_active(self) -> bool:
-        """Whether all rollouts of the batch go on."""
-        return len(self.rollout) == len(self.scene)
+        Nothing more is computed for the others.
+        """
+        return replace(self, rollout=self.rollout[places], all_active=False)
 
     def active(self, values: Tensor) -> Tensor:
         """Take the values [rollout, ...] of the rollouts that go on."""

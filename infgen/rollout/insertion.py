@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from infgen.model.insertion import InsertionDetails
@@ -13,18 +13,21 @@ from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.token_step import PositionOutputs
 from infgen.rollout.insertion_state import (
     TURN_PURPOSES,
+    Attempts,
     InsertionRequest,
     InsertionState,
     TurnNumbers,
 )
 from infgen.rollout.population import InsertedAgents, Population
-from infgen.rollout.random_streams import Purpose
+from infgen.rollout.random_streams import WORDS, Purpose
 from infgen.rollout.sampling import choose, sample_event
 from infgen.rollout.simulator import Simulator
 from infgen.tokens.grid import Grid, decode_heading, encode_cell
 
 INSIDE = 0.999
 """Inserted agents stay within this share of the grid radius, whatever their offsets."""
+FEW_ROLLOUTS = 16
+"""A query of so few rollouts costs as much as one of four times as many."""
 
 UniformNumbers = Callable[[Purpose], Tensor]
 
@@ -34,7 +37,8 @@ class _Turns:
     """Insertion turns of a batch: every rollout is at a turn and an attempt of its own.
 
     So no rollout waits for the rejected positions of another, and the network is queried
-    for many at once. Nothing is computed for rollouts that are done. Changes in place.
+    for many rollouts, and several attempts of each, at once. Nothing is computed for
+    rollouts that are done. Changes in place.
 
     Attributes:
         batch: All rollouts.
@@ -64,50 +68,70 @@ class _Turns:
     def advance(
         self, rollouts: Int64[np.ndarray, " active"]
     ) -> Int64[np.ndarray, " active_"]:
-        """Sample one position of every active rollout; return those that go on."""
+        """Sample positions of every active rollout; return those that go on."""
         turn, attempt = self.turn[rollouts], self.attempt[rollouts]
         self.numbers.draw(rollouts, turn, attempt)
-        numbers, fresh = self.numbers.get(rollouts, turn, attempt), attempt == 0
+        fresh = attempt == 0
         if fresh.any():
             goes_on = ~fresh
-            goes_on[fresh] = self._query(rollouts[fresh], numbers[:, fresh])
-            rollouts, numbers = rollouts[goes_on], numbers[:, goes_on]
+            goes_on[fresh] = self._query(rollouts[fresh])
+            rollouts = rollouts[goes_on]
         if not len(rollouts):
             return rollouts
-        inserted, cell = _sample_agents(self, rollouts, numbers)
+        attempts = self._attempts(rollouts)
+        inserted = _sample_agents(self, attempts)
         batch = self.batch
         mask, allowed = batch.request.insertion_mask, inserted.who
         if mask is not None:
-            allowed = mask.allows(batch.population, inserted, rollouts, batch.circles)
-        placed, rejected = rollouts[allowed], rollouts[~allowed]
+            allowed = mask.allows(
+                batch.population, inserted, attempts.rollout, batch.circles
+            )
+        taken = attempts.first(allowed)
+        placed, rejected = rollouts[taken >= 0], rollouts[taken < 0]
         if len(placed):
-            self._add(placed, inserted.take(np.flatnonzero(allowed)))
+            self._add(placed, inserted.take(taken[taken >= 0]))
         self.turn[placed] += 1
         self.attempt[placed] = 0
-        self.attempt[rejected] += 1
-        self._exclude(rejected, cell[~allowed])
+        self.attempt[rejected] += attempts.count[taken < 0]
         turns = batch.request.simulator.settings.max_insertions
         ends = (self.turn >= turns) | (self.attempt >= batch.request.attempts)
         return rollouts[~ends[rollouts]]
 
-    def positions(self, rollouts: Int64[np.ndarray, " active"]) -> PositionOutputs:
-        """Return the logits of positions of some rollouts."""
-        assert self.query is not None
-        if len(rollouts) == len(self.turn):
-            return self.query
-        return self.query.take(self.batch.request.simulator.tensor(rollouts))
+    def _attempts(self, rollouts: Int64[np.ndarray, " active"]) -> Attempts:
+        """Say which attempts are made at once: the first alone, later ones by fours.
 
-    def some_entries(self, rollouts: Int64[np.ndarray, " active"]) -> Insertions:
-        """Return the token step of some rollouts, as the network sees it."""
-        if len(rollouts) == len(self.turn):
+        The queries of the network are then fewer and larger. What is sampled is the same:
+        every attempt excludes the cells of those before it.
+        """
+        turn, attempt = self.turn[rollouts], self.attempt[rollouts]
+        left = self.batch.request.attempts - attempt
+        alone = (attempt == 0) & (len(rollouts) > FEW_ROLLOUTS)
+        count = np.minimum(np.where(alone, 1, WORDS - attempt % WORDS), left)
+        of = np.repeat(np.arange(len(rollouts)), count)
+        rank = np.arange(len(of)) - np.repeat(count.cumsum() - count, count)
+        numbers = self.numbers.get(rollouts[of], turn[of], attempt[of] + rank)
+        return Attempts(rollouts[of], count, of, rank, numbers)
+
+    def position_logits(self, rollouts: Int64[np.ndarray, " asked"]) -> Tensor:
+        """Return the logits of positions of some rollouts [asked, cell]."""
+        assert self.query is not None
+        assert self.query.position_logits is not None
+        if self._are_all(rollouts):
+            return self.query.position_logits
+        return self.query.position_logits[self.batch.request.simulator.tensor(rollouts)]
+
+    def some_entries(self, rollouts: Int64[np.ndarray, " asked"]) -> Insertions:
+        """Return the token step of some rollouts, each once or more, for the network."""
+        if self._are_all(rollouts):
             return self.entries
         return self.entries.take(self.batch.request.simulator.tensor(rollouts))
 
-    def _query(
-        self,
-        rollouts: Int64[np.ndarray, " asked"],
-        numbers: Float64[np.ndarray, "purpose asked"],
-    ) -> Bool[np.ndarray, " asked"]:
+    def _are_all(self, rollouts: Int64[np.ndarray, " asked"]) -> bool:
+        """Tell whether every rollout is asked, each once."""
+        every = len(rollouts) == len(self.turn)
+        return every and bool((rollouts == np.arange(len(rollouts))).all())
+
+    def _query(self, rollouts: Int64[np.ndarray, " asked"]) -> Bool[np.ndarray, " asked"]:
         """Ask whether one more agent is inserted; full rollouts insert none."""
         batch, request = self.batch, self.batch.request
         simulator = request.simulator
@@ -121,20 +145,13 @@ class _Turns:
         else:
             self.query.put(simulator.tensor(rollouts), query)
         bias = simulator.tensor(batch.add_bias(rollouts))
+        turn = self.turn[rollouts]
+        numbers = self.numbers.get(rollouts, turn, np.zeros_like(turn))
         uniform = simulator.tensor(numbers[TURN_PURPOSES.index(Purpose.ADD)])
         add = simulator.fetch(sample_event(query.add_logit, uniform, bias))[0]
         # A batch has as many rows as its most crowded scene needs: free rows are no limit.
         free: np.ndarray = batch.num_agents[rollouts] < request.most[rollouts]
         return free & add
-
-    def _exclude(
-        self, rollouts: Int64[np.ndarray, " rejected"], cell: Int64[np.ndarray, " rejected"]
-    ) -> None:
-        """Exclude rejected cells until the next turn."""
-        assert self.query is not None
-        logits, simulator = self.query.position_logits, self.batch.request.simulator
-        if logits is not None:
-            logits[simulator.tensor(rollouts), simulator.tensor(cell)] = -torch.inf
 
     def _add(
         self, rollouts: Int64[np.ndarray, " inserted"], inserted: InsertedAgents
@@ -173,23 +190,19 @@ def insert_agents(
     return batch.population
 
 
-def _sample_agents(
-    turns: _Turns,
-    rollouts: Int64[np.ndarray, " active"],
-    numbers: Float64[np.ndarray, "purpose active"],
-) -> tuple[InsertedAgents, Int64[np.ndarray, " active"]]:
-    """Sample cell, type, size, heading and offset; return them and the cells.
+def _sample_agents(turns: _Turns, attempts: Attempts) -> InsertedAgents:
+    """Sample cell, type, size, heading and offset of every attempt.
 
     Everything is sampled where the network is, and fetched at once.
     """
     simulator = turns.batch.request.simulator
-    grid, query = simulator.grid, turns.positions(rollouts)
+    grid = simulator.grid
 
     def uniforms(purpose: Purpose) -> Tensor:
-        return simulator.tensor(numbers[TURN_PURPOSES.index(purpose)])
+        return simulator.tensor(attempts.numbers[TURN_PURPOSES.index(purpose)])
 
-    cell, regressed_m = _sample_cell(simulator, query, uniforms)
-    entries = turns.some_entries(rollouts)
+    cell, regressed_m = _sample_cells(turns, attempts, uniforms(Purpose.CELL))
+    entries = turns.some_entries(attempts.rollout)
     details = simulator.stepper.entry_details(entries, cell, regressed_m)
     agent_type = choose(details.agent_type_logits, uniforms(Purpose.AGENT_TYPE))
     offset, heading = sample_offset_and_heading(simulator, details, agent_type, uniforms)
@@ -206,36 +219,45 @@ def _sample_agents(
         position_m = _within(position_m + offset_m, grid)
     if details.turned_rad is None:
         headings = decode_heading(headings.astype(np.int16), grid)
-    found = InsertedAgents(
+    return InsertedAgents(
         who=np.ones(len(cells), dtype=bool),
         position_m=position_m,
         turned_rad=headings,
         agent_type=types.astype(np.int8),
         size_lwh_m=sizes,
     )
-    return found, cells
 
 
-def _sample_cell(
-    simulator: Simulator,
-    query: PositionOutputs,
-    uniforms: UniformNumbers,
+def _sample_cells(
+    turns: _Turns, attempts: Attempts, uniform: Tensor
 ) -> tuple[Tensor, Tensor | None]:
-    """Sample a cell per rollout, or take those of regressed positions, returned as well."""
-    settings, grid = simulator.settings, simulator.grid
-    if query.position_logits is not None:
-        cell = choose(
-            query.position_logits,
-            uniforms(Purpose.CELL),
+    """Sample a cell per attempt, or take those of regressed positions, returned as well.
+
+    The cells are excluded until the next turn.
+    """
+    simulator = turns.batch.request.simulator
+    settings, query = simulator.settings, turns.query
+    assert query is not None
+    rollout = simulator.tensor(attempts.rollout)
+    if query.position_logits is None:
+        assert query.position_m is not None
+        asked_m = simulator.fetch(query.position_m[rollout])[0]
+        position_m = _within(asked_m, simulator.grid)
+        cells = encode_cell(position_m, simulator.grid).astype(np.int64)
+        return simulator.tensor(cells), simulator.tensor(position_m)
+    cell = torch.empty_like(rollout)
+    for places in attempts.by_rank():
+        at = simulator.tensor(places)
+        logits = turns.position_logits(attempts.rollout[places])
+        cell[at] = chosen = choose(
+            logits,
+            uniform[at],
             settings.position_top_k,
             nucleus=settings.position_top_p,
             temperature=settings.position_temperature,
         )
-        return cell, None
-    assert query.position_m is not None
-    position_m = _within(simulator.fetch(query.position_m)[0], grid)
-    cells = encode_cell(position_m, grid).astype(np.int64)
-    return simulator.tensor(cells), simulator.tensor(position_m)
+        query.position_logits[rollout[at], chosen] = -torch.inf
+    return cell, None
 
 
 def _within(position_m: np.ndarray, grid: Grid) -> np.ndarray:

@@ -1,5 +1,6 @@
 """State of a batch while agents are inserted, kept on the host."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,6 +106,37 @@ class TurnNumbers:
     ) -> Float64[np.ndarray, "purpose asked"]:
         """Return the numbers of each rollout at an attempt that was drawn."""
         return self.numbers[:, rollouts, turn, attempt % WORDS]
+
+
+@dataclass(frozen=True, slots=True)
+class Attempts:
+    """Positions that are sampled at once: of each active rollout one or several in a row.
+
+    Attributes:
+        rollout: Rollout of each attempt, in order.
+        count: Attempts of each active rollout.
+        of: Place of each attempt's rollout among the active ones.
+        rank: Which attempt of its rollout it is, of those made at once.
+        numbers: Its uniform numbers.
+    """
+
+    rollout: Int64[np.ndarray, " attempt"]
+    count: Int64[np.ndarray, " active"]
+    of: Int64[np.ndarray, " attempt"]
+    rank: Int64[np.ndarray, " attempt"]
+    numbers: Float64[np.ndarray, "purpose attempt"]
+
+    def by_rank(self) -> Iterator[Int64[np.ndarray, " some"]]:
+        """Yield the places of the first attempts of all, then of the second ones."""
+        for rank in range(int(self.count.max(initial=0))):
+            yield np.flatnonzero(self.rank == rank)
+
+    def first(self, allowed: Bool[np.ndarray, " attempt"]) -> Int64[np.ndarray, " active"]:
+        """Return the place of each active rollout's first allowed attempt, or -1."""
+        found = np.full(len(self.count), -1)
+        places = np.flatnonzero(allowed)[::-1]
+        found[self.of[places]] = places  # The last one that is written is the first.
+        return found
 
 
 @dataclass(slots=True)

@@ -5,7 +5,7 @@ played rollouts down as a training batch, one agent per life, and passes it thro
 ``Network.forward``: every column anew, nothing remembered.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -74,8 +74,25 @@ class Listening(Stepper):
 
     def entry_details(self, entries, cell, position_m=None):
         said = super().entry_details(entries, cell, position_m)
-        self.details.append(asked(entries, said, cell, position_m))
+        for some in once_each(entries.rollout):
+            where = [None if one is None else one[some] for one in (cell, position_m)]
+            self.details.append(asked(entries.take(some), _of(said, some), *where))
         return said
+
+
+def once_each(rollout):
+    """Split places so that each part names a rollout once: attempts are made by fours."""
+    rank = (rollout[:, None] == rollout).tril(-1).sum(dim=1)
+    return [(rank == at).nonzero()[:, 0] for at in range(int(rank.max()) + 1)]
+
+
+def _of(said, places):
+    """Take some of the answers."""
+    values = {one.name: getattr(said, one.name) for one in fields(said)}
+    kept = {
+        name: value[places] for name, value in values.items() if isinstance(value, Tensor)
+    }
+    return replace(said, **kept)
 
 
 def asked(entries, said, *where):
