@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32
-from loader import shards
+from loader import split_scenes
 from torch import Tensor
 from traffic_drift import STILL_M
 
@@ -30,9 +30,6 @@ from infgen.model.signal_features import CLASSES, LONG_SINCE, StopLines
 from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import SceneTokens, SignalClass
 from pipeline.commands.screen import show_table
-from pipeline.engine.manifest import read_manifest
-from pipeline.stages.train.loader import TokenScenes
-from pipeline.storage.splits import in_split
 from pipeline.storage.weights import load_network
 
 CLOSE_M = 12.0
@@ -79,9 +76,8 @@ def look(network: Network, scene: SceneTokens) -> Stood:
         motion = network(batch).motion
     far_m = torch.from_numpy(network.motion_vocabulary().end_pose[..., :2]).norm(dim=-1)
     moves = (far_m > STILL_M)[batch.agents.agent_type[0]]  # [agent, move]
-    odds = motion.rows.spread(motion.motion_logits)[0].softmax(
-        dim=-1
-    )  # [token, agent, move]
+    logits = motion.rows.spread(motion.motion_logits)[0]  # [token, agent, move]
+    odds = logits.softmax(dim=-1)
     stood, went, quiet = _who_stood(batch.agents)
     token, agent = stood.nonzero(as_tuple=True)
     lines = StopLines.of(batch.roads)
@@ -136,10 +132,7 @@ def report(found: Sequence[Stood]) -> list[dict[str, object]]:
     )
     rows: list[dict[str, object]] = []
     for at, name in enumerate(SHOWN):
-        for alone, others in (
-            (True, "none on the motion_token"),
-            (False, "others on the motion_token"),
-        ):
+        for alone, others in ((True, "nobody moves"), (False, "others move")):
             these = (shown == at) & (quiet == alone)
             if these.any():
                 rows.append(
@@ -177,10 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--scenes", type=int, default=80)
     asked = parser.parse_args(arguments)
     network = load_network(asked.weights or asked.root / "latest" / "train")
-    units = shards(asked.root)
-    scenes = TokenScenes(
-        [unit for unit in units if in_split(read_manifest(unit)["name"], asked.split)]
-    )
+    scenes = split_scenes(asked.root, asked.split)
     count = min(asked.scenes, len(scenes))
     if not count:
         parser.error(f"{asked.root} has no tokens of split {asked.split}; see --split")
