@@ -95,22 +95,34 @@ def boxes_overlap(
 
     Two rectangles are apart if and only if an axis of one of them separates them.
     """
+    away_m = other[..., :2] - pose[..., :2]
+    turned_rad = other[..., 2] - pose[..., 2]
+    turn = np.abs(np.cos(turned_rad)), np.abs(np.sin(turned_rad))
     return ~(
-        _separates(pose, size_lw_m, other, other_size_lw_m)
-        | _separates(other, other_size_lw_m, pose, size_lw_m)
+        _separates(rotate(away_m, -pose[..., 2]), size_lw_m, other_size_lw_m, turn)
+        | _separates(rotate(away_m, -other[..., 2]), other_size_lw_m, size_lw_m, turn)
     )
 
 
 def _separates(
-    pose: np.ndarray, size_lw_m: np.ndarray, other: np.ndarray, other_size_lw_m: np.ndarray
+    away_m: np.ndarray,
+    size_lw_m: np.ndarray,
+    other_size_lw_m: np.ndarray,
+    turn: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:
-    """Whether the other box lies wholly beyond an end or a side of the first."""
-    away_m = np.abs(rotate(other[..., :2] - pose[..., :2], -pose[..., 2]))
-    turned_rad = other[..., 2] - pose[..., 2]
-    cos, sin = np.abs(np.cos(turned_rad)), np.abs(np.sin(turned_rad))
+    """Whether the other box lies wholly beyond an end or a side of the first.
+
+    Args:
+        away_m: From the one's centre to the other's, in the first one's frame; of any sign.
+        size_lw_m: Of the first.
+        other_size_lw_m: Of the other.
+        turn: Cosine and sine of the angle between them, without their signs.
+    """
+    cos, sin = turn
     length_m, width_m = other_size_lw_m[..., 0] / 2, other_size_lw_m[..., 1] / 2
     ahead_m = cos * length_m + sin * width_m + size_lw_m[..., 0] / 2
     aside_m = sin * length_m + cos * width_m + size_lw_m[..., 1] / 2
+    away_m = np.abs(away_m)
     apart: np.ndarray = (away_m[..., 0] >= ahead_m) | (away_m[..., 1] >= aside_m)
     return apart
 
