@@ -32,14 +32,12 @@ from infgen.tokens.scene_tokens import SceneTokens
 from pipeline.commands.screen import show_table
 from pipeline.engine.events import Events
 from pipeline.engine.layout import Root
-from pipeline.engine.manifest import read_manifest
 from pipeline.engine.runner import RunOptions, run
 from pipeline.settings.request import Request
 from pipeline.settings.stages_file import DEFAULT_FILE
 from pipeline.stages.train.loader import Recipe, TokenScenes, train_batches
 from pipeline.stages.train.process_group import ProcessGroup
 from pipeline.stages.train.setup import TrainingSetup
-from pipeline.storage.splits import in_split
 
 SECONDS = 6.0
 """How long each figure is measured."""
@@ -60,12 +58,6 @@ def shards(root: Path) -> list[Path]:
     """Folders of the tokenized units of an experiment."""
     manifest = json.loads((root / "latest" / "tokenize" / "manifest.json").read_text())
     return [Root(root).unit("tokenize", unit["key"]) for unit in manifest["units"]]
-
-
-def split_scenes(root: Path, split: str) -> TokenScenes:
-    """Open the tokenized scenes of a split of an experiment."""
-    units = [unit for unit in shards(root) if in_split(read_manifest(unit)["name"], split)]
-    return TokenScenes(units)
 
 
 def per_s(counts: Iterator[int]) -> float:

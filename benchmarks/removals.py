@@ -11,24 +11,21 @@ expected. A network that is right in sum may still remove too many that drive cl
 ego. The last line is one JSON object.
 """
 
-import argparse
 import json
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
-from loader import split_scenes
+from logged_scenes import asked, whole
 from torch import Tensor
 
-from infgen.model.batching.batch import Agents, Limits, collate
+from infgen.model.batching.batch import Agents
 from infgen.model.batching.supervision import stay_mask
 from infgen.model.network import Network
 from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence, SceneTokens
 from pipeline.commands.screen import show_table
-from pipeline.storage.weights import load_network
 
 DRIVING_M = 0.25
 """Who moves so far in half a second drives."""
@@ -39,9 +36,7 @@ STATES = ("drives", "stands", "just inserted")
 
 def look(network: Network, scene: SceneTokens) -> Float64[np.ndarray, "3 state ring"]:
     """Count token steps of vehicles in a log, removals expected, and removals logged."""
-    roads = max(1, scene.num_map_tokens)
-    limits = Limits(scene.num_agents, roads, 1, scene.num_tokens, network.grid_settings)
-    batch = collate([scene], limits, draw=0)
+    batch = whole(network, scene)
     with torch.no_grad():
         motion = network(batch).motion
     if motion.remove_logit is None:
@@ -110,19 +105,9 @@ def _percent(row: dict[str, object], *names: str) -> Iterable[str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Look at the logs of a root's tokens."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("root", type=Path, help="root with stage tokenize")
-    parser.add_argument("--weights", type=Path, help="default: those of the root")
-    parser.add_argument("--split", default="validation")
-    parser.add_argument("--scenes", type=int, default=80)
-    asked = parser.parse_args(arguments)
-    network = load_network(asked.weights or asked.root / "latest" / "train")
-    scenes = split_scenes(asked.root, asked.split)
-    count = min(asked.scenes, len(scenes))
-    if not count:
-        parser.error(f"{asked.root} has no tokens of split {asked.split}; see --split")
-    found = sum(look(network, scenes[row]) for row in range(count))
-    print(json.dumps({"scenes": count, "rows": report(np.asarray(found))}))
+    network, scenes = asked(__doc__, arguments)
+    found = np.sum([look(network, scene) for scene in scenes], axis=0)
+    print(json.dumps({"scenes": len(scenes), "rows": report(found)}))
 
 
 if __name__ == "__main__":

@@ -11,26 +11,23 @@ that set off in the next half second, and the share that was expected. The last 
 JSON object.
 """
 
-import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32
-from loader import split_scenes
+from logged_scenes import asked, whole
 from torch import Tensor
 from traffic_drift import STILL_M
 
-from infgen.model.batching.batch import Agents, Limits, collate
+from infgen.model.batching.batch import Agents
 from infgen.model.network import Network
 from infgen.model.signal_features import CLASSES, LONG_SINCE, StopLines
 from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import SceneTokens, SignalClass
 from pipeline.commands.screen import show_table
-from pipeline.storage.weights import load_network
 
 CLOSE_M = 12.0
 """A stop line so far ahead of a vehicle's centre is its next one."""
@@ -67,9 +64,7 @@ class Stood:
 
 def look(network: Network, scene: SceneTokens) -> Stood:
     """Find who stood at a line in a log, and ask the network about each."""
-    roads = max(1, scene.num_map_tokens)
-    limits = Limits(scene.num_agents, roads, 1, scene.num_tokens, network.grid_settings)
-    batch = collate([scene], limits, draw=0)
+    batch = whole(network, scene)
     shown = torch.from_numpy(scene.signal_state.astype(np.int64))[None]
     batch = replace(batch, roads=replace(batch.roads, shown=shown))  # Nobody looks away.
     with torch.no_grad():
@@ -132,7 +127,7 @@ def report(found: Sequence[Stood]) -> list[dict[str, object]]:
     )
     rows: list[dict[str, object]] = []
     for at, name in enumerate(SHOWN):
-        for alone, others in ((True, "nobody moves"), (False, "others move")):
+        for alone, others in ((True, "no other moves"), (False, "others move")):
             these = (shown == at) & (quiet == alone)
             if these.any():
                 rows.append(
@@ -163,19 +158,9 @@ def report(found: Sequence[Stood]) -> list[dict[str, object]]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Look at the logs of a root's tokens."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("root", type=Path, help="root with stage tokenize")
-    parser.add_argument("--weights", type=Path, help="default: those of the root")
-    parser.add_argument("--split", default="validation")
-    parser.add_argument("--scenes", type=int, default=80)
-    asked = parser.parse_args(arguments)
-    network = load_network(asked.weights or asked.root / "latest" / "train")
-    scenes = split_scenes(asked.root, asked.split)
-    count = min(asked.scenes, len(scenes))
-    if not count:
-        parser.error(f"{asked.root} has no tokens of split {asked.split}; see --split")
-    found = [look(network, scenes[row]) for row in range(count)]
-    print(json.dumps({"scenes": count, "rows": report(found)}))
+    network, scenes = asked(__doc__, arguments)
+    found = [look(network, scene) for scene in scenes]
+    print(json.dumps({"scenes": len(scenes), "rows": report(found)}))
 
 
 if __name__ == "__main__":

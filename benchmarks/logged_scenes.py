@@ -1,0 +1,46 @@
+"""Logs of a root's tokens, and the weights that are asked about them."""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from loader import shards
+
+from infgen.model.batching.batch import Batch, Limits, collate
+from infgen.model.network import Network
+from infgen.tokens.scene_tokens import SceneTokens
+from pipeline.engine.manifest import read_manifest
+from pipeline.stages.train.loader import TokenScenes
+from pipeline.storage.splits import in_split
+from pipeline.storage.weights import load_network
+
+
+def asked(
+    doc: str | None, arguments: Sequence[str] | None
+) -> tuple[Network, list[SceneTokens]]:
+    """Read a benchmark's arguments; return the weights and the scenes they name."""
+    parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
+    parser.add_argument("root", type=Path, help="root with stage tokenize")
+    parser.add_argument("--weights", type=Path, help="default: those of the root")
+    parser.add_argument("--split", default="validation")
+    parser.add_argument("--scenes", type=int, default=80)
+    given = parser.parse_args(arguments)
+    network = load_network(given.weights or given.root / "latest" / "train")
+    scenes = list(_scenes(given.root, given.split, given.scenes))
+    if not scenes:
+        parser.error(f"{given.root} has no tokens of split {given.split}; see --split")
+    return network, scenes
+
+
+def _scenes(root: Path, split: str, count: int) -> Iterator[SceneTokens]:
+    units = [unit for unit in shards(root) if in_split(read_manifest(unit)["name"], split)]
+    scenes = TokenScenes(units)
+    for row in range(min(count, len(scenes))):
+        yield scenes[row]
+
+
+def whole(network: Network, scene: SceneTokens) -> Batch:
+    """Make a batch of a scene, with all of its agents, roads and token steps."""
+    roads = max(1, scene.num_map_tokens)
+    limits = Limits(scene.num_agents, roads, 1, scene.num_tokens, network.grid_settings)
+    return collate([scene], limits, draw=0)
