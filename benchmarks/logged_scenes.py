@@ -17,7 +17,7 @@ from pipeline.storage.weights import load_network
 
 def asked(
     doc: str | None, arguments: Sequence[str] | None
-) -> tuple[Network, list[SceneTokens]]:
+) -> tuple[Network, Iterator[SceneTokens]]:
     """Read a benchmark's arguments; return the weights and the scenes they name."""
     parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
     parser.add_argument("root", type=Path, help="root with stage tokenize")
@@ -26,17 +26,14 @@ def asked(
     parser.add_argument("--scenes", type=int, default=80)
     given = parser.parse_args(arguments)
     network = load_network(given.weights or given.root / "latest" / "train")
-    scenes = list(_scenes(given.root, given.split, given.scenes))
-    if not scenes:
+    units = shards(given.root)
+    scenes = TokenScenes(
+        [unit for unit in units if in_split(read_manifest(unit)["name"], given.split)]
+    )
+    count = min(given.scenes, len(scenes))
+    if not count:
         parser.error(f"{given.root} has no tokens of split {given.split}; see --split")
-    return network, scenes
-
-
-def _scenes(root: Path, split: str, count: int) -> Iterator[SceneTokens]:
-    units = [unit for unit in shards(root) if in_split(read_manifest(unit)["name"], split)]
-    scenes = TokenScenes(units)
-    for row in range(min(count, len(scenes))):
-        yield scenes[row]
+    return network, (scenes[row] for row in range(count))
 
 
 def whole(network: Network, scene: SceneTokens) -> Batch:

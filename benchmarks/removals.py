@@ -12,7 +12,7 @@ ego. The last line is one JSON object.
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -91,7 +91,8 @@ def report(found: Float64[np.ndarray, "3 state ring"]) -> list[dict[str, object]
                 r["vehicle"],
                 r["away_m"],
                 r["token_steps"],
-                *_percent(r, "removed", "expected"),
+                f"{r['removed']:.2%}",
+                f"{r['expected']:.2%}",
             )
             for r in rows
         ],
@@ -99,15 +100,11 @@ def report(found: Float64[np.ndarray, "3 state ring"]) -> list[dict[str, object]
     return rows
 
 
-def _percent(row: dict[str, object], *names: str) -> Iterable[str]:
-    return (f"{row[name]:.2%}" for name in names)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Look at the logs of a root's tokens."""
     network, scenes = asked(__doc__, arguments)
-    found = np.sum([look(network, scene) for scene in scenes], axis=0)
-    print(json.dumps({"scenes": len(scenes), "rows": report(found)}))
+    found = [look(network, scene) for scene in scenes]
+    print(json.dumps({"scenes": len(found), "rows": report(np.sum(found, axis=0))}))
 
 
 if __name__ == "__main__":

@@ -160,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Look at the logs of a root's tokens."""
     network, scenes = asked(__doc__, arguments)
     found = [look(network, scene) for scene in scenes]
-    print(json.dumps({"scenes": len(scenes), "rows": report(found)}))
+    print(json.dumps({"scenes": len(found), "rows": report(found)}))
 
 
 if __name__ == "__main__":
