@@ -4,9 +4,9 @@ The paper's heads choose among two thousand cells and 120 headings from one feat
 query, which would have to carry the whole street (SPEC 4.6). Here what is around is laid
 onto the cells, or the bins, that it covers, and each of them has a say of its own.
 
-Everything is shared out between the nearest points of a lattice, so features change
-continuously with poses; in float32 also under autocast. Shape letters as in ``layers``; C
-is the width of these features.
+Everything is shared out between the nearest points of a lattice, in float32 also under
+autocast, so features change continuously with poses. Shape letters as in ``layers``; C is
+the width of these features.
 """
 
 import math
@@ -17,7 +17,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from infgen.model.layers import AttentionSources, embedding_mlp, gather, mlp
+from infgen.model.layers import (
+    AttentionSources,
+    embedding_mlp,
+    full_precision,
+    gather,
+    mlp,
+)
 from infgen.model.neighbours import MapFeatures, grid_place
 from infgen.model.relations import wrap_angle
 from infgen.tokens.grid import Grid
@@ -168,7 +174,8 @@ class HeadingFeatures(nn.Module):
         features = features * roads.present[:, None, :, None]  # [N, S, K, C]
         turned_rad = wrap_angle(roads.pose[..., 2] - pose[:, None, 2])
         bins = self._shares(turned_rad)  # [N, K, heading]
-        laid = torch.einsum("nskc,nkh->nsch", features, bins).flatten(0, 1)
+        with full_precision(x):
+            laid = torch.einsum("nskc,nkh->nsch", features.float(), bins).flatten(0, 1)
         logits = self.say(_ring(functional.relu(self.beside(_ring(laid)))))
         return logits.view(*x.shape[:-1], self.num_headings)
 
@@ -277,6 +284,7 @@ class OffsetFeatures(nn.Module):
         at = at.clamp(0, self.steps - LAST_SHARE)
         lower = at.floor()
         share, lower = at - lower, lower.long()
+        profile = profile.float()  # A product, so of low precision under autocast.
         said = torch.lerp(profile.gather(2, lower), profile.gather(2, lower + 1), share)
         beside = (2 - (along_m / ROAD_MIDDLE_M - 1).abs()).clamp(0, 1)
         return (said * beside * roads.present[..., None]).sum(dim=1)

@@ -84,6 +84,7 @@ def averages_before(
     """Average the number of agents over all token steps before each.
 
     At the first token step, before which nothing is known, the averages are its own number.
+    Summed, as a matrix product would lose digits under autocast and in TF32.
     """
     tokens = torch.arange(count.shape[1], device=count.device)
     ago = tokens[:, None] - 1 - tokens  # [token, earlier token]
@@ -92,7 +93,7 @@ def averages_before(
         rest = 1 - 1 / constant
         share = torch.where(ago >= 0, rest ** ago.clamp(min=0) / constant, 0.0)
         share[:, 0] += rest**tokens  # The first number stands for all before it.
-        found.append(count @ share.T.to(count.dtype))
+        found.append((count[:, None] * share).sum(dim=-1))
     return torch.stack(found, dim=-1)
 
 

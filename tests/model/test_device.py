@@ -62,12 +62,14 @@ def test_launched_together_a_network_learns_what_it_learns_part_by_part(variant,
         torch.testing.assert_close(ours[1][name], gradient, msg=name, **close)
 
 
-def test_under_autocast_losses_are_nearly_those_of_float32(limits):
-    network = make_network().train()
+@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_under_autocast_losses_are_nearly_those_of_float32(variant, together, limits):
+    network = make_network(replace(TINY, **VARIANTS[variant])).train()
     batch = collate([make_record(3, agents=12)], limits, 0)
-    sharp, _ = learned(network, batch, together=True)
+    sharp, _ = learned(network, batch, together=together)
 
-    rough, gradients = learned(network, batch, together=True, bf16=True)
+    rough, gradients = learned(network, batch, together=together, bf16=True)
 
     assert rough != sharp
     torch.testing.assert_close(rough, sharp, rtol=0.02, atol=0.0)
