@@ -255,7 +255,7 @@ def _rates(counts: "FlowCounts") -> dict[str, float | None]:
 
 STAGE = Stage(
     name="calibrate",
-    version=9,
+    version=10,
     settings={
         "tokenize": TokenSettings,
         "rollout": RolloutSettings,

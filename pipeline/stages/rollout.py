@@ -187,7 +187,7 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=11,
+    version=12,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=simulate,

@@ -316,6 +316,23 @@ def training(shards: str, name: str) -> Found:
     return {"ours": ours, "theirs": theirs, "apart": max(apart), **costs(tally)}
 
 
+def low_precision(shards: str, profile: str) -> Found:
+    """Two optimizer steps in bf16 and in float32, of tiny networks of a profile."""
+    stages = load_stages(DEFAULT_FILE, {}).choose(profile)
+    tiny = {name: getattr(TINY, name) for name in SIZES}
+    model = replace(stages.build("model", ModelSettings), **tiny)
+    how = stages.build("train", TrainSettings)
+    how = replace(how, batch_scenes=2, steps=2, warmup_steps=0, initial_weights="")
+    given = replace(course(Path(shards), "paper"), model=model)
+    found: Found = {}
+    with StandIn():
+        for precision in ("bf16", "float32"):
+            given = replace(given, train=replace(how, precision=precision))
+            terms = taken(given, begun(given, DEVICE), range(2)).terms
+            found[precision] = {key: float(term.loss) for key, term in terms.items()}
+    return found
+
+
 def step_costs(scenes: str) -> Found:
     """What an optimizer step of the paper's network costs, with dropout, on towns."""
     known = load_network(builtin_weights())
@@ -454,6 +471,32 @@ def device() -> Found:
     return {"refused": refused, "counts": found, "gradient": gradient}
 
 
+def types() -> Found:
+    """The types that autocast gives, and whether a mixture of two is refused."""
+    lerp, norm = torch.lerp, torch.nn.functional.layer_norm
+    with StandIn():
+        ones = torch.ones(2, 2).to(DEVICE)
+        low = ones.bfloat16()
+        with torch.autocast(DEVICE.type, torch.bfloat16):
+            made = {
+                "linear": torch.nn.functional.linear(ones, ones),
+                "added": low + low,
+                "softmax": low.softmax(-1),
+                "norm": norm(low, (2,), ones[0], ones[0]),
+            }
+        mixtures = {
+            "lerp": lambda: lerp(low, low, ones),
+            "norm": lambda: norm(low, (2,), ones[0], ones[0]),
+        }
+        refused = {}
+        for name, mix in mixtures.items():
+            try:
+                mix()
+            except RuntimeError as error:
+                refused[name] = type(error).__name__
+    return {"made": {name: str(x.dtype) for name, x in made.items()}, "refused": refused}
+
+
 def benchmarks(name: str) -> Found:
     """Measure a small row of a benchmark, as its process on a GPU would."""
     sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -500,10 +543,12 @@ CASES: dict[str, Callable[..., Found]] = {
     "device": device,
     "gpu_rows": gpu_rows,
     "insertion": insertion,
+    "low_precision": low_precision,
     "resuming": resuming,
     "rollout": rollout,
     "step": step_costs,
     "training": training,
+    "types": types,
 }
 
 if __name__ == "__main__":

@@ -23,6 +23,8 @@ from torch.utils import _pytree as pytree
 from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from tests.standin.autocast import autocast_rules
+
 NAME = "standin"
 ROOT = Path(__file__).parents[2]
 _OWN = str(Path(__file__))
@@ -48,6 +50,8 @@ _WAITING = {
 """Operations whose result the host needs before it can go on."""
 _OF_THE_HOST = {"_local_scalar_dense", "equal", "is_nonzero", "item"}
 """Operations whose result is no tensor."""
+_OF_ONE_TYPE = {"native_layer_norm", "native_layer_norm_backward"}
+"""Operations that refuse mixed types on CUDA, and not on a CPU."""
 _RESHAPING = {"squeeze_", "unsqueeze_", "t_", "transpose_", "swapaxes_", "as_strided_"}
 """Operations that change a shape in place."""
 
@@ -72,6 +76,10 @@ class Tally:
 
 class MixedDevicesError(RuntimeError):
     """One operation asked for tensors of two devices."""
+
+
+class MixedTypesError(RuntimeError):
+    """One operation asked for inputs and parameters of two types."""
 
 
 class StandInTensor(Tensor):
@@ -130,7 +138,7 @@ class StandIn(TorchDispatchMode):
 @dataclass
 class _State:
     tally: Tally = field(default_factory=Tally)
-    library: Any = None
+    libraries: tuple[Any, ...] = ()
 
 
 _STATE = _State()
@@ -184,6 +192,8 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         return func(*args, **kwargs)
     if ours:
         _check_devices(func, name, tensors)
+    if name in _OF_ONE_TYPE:
+        _check_types(func, tensors)
     _count(name, args)
     return (
         _reshape(func, args, kwargs) if name in _RESHAPING else _compute(func, args, kwargs)
@@ -252,6 +262,15 @@ def _check_devices(func: Any, name: str, tensors: list[Tensor]) -> None:
     where = "".join(traceback.format_stack(limit=25)[:-3])
     sizes = ", ".join(f"{tuple(x.shape)} on {x.device}" for x in tensors)
     raise MixedDevicesError(f"{func} at {_line()} got {sizes}\n{where}")
+
+
+def _check_types(func: Any, tensors: list[Tensor]) -> None:
+    """Refuse floating-point tensors of two types, statistics in float32 aside."""
+    kinds = given = [x.dtype for x in tensors if x.is_floating_point()]
+    if _name(func) == "native_layer_norm_backward":
+        given = kinds[:2] + kinds[4:]  # The mean and the spread are float32.
+    if len(set(given)) > 1:
+        raise MixedTypesError(f"{func} at {_line()} got {given}")
 
 
 def _to_copy(func: Any, args: Any, kwargs: dict[str, Any], ours: list[Any]) -> Any:
@@ -340,9 +359,7 @@ def set_up() -> torch.device:
     if "infgen" in sys.modules:
         raise RuntimeError("infgen is imported already; set the stand-in device up first")
     _setup_privateuseone_for_python_backend(NAME, backend_module=_Module())
-    # Autocast has no rules for this device: operations keep the types they are given.
-    _STATE.library = torch.library.Library("_", "IMPL")
-    _STATE.library.fallback(torch.library.fallthrough_kernel, "AutocastPrivateUse1")
+    _STATE.libraries = autocast_rules(NAME)
     # Wrappers cannot be inference tensors.
     torch.inference_mode = lambda *_: torch.no_grad()  # type: ignore[misc, assignment]
     torch.tensor = _made(torch.tensor)

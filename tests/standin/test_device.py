@@ -18,3 +18,15 @@ def test_it_refuses_mixed_devices_and_counts_kernels_and_waits(case):
     }
     assert kernels["a sum"] == 1
     assert found["gradient"] == [2.0, 2.0, 2.0, 2.0]
+
+
+def test_it_casts_under_autocast_as_cuda_does_and_refuses_two_types(case):
+    found = case("types")
+
+    assert found["made"] == {
+        "linear": "torch.bfloat16",
+        "added": "torch.bfloat16",
+        "softmax": "torch.float32",
+        "norm": "torch.float32",
+    }
+    assert found["refused"] == {"lerp": "RuntimeError", "norm": "MixedTypesError"}

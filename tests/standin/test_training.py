@@ -3,6 +3,8 @@
 The most kernels and waits of one step on two tiny scenes; to be lowered, never raised.
 """
 
+import math
+
 import pytest
 
 MOST = {
@@ -41,6 +43,25 @@ def test_a_step_of_the_papers_network_costs_no_more_than_it_did(case, scenes):
     kernels, waits = OF_THE_PAPER
     assert found["kernels"] <= kernels, found["words"]
     assert found["waits"] <= waits, found["words"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("profile", ["paper", "smart", "pretrained"])
+def test_in_bf16_a_profile_learns_nearly_what_it_learns_in_float32(case, shards, profile):
+    found = case("low_precision", str(shards), profile)
+
+    assert found["bf16"] != found["float32"]
+    assert found["bf16"] == pytest.approx(found["float32"], rel=0.1, abs=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("played", ["closed-loop-population", "policy-gradient"])
+def test_in_bf16_a_profile_that_plays_learns_every_loss(case, shards, played):
+    # What is played differs with the precision, and with it what is learnt from.
+    found = case("low_precision", str(shards), f"pretrained,{played}")
+
+    assert found["bf16"].keys() == found["float32"].keys()
+    assert all(math.isfinite(loss) for loss in found["bf16"].values())
 
 
 @pytest.mark.slow

@@ -250,18 +250,23 @@ def test_every_point_of_the_scaling_curve_reads_the_scenes_after_those_before_it
     assert preset.towns["training"].variety == "broad"
 
 
-def test_transfer_has_each_number_of_real_scenes_on_each_line():
-    preset = load_stages(DEFAULT_FILE, {}).preset("transfer")
+@pytest.mark.parametrize(
+    ("name", "lines"),
+    [
+        ("transfer", ["real alone", "towns, then real", "real, then towns"]),
+        ("transfer-pretrained", ["real alone", "the package's weights, then real"]),
+    ],
+)
+def test_transfer_has_each_number_of_real_scenes_on_each_line(name, lines):
+    preset = load_stages(DEFAULT_FILE, {}).preset(name)
 
-    lines = {}
+    found = {}
     for arm in preset.arms.values():
         if arm.curve is not None:
-            lines.setdefault(arm.curve.line, []).append(arm.curve.at)
-    assert lines == {
-        "real alone": [50, 150, 543],
-        "towns, then real": [50, 150, 543],
-        "real, then towns": [50, 150, 543],
-    }
+            found.setdefault(arm.curve.line, []).append(arm.curve.at)
+            scenes = arm.settings.values["train"].get("max_scenes")
+            assert scenes is None or scenes.value == arm.curve.at
+    assert found == dict.fromkeys(lines, [50, 150, 543])
 
 
 def test_a_preset_that_does_not_exist_is_refused_with_those_that_do(load):
