@@ -266,7 +266,7 @@ def test_transfer_has_each_number_of_real_scenes_on_each_line(name, lines):
             found.setdefault(arm.curve.line, []).append(arm.curve.at)
             scenes = arm.settings.values["train"].get("max_scenes")
             assert scenes is None or scenes.value == arm.curve.at
-    assert found == dict.fromkeys(lines, [50, 150, 543])
+    assert found == {line: [50, 150, 543] for line in lines}
 
 
 def test_a_preset_that_does_not_exist_is_refused_with_those_that_do(load):
