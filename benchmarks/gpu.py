@@ -9,7 +9,8 @@ Whether it computes what a CPU computes: logits of a pass over a scene, and choi
 motion tokens with the package's weights when both are shown the same token steps. Scenes a
 second in training and rollouts (of 30 s, default settings) a second, for batches of 32, 256
 and 1,024, two sizes, float32 and bf16, with the share of the device's peak (its maker's, by
-its name, or else that of a large matrix product here) and memory. The ten dearest kernels.
+its name, or else that of a large matrix product here) and memory; rollouts with passes of
+insertion as CUDA graphs, and whether they insert the same. The ten dearest kernels.
 
 Rows run in processes of their own, a few in each. A row that fails is printed as such, and
 the rest goes on in another process; rows for which time is too short are "not run". The
@@ -69,12 +70,16 @@ def make_groups(*, small: bool) -> list[Group]:
             for batch in batches
             for word in ("float32", "auto", "bf16")
         ]
+        graphs = [Row("graphs", size, batch, "auto") for batch in batches]
         training = [
             Row("training", size, batch, word)
             for batch in batches
             for word in ("float32", "bf16")
         ]
-        groups += [Group(tuple(rollouts), weight), Group(tuple(training), weight)]
+        groups += [
+            Group(tuple(rows), weight * share)
+            for rows, share in ((rollouts, 1.0), (graphs, 0.5), (training, 1.0))
+        ]
     groups.append(Group((Row("kernels", profiled, few, "auto"),), 1.0))
     if small:  # Most of the time would go into starting processes.
         return [Group(tuple(row for group in groups for row in group.rows), 1.0)]
@@ -227,7 +232,7 @@ def show_speed(found: Sequence[Found]) -> None:
         "scenes (training) and rollouts of 30 s, a second",
         (
             "what", "size", "batch", "precision", "a second", "ms a step", "peak MiB",
-            "GFLOP each", "of peak", "peak is",
+            "GFLOP each", "of peak", "peak is", "same without graphs",
         ),
         [
             (
@@ -235,7 +240,7 @@ def show_speed(found: Sequence[Found]) -> None:
                 _cell(one, "per_s", ".4g") or one["failed"],
                 _cell(one, "step_ms", ".4g"), _cell(one, "peak_mib", ".0f"),
                 _cell(one, "gflop_each", ".3g"), _cell(one, "of_peak", ".2%"),
-                one.get("peak", ""),
+                one.get("peak", ""), _cell(one, "same", ".1%"),
             )
             for one in found
         ],
@@ -260,7 +265,7 @@ def report(found: Sequence[Found], place: Place, minutes: float) -> bool:
         by_kind.setdefault(one["row"].kind, []).append(one)
     agreement = [*by_kind["logits"], *by_kind["choices"]]
     show_agreement(agreement)
-    show_speed([*by_kind["rollouts"], *by_kind["training"]])
+    show_speed([*by_kind["rollouts"], *by_kind["graphs"], *by_kind["training"]])
     for one in by_kind["kernels"]:
         show_kernels(one)
     rows = {

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from typing import Any, Literal
 
+import numpy as np
 import rollout
 import torch
 import training
@@ -33,7 +34,7 @@ from infgen.model.stepping import Stepper
 from infgen.model.token_step import MotionStep, TokenStep
 from infgen.pretrained import builtin_weights
 from infgen.rollout.precision import Precision, describe_precision, make_stepper
-from infgen.rollout.recording import RolloutStart
+from infgen.rollout.recording import Frame, RolloutStart
 from infgen.rollout.sampling import choose
 from infgen.rollout.session import Session
 from infgen.rollout.simulator import Simulator
@@ -48,7 +49,9 @@ FORCED_STEPS, FORCED_ROLLOUTS, FORCED_TOP_K = 8, 4, 5
 LOGITS_LIMIT, CHOICES_LIMIT = 1e-3, 0.99
 """In float32: largest difference of logits, and smallest share of equal choices."""
 DEAREST, FEW, SMALL_SIDE = 10, 2, 512
-Kind = Literal["logits", "choices", "training", "rollouts", "kernels"]
+GRAPH_STEPS = 3
+"""Token steps in which rollouts with and without graphs are compared."""
+Kind = Literal["logits", "choices", "training", "rollouts", "graphs", "kernels"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,11 +234,35 @@ def measure_rollouts(row: Row, place: Place) -> dict[str, Any]:
     await_device(place.device)
     begin_s = time.perf_counter() - start
     session.step()
+    return {**_token_steps(session, row, place), "begin_s": begin_s}
+
+
+def measure_graphs(row: Row, place: Place) -> dict[str, Any]:
+    """Measure the same with passes of insertion as CUDA graphs, and whether they insert so.
+
+    On a CPU there are none.
+    """
+    plain = _session(row, place)
+    captured = _session(row, place, cuda_graphs=True)
+    same = [_share_alike(plain.step(), captured.step()) for _ in range(GRAPH_STEPS)]
+    del plain
+    return {**_token_steps(captured, row, place), "same": float(np.mean(same))}
+
+
+def _share_alike(one: Frame, other: Frame) -> float:
+    """Share of rollouts with the same agents at the same places."""
+    alike = (one.agent_number == other.agent_number).all(axis=1)
+    alike &= (one.inserted_number == other.inserted_number).all(axis=1)
+    gap_m = np.abs(one.path - other.path).max(axis=(1, 2, 3))
+    return float((alike & (gap_m < LOGITS_LIMIT)).mean())
+
+
+def _token_steps(session: Session, row: Row, place: Place) -> dict[str, Any]:
+    """Measure token steps of a session that has been stepped before."""
     found = _repeat(session.step, place)
     precision = describe_precision(row.precision, torch.device(place.device).type)
     steps, flops = CLOCK.tokens_in(ROLLOUT_S), _flops_of_a_step(row.size, place)
-    figures = _figures(found, row, place, precision, flops, steps=steps)
-    return {**figures, "begin_s": begin_s}
+    return _figures(found, row, place, precision, flops, steps=steps)
 
 
 @cache
@@ -247,11 +274,11 @@ def _flops_of_a_step(size: str, place: Place) -> float:
     return counter.get_total_flops() / FEW
 
 
-def _session(row: Row, place: Place) -> Session:
+def _session(row: Row, place: Place, *, cuda_graphs: bool = False) -> Session:
     agents, roads = (6, 100) if place.small else (0, 0)
     case = rollout.Case(
         row.size, row.batch, "long", "masked", ROLLOUT_S, agents, roads, place.device,
-        place.threads, row.precision,
+        place.threads, row.precision, cuda_graphs,
     )  # fmt: skip
     session, _ = rollout.make_session(case, place.scene())
     return session
@@ -341,5 +368,6 @@ MEASURES: dict[str, Callable[[Row, Place], dict[str, Any]]] = {
     "choices": measure_choices,
     "training": measure_training,
     "rollouts": measure_rollouts,
+    "graphs": measure_graphs,
     "kernels": measure_kernels,
 }

@@ -86,6 +86,7 @@ class Case:
         device: Where.
         threads: Of the processor.
         precision: As in ``RolloutSettings``.
+        cuda_graphs: As in ``RolloutSettings``.
     """
 
     size: str
@@ -98,6 +99,7 @@ class Case:
     device: str
     threads: int
     precision: Precision = "auto"
+    cuda_graphs: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +175,7 @@ def make_session(case: Case, scene: Scene | None = None) -> tuple[Session, Scene
         mode=case.mode,
         seconds=case.seconds,
         batch_rollouts=case.batch,
+        cuda_graphs=case.cuda_graphs,
         **PLAYED[case.played],
     )
     stepper, device = make_stepper(network, case.precision), torch.device(case.device)

@@ -92,6 +92,9 @@ class RolloutSettings:
     `float32` is exact on both, `bf16` is bfloat16 by autocast on both. Poses, distances and
     sampling are float32 or float64 in all of them. Choices differ between precisions, as
     between devices, where two are about equally likely."""
+    cuda_graphs: Annotated[Bool, NOT_IN_KEY] = False
+    """Whether passes of insertion on a CUDA device are captured as CUDA graphs: what is
+    simulated is the same. Not run on a GPU yet."""
     all_agents: Bool | None = None
     """Whether to simulate all agents that the log has at the end of the history, however
     far from the ego, or those within `tokenize.max_ego_distance_m`; as the mode says if not

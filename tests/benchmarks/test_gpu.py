@@ -36,13 +36,14 @@ def test_the_small_case_measures_every_kind_of_row_on_a_cpu():
     assert figures["not_measured"] == []
     rows = figures["rows"]
     assert {name.split()[0] for name in rows} == {
-        "logits", "choices", "rollouts", "training", "kernels",
+        "logits", "choices", "rollouts", "graphs", "training", "kernels",
     }  # fmt: skip
     assert rows["logits tiny 1 float32"] == {"largest_gap": 0.0, "holds": True}
     assert rows["choices builtin 4 float32"]["same"] == 1.0
     assert rows["choices builtin 4 bf16"]["same"] > 0.9
     assert rows["choices builtin 4 bf16"]["largest_gap"] > 0
-    for name in ("rollouts tiny 1 bf16", "training tiny 1 float32"):
+    assert rows["graphs tiny 1 auto"]["same"] == 1.0
+    for name in ("rollouts tiny 1 bf16", "graphs tiny 1 auto", "training tiny 1 float32"):
         row = rows[name]
         assert row["per_s"] > 0
         assert 0 < row["of_peak"] < 1

@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,7 @@ from infgen.rollout.simulator import Simulator  # noqa: E402
 from infgen.scene import Scene  # noqa: E402
 from infgen.sources.towns import builtin_records  # noqa: E402
 from infgen.sources.womd import iter_scenes  # noqa: E402
+from infgen.tokens.scene_tokens import Presence  # noqa: E402
 from infgen.tokens.tokenizer import tokenize_scene  # noqa: E402
 from pipeline.engine.stage import Unit  # noqa: E402
 from pipeline.settings.stages_file import DEFAULT_FILE, load_stages  # noqa: E402
@@ -68,6 +69,7 @@ from pipeline.storage.checkpoint import (  # noqa: E402
 from pipeline.storage.scenes import SCENES_SCHEMA  # noqa: E402
 from pipeline.storage.weights import load_network  # noqa: E402
 from pipeline.storage.zarr_store import write_records  # noqa: E402
+from tests.standin.recorded import RecordedGraph, recorder  # noqa: E402
 
 CPU = torch.device("cpu")
 MASK: dict[str, Any] = {
@@ -182,9 +184,9 @@ def insertion(rollouts: str) -> Found:
     """What each pass of insertion costs, and for how many rollouts it was."""
     passes, plain = [], DeviceInsertion._ask
 
-    def asked(engine: Any, running: Any, wanted: Any) -> None:
+    def asked(engine: Any, running: Any) -> None:
         with counted() as tally:
-            plain(engine, running, wanted)
+            plain(engine, running)
         costs = (tally.kernels, tally.waits, tally.copies)
         rollouts = len(running.entries.rollout)
         passes.append([rollouts, *(sum(each.values()) for each in costs)])
@@ -197,6 +199,33 @@ def insertion(rollouts: str) -> Found:
         passes.clear()
         ours.step()
     return {"passes": passes}
+
+
+def graphs(rules: str) -> Found:
+    """Whether captured passes insert the same, and how many graphs each token step made."""
+    settings = {"mode": "long", **OPTIONS[rules], "add_bias": 1.0}
+    captured: list[RecordedGraph] = []
+    found: Found = {"equal": [], "inserted": [], "graphs": []}
+    with StandIn(), torch.inference_mode():
+        ours = session(DEVICE, 16, settings)
+        plain = DeviceInsertion(ours._asking)
+        other = DeviceInsertion(ours._asking, recorder(captured))
+        for _ in range(3):
+            request = ours._query_network(ours.population)
+            given = request, ours._memory, ours.population, ours.token + 1
+            one, two = plain.insert(*given), other.insert(*given)
+            alike = [same_bits(one, two, each.name) for each in fields(one)]
+            inserted = one.presence == Presence.INSERTED
+            found["equal"].append(all(alike))
+            found["inserted"].append(int(inserted.sum()))
+            found["graphs"].append(len(captured))
+            ours.step()
+    return found
+
+
+def same_bits(one: Any, other: Any, name: str) -> bool:
+    """Whether an array of two objects is the same."""
+    return bool(np.array_equal(getattr(one, name), getattr(other, name)))
 
 
 def costs(tally: Tally) -> Found:
@@ -542,6 +571,7 @@ CASES: dict[str, Callable[..., Found]] = {
     "counts": counts,
     "device": device,
     "gpu_rows": gpu_rows,
+    "graphs": graphs,
     "insertion": insertion,
     "low_precision": low_precision,
     "resuming": resuming,

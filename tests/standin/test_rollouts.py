@@ -56,3 +56,13 @@ def test_a_pass_of_insertion_never_waits_and_has_fixed_shapes(case):
     for size, launched, *_ in passes:
         kernels.setdefault(size, set()).add(launched)
     assert all(len(each) == 1 for each in kernels.values()), passes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rules", ["none", "rules", "crowded"])
+def test_captured_passes_insert_what_others_insert(case, rules):
+    found = case("graphs", rules)
+
+    assert found["equal"] == [True] * 3
+    assert min(found["inserted"]) > 8
+    assert found["graphs"] == [2] * 3  # For sixteen rollouts and for eight, once each.

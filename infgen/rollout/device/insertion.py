@@ -3,8 +3,8 @@
 The rollouts of a batch go on side by side, each at a turn and an attempt of its own: one
 pass asks every rollout that goes on for one position, and either inserts the agent or marks
 the cell as tried. A pass has fixed shapes, masks instead of selections, and never waits: it
-can be captured as a CUDA graph. After it the host reads once which rollouts go on; when
-half of them are done the pass is made for fewer. What is inserted is what
+can be captured as a CUDA graph (``graphs``). After it the host reads once which rollouts go
+on; when half of them are done the pass is made for fewer. What is inserted is what
 ``infgen.rollout.insertion`` inserts on a CPU, up to rounding in the sums of the network.
 """
 
@@ -12,17 +12,19 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from infgen.model.neighbours import cell_pose, grid_place
 from infgen.model.network import EGO
 from infgen.model.relations import Rows
-from infgen.model.step_memory import Insertions, StepMemory
+from infgen.model.step_memory import StepMemory
 from infgen.model.token_step import PositionOutputs, TokenStep
 from infgen.rollout.device.geometry import DeviceGrid, wrap_angle
+from infgen.rollout.device.graphs import Capture, PassGraphs, cuda_graph
 from infgen.rollout.device.positions import DeviceMask
 from infgen.rollout.device.random_numbers import DeviceStreams
+from infgen.rollout.device.running import RunningInsertions
 from infgen.rollout.insertion import INSIDE, of_type, sample_offset_and_heading
 from infgen.rollout.insertion_state import TURN_PURPOSES, InsertionRequest
 from infgen.rollout.population import InsertedAgents, Population, insertion_pose
@@ -34,37 +36,6 @@ LOGGED = 8
 """Numbers that are logged of an inserted agent: row, type, box, position and heading."""
 FEWEST = 8
 """A pass for fewer rollouts saves nothing."""
-
-
-@dataclass(slots=True)
-class _Running:
-    """A batch while agents are inserted; changes in place.
-
-    Attributes:
-        entries: The token step as the network sees it, and the rollouts that a pass is for.
-        numbers: Uniform numbers of all turns and attempts.
-        going: Whether a rollout goes on.
-        turn: Agents it has inserted.
-        attempt: Positions rejected in this turn ...
-        tried: ... and their cells.
-        num_agents: Agents in it.
-        num_others: Agents around its ego, which is not counted.
-        soon: Poses one token step ahead; None without an insertion mask.
-        log: What was inserted, by turn; row -1 where nothing was. The last turn is for
-            what was not inserted.
-    """
-
-    entries: Insertions
-    numbers: Float64[Tensor, "rollout turn purpose attempt"]
-    going: Bool[Tensor, " rollout"]
-    turn: Int64[Tensor, " rollout"]
-    attempt: Int64[Tensor, " rollout"]
-    tried: Bool[Tensor, "rollout cell"]
-    most: Int64[Tensor, " rollout"]
-    num_agents: Int64[Tensor, " rollout"]
-    num_others: Int64[Tensor, " rollout"]
-    soon: Float32[Tensor, "rollout row 3"] | None
-    log: Float32[Tensor, "rollout turn_ 8"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +62,13 @@ class _Proposal:
 class DeviceInsertion:
     """Inserts agents into the rollouts of a session."""
 
-    def __init__(self, request: InsertionRequest) -> None:
-        """Bring what does not change between token steps to the device."""
+    def __init__(self, request: InsertionRequest, capture: Capture | None = None) -> None:
+        """Bring what does not change between token steps to the device.
+
+        Args:
+            request: What insertion needs besides the agents.
+            capture: Makes graphs of passes; as the settings say if None.
+        """
         simulator, device = request.simulator, request.simulator.device
         self._simulator, mask = simulator, request.insertion_mask
         self._turns, self._attempts = simulator.settings.max_insertions, request.attempts
@@ -103,6 +79,9 @@ class DeviceInsertion:
         turn, kind, block = np.indices(shape).reshape(3, -1)
         purpose = np.array(TURN_PURPOSES, dtype=np.int64)[kind]
         self._draws = [torch.from_numpy(x).to(device) for x in (block, turn, purpose)]
+        if capture is None and simulator.settings.cuda_graphs and device.type == "cuda":
+            capture = cuda_graph
+        self._graphs = None if capture is None else PassGraphs(self._ask, capture)
 
     def insert(
         self,
@@ -115,12 +94,14 @@ class DeviceInsertion:
         if not self._turns:
             return population
         simulator = self._simulator
-        wanted = None if request.wanted is None else simulator.tensor(request.wanted)
-        running = self._begin(memory, population, token, request.most)
+        running = self._begin(memory, population, token, request)
+        ask = self._ask
+        if self._graphs is not None:
+            running, ask = self._graphs.hold(running), self._graphs.ask
         active = np.arange(len(running.going))
         for _ in range(self._turns * self._attempts):
             asked = running.entries.rollout
-            self._ask(running, wanted)
+            ask(running)
             going, log = simulator.fetch(running.going[asked], running.log)
             if not going.any():
                 break
@@ -131,8 +112,12 @@ class DeviceInsertion:
         return _inserted(population, log[:, : self._turns])
 
     def _begin(
-        self, memory: StepMemory, population: Population, token: int, most: np.ndarray
-    ) -> _Running:
+        self,
+        memory: StepMemory,
+        population: Population,
+        token: int,
+        request: InsertionRequest,
+    ) -> RunningInsertions:
         """Show all agents to the network, and draw the numbers of the token step."""
         simulator, grid = self._simulator, self._grid.grid
         token_step = simulator.token_step(population)
@@ -145,7 +130,7 @@ class DeviceInsertion:
         there = token_step.presence != int(Presence.ABSENT)
         near = self._near_ego(token_step.pose, token_step.pose[:, EGO, None]) & there
         zero = torch.zeros_like(entries.rollout)
-        return _Running(
+        return RunningInsertions(
             entries=entries,
             numbers=numbers,
             going=torch.ones_like(zero, dtype=torch.bool),
@@ -154,7 +139,8 @@ class DeviceInsertion:
             tried=torch.zeros(
                 (len(zero), grid.num_cells), dtype=torch.bool, device=zero.device
             ),
-            most=simulator.tensor(most),
+            most=simulator.tensor(request.most),
+            wanted=None if request.wanted is None else simulator.tensor(request.wanted),
             num_agents=there.sum(dim=1),
             num_others=near[:, EGO + 1 :].sum(dim=1),
             soon=None if self._mask is None else self._mask.soon(token_step),
@@ -166,7 +152,7 @@ class DeviceInsertion:
         away_m = pose[..., :2] - ego_pose[..., :2]
         return torch.hypot(away_m[..., 0], away_m[..., 1]) < self._grid.grid.radius_m
 
-    def _ask(self, running: _Running, wanted: Tensor | None) -> None:
+    def _ask(self, running: RunningInsertions) -> None:
         """Make one pass: ask every rollout for one position, insert where it is allowed."""
         entries, asked = running.entries, running.entries.rollout
         turn, attempt = running.turn[asked], running.attempt[asked]
@@ -176,7 +162,7 @@ class DeviceInsertion:
         ]
         query = self._simulator.stepper.entry_query(entries)
         uniform = numbers[:, TURN_PURPOSES.index(Purpose.ADD)]
-        add = sample_event(query.add_logit, uniform, self._add_bias(running, wanted))
+        add = sample_event(query.add_logit, uniform, self._add_bias(running))
         going = running.going[asked] & (add | (attempt > 0))
         going &= running.num_agents[asked] < running.most[asked]
         proposal = self._propose(running, query, numbers)
@@ -199,16 +185,16 @@ class DeviceInsertion:
         running.attempt.index_copy_(0, asked, attempt)
         running.going.index_copy_(0, asked, going)
 
-    def _add_bias(self, running: _Running, wanted: Tensor | None) -> Tensor | float:
+    def _add_bias(self, running: RunningInsertions) -> Tensor | float:
         """Return what is added to the logit of ADD, with density control."""
         simulator, asked = self._simulator, running.entries.rollout
-        if wanted is None:
+        if running.wanted is None:
             return simulator.settings.add_bias
-        odds = (wanted[asked] + 1) / (running.num_others[asked] + 1)
+        odds = (running.wanted[asked] + 1) / (running.num_others[asked] + 1)
         return simulator.settings.add_bias + simulator.rules.density_control * odds.log()
 
     def _propose(
-        self, running: _Running, query: PositionOutputs, numbers: Tensor
+        self, running: RunningInsertions, query: PositionOutputs, numbers: Tensor
     ) -> _Proposal:
         """Sample cell, type, size and heading for every rollout that a pass is for."""
         simulator, grid, entries = self._simulator, self._grid, running.entries
@@ -242,7 +228,7 @@ class DeviceInsertion:
         )
 
     def _sample_cell(
-        self, running: _Running, query: PositionOutputs, uniform: Tensor
+        self, running: RunningInsertions, query: PositionOutputs, uniform: Tensor
     ) -> tuple[Tensor, Tensor | None]:
         """Sample cells, or take those of regressed positions, which are returned too."""
         if query.position_logits is None:
@@ -264,7 +250,9 @@ class DeviceInsertion:
         )
         return chosen, None
 
-    def _place(self, running: _Running, proposal: _Proposal, placed: Tensor) -> None:
+    def _place(
+        self, running: RunningInsertions, proposal: _Proposal, placed: Tensor
+    ) -> None:
         """Write the agents that are placed into the first free rows of their rollouts."""
         entries, asked = running.entries, running.entries.rollout
         step = entries.token_step

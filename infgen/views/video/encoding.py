@@ -15,6 +15,7 @@ from jaxtyping import UInt8
 from infgen.views.video.painter import rgb, wanted
 
 CODEC = "libx264"
+PIXELS = "yuv420p"
 OPTIONS = {"preset": "veryfast", "crf": "20", "bf": "0", "x264-params": "sliced-threads=0"}
 """No picture waits for a later one (bf), so pieces follow each other without gaps."""
 GIF_COLOURS = 255
@@ -35,10 +36,11 @@ def encode_piece(
             if stream is None:
                 stream = file.add_stream(CODEC, rate=fps, options=OPTIONS)
                 stream.height, stream.width = frame.shape[:2]
-                stream.pix_fmt = "yuv420p"
+                stream.pix_fmt = PIXELS
                 stream.codec_context.thread_count = 1
             picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            file.mux(stream.encode(picture))
+            # By one thread: as many as there are cores would share out each picture.
+            file.mux(stream.encode(picture.reformat(format=PIXELS, threads=1)))
         if stream is not None:
             file.mux(stream.encode())
 
