@@ -43,6 +43,7 @@ from infgen.model.stepping import Stepper  # noqa: E402
 from infgen.model.training.losses import losses  # noqa: E402
 from infgen.pretrained import builtin_weights  # noqa: E402
 from infgen.rollout.device.insertion import DeviceInsertion  # noqa: E402
+from infgen.rollout.precision import make_stepper  # noqa: E402
 from infgen.rollout.recording import Frame, RolloutStart  # noqa: E402
 from infgen.rollout.session import Session  # noqa: E402
 from infgen.rollout.simulator import Simulator  # noqa: E402
@@ -139,7 +140,7 @@ def session(
     length = {} if settings["mode"] == "wosac" else {"seconds": 4.0}
     how = RolloutSettings(**{**length, "batch_rollouts": count, **settings})
     simulator = Simulator(
-        Stepper(network),
+        make_stepper(network, how.precision),
         network.motion_vocabulary(),
         network.map_vocabulary(),
         network.grid_settings,
@@ -201,9 +202,9 @@ def insertion(rollouts: str) -> Found:
     return {"passes": passes}
 
 
-def graphs(rules: str) -> Found:
+def graphs(rules: str, precision: str) -> Found:
     """Whether captured passes insert the same, and how many graphs each token step made."""
-    settings = {"mode": "long", **OPTIONS[rules], "add_bias": 1.0}
+    settings = {"mode": "long", "precision": precision, **OPTIONS[rules], "add_bias": 1.0}
     captured: list[RecordedGraph] = []
     found: Found = {"equal": [], "inserted": [], "graphs": []}
     with StandIn(), torch.inference_mode():

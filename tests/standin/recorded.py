@@ -33,7 +33,7 @@ class RecordedGraph(TorchDispatchMode):
         if any(info is not None and info.is_write for info in written):
             self._keep(given)
         out = func(*args, **kwargs)
-        if _waits(func, args) or _crosses(given, _tensors(out)):
+        if _waits(func, args) or _crosses(func, given, _tensors(out)):
             raise RuntimeError(f"{func} cannot be captured")
         theirs = {_storage(x) for x in given}
         self._own |= {_storage(x) for x in _tensors(out)} - theirs
@@ -101,7 +101,11 @@ def _waits(func: Any, args: Any) -> bool:
     return torch.Tag.dynamic_output_shape in func.tags and (masked or not by_index)
 
 
-def _crosses(given: list[Tensor], made: list[Tensor]) -> bool:
-    """Whether something comes from, or goes to, the host; single numbers may come."""
-    there = {x.device.type for x in given if x.dim()} | {x.device.type for x in made}
-    return len(there) > 1
+def _crosses(func: Any, given: list[Tensor], made: list[Tensor]) -> bool:
+    """Whether something comes from, or goes to, the host.
+
+    Single numbers may come as operands, which are arguments of a kernel; not as copies.
+    """
+    copies = func.overloadpacket in (torch.ops.aten._to_copy, torch.ops.aten.copy_)
+    there = {x.device.type for x in given if x.dim() or copies}
+    return len(there | {x.device.type for x in made}) > 1

@@ -60,8 +60,9 @@ def test_a_pass_of_insertion_never_waits_and_has_fixed_shapes(case):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rules", ["none", "rules", "crowded"])
-def test_captured_passes_insert_what_others_insert(case, rules):
-    found = case("graphs", rules)
+@pytest.mark.parametrize("precision", ["auto", "bf16"])
+def test_captured_passes_insert_what_others_insert(case, rules, precision):
+    found = case("graphs", rules, precision)
 
     assert found["equal"] == [True] * 3
     assert min(found["inserted"]) > 8

@@ -50,7 +50,8 @@ def cuda_graph(
     torch.cuda.current_stream().wait_stream(stream)
     graph = torch.cuda.CUDAGraph()
     pool = beside.pool() if isinstance(beside, torch.cuda.CUDAGraph) else None
-    with torch.cuda.graph(graph, pool=pool):
+    # Other threads may go on using the device.
+    with torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
         act()
     return graph
 
@@ -121,7 +122,8 @@ class PassGraphs:
 def _shapes(running: RunningInsertions) -> tuple[object, ...]:
     """What must be the same for a graph to be replayed."""
     shapes = [(x.shape, x.dtype) for x in tensors_of(running)]
-    return id(running.entries.map), *shapes
+    maps = map(id, tensors_of(running.entries.map, ()))  # Read where they are.
+    return *shapes, *maps
 
 
 def _write(held: RunningInsertions, running: RunningInsertions) -> None:

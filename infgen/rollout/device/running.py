@@ -48,18 +48,19 @@ class RunningInsertions:
     log: Float32[Tensor, "rollout turn_ 8"]
 
 
-def tensors_of(state: object) -> list[Tensor]:
-    """Return the tensors of a token step in a state, in the order of its fields.
+def tensors_of(state: object, without: tuple[type, ...] = (MapFeatures,)) -> list[Tensor]:
+    """Return the tensors of a state, in the order of its fields.
 
-    Encoded maps are left out: they last as long as the batch.
+    Encoded maps are left out if nothing else is said: they last as long as the batch.
     """
     if isinstance(state, Tensor):
         return [state]
     if isinstance(state, Shared):
         return [state.values]
-    if isinstance(state, MapFeatures) or not is_dataclass(state):
+    if isinstance(state, without) or not is_dataclass(state):
         return []
-    return [x for each in fields(state) for x in tensors_of(getattr(state, each.name))]
+    parts = (getattr(state, each.name) for each in fields(state))
+    return [x for part in parts for x in tensors_of(part, without)]
 
 
 def with_tensors(state: State, tensors: Iterator[Tensor]) -> State:
