@@ -306,9 +306,10 @@ def start(*words, **environ):
     )
 
 
-def wait_for(path):
+def wait_for(path, lines=0):
+    """Wait until a file is there, and has so many lines."""
     deadline = time.monotonic() + 30
-    while not path.exists():
+    while not path.exists() or len(path.read_text().splitlines()) < lines:
         assert time.monotonic() < deadline, f"{path} never came"
         time.sleep(0.01)
 
@@ -333,7 +334,8 @@ def test_a_signal_lets_a_resuming_stage_save_where_it_is(toys):
     running.send_signal(signal.SIGTERM)
     running.communicate(timeout=20)
     again = start("run", "--root", "R", "-s", "climb.sleep_s=0.2")
-    time.sleep(2.5)
+    wait_for(toys / "R/store/climb/begun-at", lines=2)
+    time.sleep(0.7)
     again.send_signal(signal.SIGTERM)
     again.communicate(timeout=20)
 

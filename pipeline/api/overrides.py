@@ -14,6 +14,7 @@ class RolloutOverrides(TypedDict, total=False):
     split: str
     device: Literal["auto", "cpu", "cuda"]
     precision: Literal["auto", "float32", "bf16"]
+    cuda_graphs: bool
     mode: Literal["long", "motion-only", "wosac"]
     seconds: float | None
     count: int
