@@ -59,8 +59,9 @@ def test_a_pass_of_insertion_never_waits_and_has_fixed_shapes(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rules", ["none", "rules", "crowded"])
-@pytest.mark.parametrize("precision", ["auto", "bf16"])
+@pytest.mark.parametrize(
+    ("rules", "precision"), [("none", "auto"), ("rules", "bf16"), ("crowded", "auto")]
+)
 def test_captured_passes_insert_what_others_insert(case, rules, precision):
     found = case("graphs", rules, precision)
 
