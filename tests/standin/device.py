@@ -79,7 +79,7 @@ class MixedDevicesError(RuntimeError):
 
 
 class MixedTypesError(RuntimeError):
-    """One operation asked for inputs and parameters of two types."""
+    """An operation got inputs and parameters of two data types."""
 
 
 class StandInTensor(Tensor):
