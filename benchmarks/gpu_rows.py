@@ -49,8 +49,8 @@ FORCED_STEPS, FORCED_ROLLOUTS, FORCED_TOP_K = 8, 4, 5
 LOGITS_LIMIT, CHOICES_LIMIT = 1e-3, 0.99
 """In float32: largest difference of logits, and smallest share of equal choices."""
 DEAREST, FEW, SMALL_SIDE = 10, 2, 512
-GRAPH_STEPS = 3
-"""Token steps in which rollouts with and without graphs are compared."""
+GRAPH_STEPS, SAME_PLACE_M = 3, 1e-3
+"""Token steps in which rollouts with and without graphs are compared, and how nearly."""
 Kind = Literal["logits", "choices", "training", "rollouts", "graphs", "kernels"]
 
 
@@ -254,7 +254,7 @@ def _share_alike(one: Frame, other: Frame) -> float:
     alike = (one.agent_number == other.agent_number).all(axis=1)
     alike &= (one.inserted_number == other.inserted_number).all(axis=1)
     gap_m = np.abs(one.path - other.path).max(axis=(1, 2, 3))
-    return float((alike & (gap_m < LOGITS_LIMIT)).mean())
+    return float((alike & (gap_m < SAME_PLACE_M)).mean())
 
 
 def _token_steps(session: Session, row: Row, place: Place) -> dict[str, Any]:

@@ -67,9 +67,7 @@ class _Captured:
 class PassGraphs:
     """The graphs of a batch's passes, and the state that they work on."""
 
-    def __init__(
-        self, ask: Callable[[RunningInsertions], None], capture: Capture = cuda_graph
-    ) -> None:
+    def __init__(self, ask: Callable[[RunningInsertions], None], capture: Capture) -> None:
         """Begin without graphs.
 
         Args:

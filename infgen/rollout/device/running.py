@@ -66,7 +66,8 @@ def tensors_of(state: object, without: tuple[type, ...] = (MapFeatures,)) -> lis
 def with_tensors(state: State, tensors: Iterator[Tensor]) -> State:
     """Return a state of other tensors; the next ones are taken. Inverse of ``tensors_of``.
 
-    What depends on tensors, as copies in other precisions, is made anew.
+    Unlike by ``map_tensors`` maps stay as they are, and what is made of tensors, as copies
+    in other precisions, is made anew.
     """
     changed: Any = state
     if isinstance(state, Tensor):
