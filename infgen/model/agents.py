@@ -29,6 +29,7 @@ from infgen.model.long_memory import (
 from infgen.model.motion_head import MotionHead
 from infgen.model.neighbours import MapFeatures, NeighbourRows, NeighbourSpec
 from infgen.model.relations import Rows, direction, relation_embedding
+from infgen.model.removal_features import EgoPlace, RemovalFeatures
 from infgen.model.rotary.turns import turned
 from infgen.model.settings import ModelSettings
 from infgen.model.signal_features import SignalAhead
@@ -190,6 +191,7 @@ class AgentContext:
         agents: Rows of the agents around them.
         light: Features of the signals ahead [N, D], if they are used.
         density: Agents around the ego of each [N], if that is used.
+        ego_place: Where they are to the ego [N], if that is used.
     """
 
     past_relation: Shared
@@ -199,6 +201,7 @@ class AgentContext:
     agents: NeighbourRows
     light: Tensor | None
     density: Density | None
+    ego_place: EgoPlace | None
 
 
 class MotionBlock(nn.Module):
@@ -247,6 +250,11 @@ class MotionStack(nn.Module):
         self.leave = mlp(width, width, 1) if leaves else None
         crowded = leaves and settings.density_features
         self.density = DensityFeatures(width) if crowded else None
+        self.ego_place = (
+            RemovalFeatures(width, settings.position_query_radius_m)
+            if leaves and settings.removal_features
+            else None
+        )
         patterns = settings.validity_pattern_tokens
         self.pattern = mlp(width, width, NUM_PATTERNS) if patterns else None
         ahead_m = settings.signal_ahead_m
@@ -316,7 +324,9 @@ class MotionStack(nn.Module):
         """
         leaving = x_ND
         if self.density is not None and sight.density is not None:
-            leaving = x_ND + self.density(sight.density)
+            leaving = leaving + self.density(sight.density)
+        if self.ego_place is not None and sight.ego_place is not None:
+            leaving = leaving + self.ego_place(sight.ego_place)
         return MotionOutputs(
             rows,
             self._moves(x_ND, agent_type, shapes),

@@ -19,6 +19,7 @@ from torch.nn import functional
 
 from infgen.model.layers import (
     AttentionSources,
+    begin_last_at_zero,
     embedding_mlp,
     full_precision,
     gather,
@@ -238,10 +239,7 @@ class OffsetFeatures(nn.Module):
 
     def begin_at_zero(self) -> None:
         """Take all bins for equally likely until they are trained."""
-        last = self.alone[-1]
-        assert isinstance(last, nn.Linear)
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
+        begin_last_at_zero(self.alone)
         if self.say is not None:
             nn.init.zeros_(self.say.weight)
 

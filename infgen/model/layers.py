@@ -43,6 +43,14 @@ def embedding_mlp(inputs: int, width: int) -> nn.Sequential:
     )
 
 
+def begin_last_at_zero(layers: nn.Sequential) -> None:
+    """Set the last linear layer to zero, so that what it adds changes nothing at first."""
+    last = layers[-1]
+    assert isinstance(last, nn.Linear)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+
+
 def normed(x: Tensor) -> Tensor:
     """Bring features [..., D] to mean 0 and variance 1, without a learned gain."""
     return functional.layer_norm(x, x.shape[-1:])

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from infgen.model.layers import mlp
+from infgen.model.layers import begin_last_at_zero, mlp
 from infgen.model.relations import within_radius
 from infgen.model.token_step import TokenStep
 from infgen.tokens.scene_tokens import Presence
@@ -58,7 +58,7 @@ class DensityFeatures(nn.Module):
 
     def begin_at_zero(self) -> None:
         """Let the features be zero at first."""
-        _zero_last(self.embed)
+        begin_last_at_zero(self.embed)
 
     def forward(self, density: Density) -> Tensor:
         """Describe traffic densities [..., D]."""
@@ -199,7 +199,7 @@ class StandingFeatures(nn.Module):
 
     def begin_at_zero(self) -> None:
         """Let the features be zero at first."""
-        _zero_last(self.embed)
+        begin_last_at_zero(self.embed)
 
     def forward(self, standing: Standing) -> Tensor:
         """Describe agents [..., D]."""
@@ -212,10 +212,3 @@ class StandingFeatures(nn.Module):
 def _latest(marks: Tensor) -> Tensor:
     """Largest mark up to each token step [scene, token, agent]."""
     return marks.cummax(dim=1).values
-
-
-def _zero_last(layers: nn.Sequential) -> None:
-    last = layers[-1]
-    assert isinstance(last, nn.Linear)
-    nn.init.zeros_(last.weight)
-    nn.init.zeros_(last.bias)

@@ -41,6 +41,7 @@ from infgen.model.neighbours import (
     find_others,
 )
 from infgen.model.relations import Rows, describe_pairs
+from infgen.model.removal_features import EgoPlace, RemovalFeatures
 from infgen.model.rotary.turns import turned
 from infgen.model.settings import ModelSettings
 from infgen.tokens.grid import Grid, make_grid
@@ -52,7 +53,9 @@ EGO = 0
 """Row of the ego, in batches as in simulation."""
 
 
-AddedPart = DensityFeatures | StandingFeatures | OffsetEmbedding | OffsetFeatures
+AddedPart = (
+    DensityFeatures | StandingFeatures | RemovalFeatures | OffsetEmbedding | OffsetFeatures
+)
 """Parts that may be added to trained weights."""
 
 
@@ -211,6 +214,7 @@ class Network(nn.Module):
                 roads, own_pose, rows.at // agents.visible[0].numel(), token
             ),
             None if density is None else density.take(rows.at // visible.shape[1]),
+            _ego_place(agents, rows) if self.motion.ego_place is not None else None,
         )
         x = self.motion(x, past_index, sight)
         agent_type = rows.pack(agents.agent_type[:, None].expand(agents.visible.shape))
@@ -356,6 +360,20 @@ def _before(agents: Agents) -> tuple[Tensor, Tensor]:
     known = torch.zeros_like(visible)
     known[:, 1:] = visible[:, :-1]
     return torch.cat([pose[:, :1], pose[:, :-1]], dim=1), known
+
+
+def _ego_place(agents: Agents, rows: Rows) -> EgoPlace:
+    """Where all visible agents are to their ego."""
+    before, known = _before(agents)
+    known = known & (agents.presence != int(Presence.INSERTED))
+    ego = rows.at // agents.visible.shape[2]
+    return EgoPlace(
+        rows.pack(agents.pose),
+        agents.pose[:, :, EGO].flatten(0, 1)[ego],
+        rows.pack(before),
+        before[:, :, EGO].flatten(0, 1)[ego],
+        rows.pack(known),
+    )
 
 
 def _agent_rows(agents: Agents, rows: Rows, standing: Standing | None) -> AgentRows:

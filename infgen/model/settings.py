@@ -104,6 +104,9 @@ class ModelSettings:
     standing_features: Bool = False
     """Whether agents know for how long each has stood, and whether it has ever driven: a
     vehicle that waits from one that is parked."""
+    removal_features: Bool = False
+    """Whether removal knows how far an agent is from the ego, in which direction, and
+    whether it comes nearer: logs lose sight of agents at the edge of what the ego sees."""
     signal_ahead_m: NonNegative = 0.0
     """Every agent sees the signal of its own lane up to so far ahead, and how long it has
     shown that; 0 to see it only among all other map tokens."""

@@ -43,6 +43,7 @@ from infgen.model.neighbours import (
 )
 from infgen.model.network import EGO, Network
 from infgen.model.relations import Rows, describe_pairs, within_radius
+from infgen.model.removal_features import EgoPlace
 from infgen.model.rotary.turns import turned, turned_back
 from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.token_step import MotionStep, PositionOutputs, TokenStep
@@ -382,4 +383,16 @@ class Stepper:
         if self.network.settings.density_features:
             count = self._count(token_step)
             density = Density(count, memory.averages_before(count)).take(rollout)
-        return AgentContext(Shared.of(related), past, turn, roads, around, light, density)
+        ego_place = None
+        if self.network.motion.ego_place is not None:
+            before, known = memory.last()
+            ego_place = EgoPlace(
+                pose,
+                token_step.pose[:, EGO][rollout],
+                rows.pack(before),
+                before[:, EGO][rollout],
+                rows.pack(known),
+            )
+        return AgentContext(
+            Shared.of(related), past, turn, roads, around, light, density, ego_place
+        )

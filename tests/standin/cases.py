@@ -279,7 +279,12 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     ),
     "closed-loop": (FEATURES, {"closed_loop_top_k": 4}),
     "closed-loop-population": (
-        {**FEATURES, "density_features": True, "standing_features": True},
+        {
+            **FEATURES,
+            "density_features": True,
+            "standing_features": True,
+            "removal_features": True,
+        },
         {"motion_noise_neighbours": 5, "closed_loop_population": True},
     ),
     "offset-token": (

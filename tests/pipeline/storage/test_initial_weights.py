@@ -120,7 +120,9 @@ def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_i
     assert len(message) < 1000
 
 
-ADDED = {"density_features": True, "standing_features": True, "offset_token": True}
+ADDED = dict.fromkeys(
+    ("density_features", "standing_features", "removal_features", "offset_token"), True
+)
 
 
 def test_added_parts_may_be_missing_in_weights_to_begin_with(tmp_path):
@@ -136,7 +138,7 @@ def test_added_parts_may_be_missing_in_weights_to_begin_with(tmp_path):
 
     found, own = dict(network.named_parameters()), dict(plain.named_parameters())
     parts = tuple(network.added_parts())
-    assert len(parts) == 5
+    assert len(parts) == 6
     added = found.keys() - own.keys()
     assert added
     assert all(name.startswith(parts) for name in added)
