@@ -7,11 +7,12 @@ Reads the logs and the rollouts of a root::
 The first table has contacts of two agents after now, for each rollout beside each log: in
 how many one had been inserted, in how many one stood (slower than 0.5 m/s) when they met,
 and between which types; and how long they lasted. Pairs that overlap from now on count.
-The second has vehicles every 5 s: how far from the middle of the nearest lane, and at which
-angle to it, those stand and drive that were inserted, and all others. A vehicle between
-0.75 and 1.75 m stands neither in a lane nor beside the road, and is driven into. "Against"
-is the share of those in a lane (1 m) that no lane there leads the way they face. The last
-line is one JSON object.
+The second has those of two vehicles that move: at which angle, and in how many one had been
+inserted at most 3 s before. The third has vehicles every 5 s: how far from the middle of
+the nearest lane, and at which angle to it, those stand and drive that were inserted, and
+all others. A vehicle between 0.75 and 1.75 m stands neither in a lane nor beside the road,
+and is driven into. "Against" is the share of those in a lane (1 m) that no lane there leads
+the way they face. The last line is one JSON object.
 """
 
 import argparse
@@ -45,6 +46,10 @@ BETWEEN_M = (0.75, 1.75)
 IN_LANE_M = 1.0
 ALONG_RAD = np.radians(45)
 """A lane leads the way of a vehicle if they are no farther turned from each other."""
+MEETINGS = (("same way", 20.0), ("merging", 60.0), ("crossing", 120.0), ("head on", 180.0))
+"""Contacts of two vehicles that move, by the angle between them, up to so many degrees."""
+FRESH = "one inserted within 3 s"
+FRESH_STEPS = 30
 NAMES = ("vehicles", "pedestrians", "cyclists")
 COLUMNS = ("contacts", "one inserted", "one stands", "both stand", "both move")
 WHERE = (
@@ -60,6 +65,7 @@ class Side:
     Attributes:
         count: How many.
         kinds: Contacts by kind.
+        moving: Those of two vehicles that move, by how they meet.
         lasted_s: Duration of each contact.
         beside: What ``beside_lanes`` tells of vehicles, by where they come from and
             whether they stand.
@@ -67,6 +73,7 @@ class Side:
 
     count: int = 0
     kinds: Counter[str] = field(default_factory=Counter)
+    moving: Counter[str] = field(default_factory=Counter)
     lasted_s: list[float] = field(default_factory=list)
     beside: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
@@ -93,6 +100,9 @@ def take(side: Side, traffic: Traffic, lanes: Lanes) -> None:
             *([] if known[pair].all() else ["one inserted"]),
         ]
         side.kinds.update(told)
+        if not stand and (motion.agent_type[pair] == AgentType.VEHICLE).all():
+            seen = motion.valid[0, pair]
+            side.moving.update(meeting(traffic, pair, now + 1 + steps[0], seen))
         side.lasted_s.append(len(steps) / 10)
     vehicle = motion.agent_type == AgentType.VEHICLE
     for step in range(now + EVERY_STEPS, motion.valid.shape[2], EVERY_STEPS):
@@ -102,6 +112,16 @@ def take(side: Side, traffic: Traffic, lanes: Lanes) -> None:
                 rows = np.flatnonzero(vehicle & motion.valid[0, :, step] & origin & moving)
                 found = beside_lanes(traffic, rows, step, lanes)
                 side.beside.setdefault(f"{who} that {how}", []).append(found)
+
+
+def meeting(traffic: Traffic, pair: list[int], step: int, seen: np.ndarray) -> list[str]:
+    """Tell how two vehicles meet at a step; ``seen`` is where they are there [2, step]."""
+    heading_rad = traffic.motion.heading_rad[0, pair, step]
+    angle_deg = np.degrees(np.abs(wrap_angle(np.diff(heading_rad))[0]))
+    inserted = ~seen[:, : traffic.now + 1].any(axis=1)
+    fresh = inserted & (step - seen.argmax(axis=1) <= FRESH_STEPS)
+    told = [name for name, most_deg in MEETINGS if angle_deg <= most_deg][:1]
+    return [*told, *([FRESH] if fresh.any() else [])]
 
 
 def overlaps(traffic: Traffic, step: int) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +189,7 @@ def _rollouts(root: Path) -> Iterator[Traffic]:
 
 
 def report(logs: Side, played: Side) -> dict[str, Any]:
-    """Print both tables; return their numbers."""
+    """Print the tables; return their numbers."""
     sides = {"logs": logs, "rollouts": played}
     types = sorted((logs.kinds | played.kinds).keys() - set(COLUMNS))
     found: dict[str, Any] = {}
@@ -179,6 +199,13 @@ def report(logs: Side, played: Side) -> dict[str, Any]:
     cells = {who: [f"{value:.2f}" for value in one.values()] for who, one in found.items()}
     rows = [(who, *told) for who, told in cells.items()]
     show_table("contacts of each", ("", *found["logs"]), rows)
+    names = (*(name for name, _ in MEETINGS), FRESH)
+    rows = []
+    for who, side in sides.items():
+        met = {name: side.moving[name] / side.count for name in names}
+        found[f"{who}: moving"] = met
+        rows.append((who, *(f"{value:.2f}" for value in met.values())))
+    show_table("contacts of two vehicles that move", ("", *names), rows)
     rows = []
     for who, side in sides.items():
         for name, parts in side.beside.items():
@@ -201,7 +228,7 @@ def _spread(values: np.ndarray) -> dict[str, float]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print both tables of a root."""
+    """Print the tables of a root."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("root", type=Path, help="root with stages ingest and rollout")
     parser.add_argument("--count", type=int, default=4, help="rollouts of each scene")

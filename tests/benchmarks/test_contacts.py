@@ -60,6 +60,33 @@ def test_a_contact_is_counted_once_by_who_takes_part_and_what_they_do(contacts):
         "vehicles and vehicles": 1,
     }
     assert side.lasted_s == [pytest.approx(0.8, abs=0.11)]
+    assert not side.moving
+
+
+@pytest.mark.parametrize(
+    ("heading_deg", "first", "told"),
+    [
+        (10, 0, {"same way": 1}),
+        (45, 0, {"merging": 1}),
+        (90, 15, {"crossing": 1, "one inserted within 3 s": 1}),
+        (-170, 15, {"head on": 1, "one inserted within 3 s": 1}),
+    ],
+)
+def test_two_vehicles_that_move_meet_at_an_angle(contacts, heading_deg, first, told):
+    side = contacts.Side()
+    other = (20, -1, np.radians(heading_deg), 1, first)
+
+    contacts.take(side, traffic((0, 0, 0, 10, 0), other), LANES)
+
+    assert side.moving == told
+
+
+def test_who_was_inserted_long_before_is_not_fresh(contacts):
+    side = contacts.Side()
+
+    contacts.take(side, traffic((0, 0, 0, 10, 0), (50, -2, np.pi / 2, 0.6, 11)), LANES)
+
+    assert side.moving == {"crossing": 1}
 
 
 def test_vehicles_are_told_by_how_far_from_a_lane_and_which_way_they_face(contacts):
