@@ -6,7 +6,7 @@ RUNS := $(VENV)/runs
 INSTALLED := $(VENV)/installed
 CODE := cli.py infgen pipeline benchmarks examples docs/hooks tests
 
-.PHONY: demo test test-slow test-all check format bench notebooks docs clean
+.PHONY: demo test test-slow test-slow-sample test-all check format bench notebooks docs clean
 
 demo: $(RUNS)
 	$(BIN)/infgen demo
@@ -18,6 +18,10 @@ test: $(INSTALLED)
 # The tests that take more than ten seconds each.
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -n 2 -m slow
+
+# One case of each of them, drawn by the seed that pytest prints, as CI does.
+test-slow-sample: $(INSTALLED)
+	$(BIN)/python -m pytest -n 2 -m slow --one-case
 
 test-all: test test-slow
 

@@ -1,6 +1,7 @@
 """Small scenes that every room's tests are built on. Each fixture is a function to call."""
 
 import os
+import random
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -34,6 +35,35 @@ def pytest_configure() -> None:
     """
     os.environ.update(dict.fromkeys(THREADS, "1"))
     torch.set_num_threads(1)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add what CI asks for: all slow tests take an hour there."""
+    parser.addoption(
+        "--one-case",
+        action="store_true",
+        help="run one case of each slow test, drawn by the seed of the order of tests",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out all but one case of each slow test, if that is asked for."""
+    if not config.getoption("one_case"):
+        return
+    cases: dict[str, list[str]] = {}
+    for item in items:
+        if item.get_closest_marker("slow"):
+            cases.setdefault(_test_of(item), []).append(item.nodeid)
+    # Every process that tests draws the same ones.
+    draw = random.Random(config.getoption("randomly_seed", 0))
+    drawn = {test: draw.choice(sorted(some)) for test, some in sorted(cases.items())}
+    kept = [item for item in items if drawn.get(_test_of(item), item.nodeid) == item.nodeid]
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    items[:] = kept
+
+
+def _test_of(item: pytest.Item) -> str:
+    return item.nodeid.partition("[")[0]
 
 
 @pytest.fixture(autouse=True)

@@ -1,0 +1,49 @@
+"""CI runs one case of each slow test, drawn by the seed of the order of tests."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from tests.conftest import pytest_collection_modifyitems
+
+
+class Item(SimpleNamespace):
+    def get_closest_marker(self, name):
+        return name if name == "slow" and self.slow else None
+
+    def __hash__(self):
+        return hash(self.nodeid)
+
+
+ITEMS = [Item(nodeid=f"test_a.py::test_kill[{case}]", slow=True) for case in range(9)]
+ITEMS += [Item(nodeid="test_a.py::test_alone", slow=True)]
+ITEMS += [Item(nodeid=f"test_b.py::test_fast[{case}]", slow=False) for case in range(3)]
+
+
+@pytest.fixture
+def collected():
+    def collect(seed, *, asked=True, order=1):
+        items, left_out = ITEMS[::order], []
+        options = {"one_case": asked, "randomly_seed": seed}
+        hook = SimpleNamespace(pytest_deselected=lambda items: left_out.extend(items))
+        config = SimpleNamespace(getoption=lambda name, *_: options[name], hook=hook)
+        pytest_collection_modifyitems(config, items)
+        assert {one.nodeid for one in [*items, *left_out]} == {i.nodeid for i in ITEMS}
+        return {one.nodeid for one in items}
+
+    return collect
+
+
+def test_one_case_of_each_slow_test_is_left_and_every_fast_one(collected):
+    kept = collected(0)
+
+    assert len(kept) == 1 + 1 + 3
+    assert "test_a.py::test_alone" in kept
+
+
+def test_all_processes_draw_the_same_cases_in_whatever_order_they_see_them(collected):
+    assert collected(5) == collected(5, order=-1)
+
+
+def test_every_case_is_drawn_by_some_seed(collected):
+    assert set.union(*(collected(seed) for seed in range(99))) == collected(0, asked=False)
