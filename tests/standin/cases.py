@@ -466,7 +466,7 @@ def compiled(shards: str, name: str, profile: str = "") -> Found:
     network = begun(given, CPU).network
     batch = given.recipe(ProcessGroup())[0][0]
     how = {"hidden_roads": True, "index": BatchIndex.of(batch)}
-    # As training does it; symbolic shapes take the compiler minutes, so one profile has them.
+    # Training has symbolic shapes, which take the compiler minutes: one profile has them.
     dynamic = True if profile in ("", "benchmark") else None
     traced = torch.compile(network, dynamic=dynamic, backend="eager")
     plain = losses(network(batch, **how), batch, given.train)
