@@ -47,23 +47,19 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out all but one case of each slow test, if that is asked for."""
+    """Deselect all but one case of each slow test, with ``--one-case``."""
     if not config.getoption("one_case"):
         return
     cases: dict[str, list[str]] = {}
-    for item in items:
-        if item.get_closest_marker("slow"):
-            cases.setdefault(_test_of(item), []).append(item.nodeid)
+    slow = [item.nodeid for item in items if item.get_closest_marker("slow")]
+    for case in slow:
+        cases.setdefault(case.partition("[")[0], []).append(case)
     # Every process that tests draws the same ones.
     draw = random.Random(config.getoption("randomly_seed", 0))
-    drawn = {test: draw.choice(sorted(some)) for test, some in sorted(cases.items())}
-    kept = [item for item in items if drawn.get(_test_of(item), item.nodeid) == item.nodeid]
-    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
-    items[:] = kept
-
-
-def _test_of(item: pytest.Item) -> str:
-    return item.nodeid.partition("[")[0]
+    drawn = {draw.choice(sorted(some)) for _, some in sorted(cases.items())}
+    deselected = set(slow) - drawn
+    config.hook.pytest_deselected(items=[i for i in items if i.nodeid in deselected])
+    items[:] = [item for item in items if item.nodeid not in deselected]
 
 
 @pytest.fixture(autouse=True)

@@ -109,15 +109,15 @@ def batch(record, limits):
 
 def test_untrained_features_change_no_logit(tiny, new_network, batch):
     plain = new_network(tiny).eval()
-    wide = replace(tiny, density_features=True, standing_features=True)
-    network = new_network(wide).eval()
+    features = ("density_features", "standing_features", "removal_features")
+    network = new_network(replace(tiny, **dict.fromkeys(features, True))).eval()
     network.load_state_dict(plain.state_dict(), strict=False)
     for part in network.added_parts().values():
         part.begin_at_zero()
 
     one, two = plain(batch), network(batch)
 
-    assert len(network.added_parts()) == 3
+    assert len(network.added_parts()) == 4
     assert torch.equal(one.motion.motion_logits, two.motion.motion_logits)
     assert torch.equal(one.motion.remove_logit, two.motion.remove_logit)
     assert torch.equal(one.entries.add_logit, two.entries.add_logit)

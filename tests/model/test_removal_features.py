@@ -31,20 +31,6 @@ def ego_place(pose, ego_pose, before, ego_before, known=True):
 BEHIND = ((10.0, -20.0, 0.4), (13.0, 5.0, 1.2), (8.0, -20.0, 0.4), (11.0, 1.0, 1.2))
 
 
-def test_untrained_features_change_no_logit(tiny, new_network, batch):
-    plain = new_network(tiny).eval()
-    network = new_network(replace(tiny, removal_features=True)).eval()
-    network.load_state_dict(plain.state_dict(), strict=False)
-    for part in network.added_parts().values():
-        part.begin_at_zero()
-
-    one, two = plain(batch), network(batch)
-
-    assert len(network.added_parts()) == 1
-    assert torch.equal(one.motion.motion_logits, two.motion.motion_logits)
-    assert torch.equal(one.motion.remove_logit, two.motion.remove_logit)
-
-
 def test_removal_sees_them_and_motion_and_insertion_do_not(tiny, new_network, batch):
     network = new_network(replace(tiny, removal_features=True)).eval()
     before = network(batch)
