@@ -159,6 +159,9 @@ class TrainSettings:
     """Factor on rewards for each token step that they come later."""
     overlap_penalty: NonNegative = 1.0
     """Cost of running into another agent."""
+    conflict_penalty: NonNegative = 0.0
+    """Cost of a motion token after which an agent that brakes would still run into another
+    one, discounted by how much later, for every token of the nucleus by its probability."""
     off_road_penalty: NonNegative = 0.5
     """Cost of each token step in which a vehicle leaves the road or gets farther off it."""
     log_distance_penalty: NonNegative = 0.1

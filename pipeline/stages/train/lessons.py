@@ -112,6 +112,7 @@ def each_terms(
         outputs = forward.evaluated(network, lesson.batch)
         with torch.no_grad():
             before = forward.evaluated(pretrained, lesson.batch)
-        terms = policy_terms(outputs, before, lesson, here, settings.policy_top_p)
+        how = settings.policy_top_p, settings.conflict_penalty
+        terms = policy_terms(outputs, before, lesson, here, *how)
         yield terms, torch.zeros(2, device=here.device)
     network.train()

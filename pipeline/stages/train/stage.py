@@ -221,7 +221,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=11,
+    version=12,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,

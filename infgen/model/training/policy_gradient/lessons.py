@@ -8,6 +8,7 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Batch
 from infgen.model.network import Network
+from infgen.model.training.policy_gradient.conflicts import Conflicts, find_conflicts
 from infgen.model.training.policy_gradient.returns import (
     advantages,
     discounted_returns,
@@ -27,7 +28,7 @@ from infgen.model.training_settings import TrainSettings
 
 SUMS = (
     *("choices", "agents", "token_steps"),
-    *("reward", "overlap", "off_road", "energy_score", "compared"),
+    *("reward", "overlap", "off_road", "conflict", "energy_score", "compared"),
     *("overlapping_agents", "departing_agents", "present", "logged", "entries", "exits"),
 )
 """Sums over the rollouts of a batch, in this order."""
@@ -61,7 +62,9 @@ def simulate_lessons(
     mask = settings.policy_insertion_mask
     rollouts = simulate_rollouts(network, batch, group, top_p, seed, mask)
     roads = read_roads(batch.roads, network.map_vocabulary())
-    costs = find_costs(rollouts, network.motion_vocabulary(), roads)
+    vocabulary = network.motion_vocabulary()
+    costs = find_costs(rollouts, vocabulary, roads)
+    conflicts = find_conflicts(rollouts, vocabulary, settings.policy_discount)
     reward = costs.reward(settings)
 
     def grouped(values: Tensor) -> Tensor:
@@ -85,10 +88,11 @@ def simulate_lessons(
             advantage[number],
             of_type[number],
             of_count[number],
+            conflicts.only(rollouts.rows(number)),
         )
         for number in range(group)
     ]
-    return PolicyLessons(lessons, _sums(rollouts, costs, reward))
+    return PolicyLessons(lessons, _sums(rollouts, costs, conflicts, reward))
 
 
 def figures(sums: Tensor) -> dict[str, float]:
@@ -97,7 +101,7 @@ def figures(sums: Tensor) -> dict[str, float]:
     choices, agents, steps, compared = (
         max(1.0, found[name]) for name in ("choices", "agents", "token_steps", "compared")
     )
-    costs = ("reward", "overlap", "off_road")
+    costs = ("reward", "overlap", "off_road", "conflict")
     return {
         **{f"rollout_{name}": found[name] / choices for name in costs},
         "rollout_energy_score": found["energy_score"] / compared,
@@ -110,7 +114,9 @@ def figures(sums: Tensor) -> dict[str, float]:
     }
 
 
-def _sums(rollouts: SimulatedRollouts, costs: Costs, reward: Tensor) -> Tensor:
+def _sums(
+    rollouts: SimulatedRollouts, costs: Costs, conflicts: Conflicts, reward: Tensor
+) -> Tensor:
     moved, inserted = rollouts.moved, rollouts.inserted
     agents, there = rollouts.batch.agents, moved | inserted
     logged = rollouts.logged.visible & there.any(dim=2, keepdim=True)
@@ -122,6 +128,7 @@ def _sums(rollouts: SimulatedRollouts, costs: Costs, reward: Tensor) -> Tensor:
         "reward": reward,
         "overlap": costs.overlap,
         "off_road": costs.off_road,
+        "conflict": conflicts.sampled(agents),
         "energy_score": costs.energy_score,
         "compared": moved & rollouts.known[:, None] & rollouts.logged.observed,
         "overlapping_agents": costs.overlap.any(dim=1),

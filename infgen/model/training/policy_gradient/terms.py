@@ -20,6 +20,7 @@ from infgen.model.batching.supervision import following
 from infgen.model.logits import DetailOutputs, InsertionOutputs, Outputs
 from infgen.model.network import EGO
 from infgen.model.training.losses import Term, Terms
+from infgen.model.training.policy_gradient.conflicts import Conflicts
 from infgen.model.training.policy_gradient.nucleus import log_probabilities
 from infgen.tokens.scene_tokens import Presence
 
@@ -36,6 +37,7 @@ class PolicyLesson:
         type_advantage: Of the type of every inserted agent.
         count_advantage: Of a rollout from a token step on: of its insertions there, and of
             the removals of the step before, whose agents are gone by then.
+        conflicts: Motion tokens in conflict.
     """
 
     batch: Batch
@@ -43,6 +45,7 @@ class PolicyLesson:
     advantage: Float32[Tensor, "scene token agent"]
     type_advantage: Float32[Tensor, "scene token agent"]
     count_advantage: Float32[Tensor, "scene token"]
+    conflicts: Conflicts
 
 
 def policy_terms(
@@ -51,6 +54,7 @@ def policy_terms(
     lesson: PolicyLesson,
     stationary: Bool[Tensor, "3 motion_token"],
     top_p: float,
+    conflict_penalty: float,
 ) -> Terms:
     """Compute the terms ``policy`` and ``divergence``.
 
@@ -60,9 +64,10 @@ def policy_terms(
         lesson: The rollouts.
         stationary: Motion tokens that stand still, by agent type.
         top_p: Share of the probability that motion tokens were sampled from.
+        conflict_penalty: Cost of a motion token in conflict.
     """
     count = lesson.moved.sum().float()
-    gained = _motion_gain(outputs, lesson, stationary, top_p)
+    gained = _motion_gain(outputs, lesson, stationary, top_p, conflict_penalty)
     gained = gained + _insertion_gain(outputs, lesson)
     gained = gained + _count_gain(outputs, lesson)
     nothing = gained.new_zeros(())
@@ -92,9 +97,13 @@ def divergence(outputs: Outputs, pretrained: Outputs, lesson: PolicyLesson) -> T
 
 
 def _motion_gain(
-    outputs: Outputs, lesson: PolicyLesson, stationary: Tensor, top_p: float
+    outputs: Outputs,
+    lesson: PolicyLesson,
+    stationary: Tensor,
+    top_p: float,
+    conflict_penalty: float,
 ) -> Tensor:
-    """Advantages times log-probabilities of motion tokens, summed."""
+    """Advantages times log-probabilities of motion tokens, less conflicts, summed."""
     rows, agents = outputs.motion.rows, lesson.batch.agents
     moves = rows.pack(following(lesson.moved, False))
     chosen = rows.pack(following(agents.motion_token, 0))[moves]
@@ -103,7 +112,13 @@ def _motion_gain(
     apart = stationary[rows.pack(agent_type)[moves]]
     logits = outputs.motion.motion_logits[moves]
     likely = log_probabilities(logits, apart, top_p, chosen)
-    return (advantage * likely.gather(1, chosen[:, None])[:, 0]).sum()
+    gained = (advantage * likely.gather(1, chosen[:, None])[:, 0]).sum()
+    if not conflict_penalty:
+        return gained
+    scene, token, agent, motion_token = lesson.conflicts.at.T
+    row = (moves.cumsum(dim=0) - 1)[rows.number[scene, token - 1, agent]]
+    probability = likely[row, motion_token].exp()
+    return gained - conflict_penalty * (lesson.conflicts.cost * probability).sum()
 
 
 def _insertion_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:

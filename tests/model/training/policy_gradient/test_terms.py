@@ -9,6 +9,7 @@ from torch.nn.functional import logsigmoid
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
+from infgen.model.training.policy_gradient.conflicts import Conflicts
 from infgen.model.training.policy_gradient.lessons import (
     SUMS,
     figures,
@@ -18,7 +19,7 @@ from infgen.model.training.policy_gradient.rollouts import HISTORY_TOKENS
 from infgen.model.training.policy_gradient.terms import divergence, policy_terms
 from infgen.tokens.scene_tokens import Presence
 
-HOW = TrainSettings(policy_gradient_rollouts=3, policy_top_p=0.9)
+HOW = TrainSettings(policy_gradient_rollouts=3, policy_top_p=0.9, conflict_penalty=2.0)
 ROUNDING = 1e-6
 """Between a network with gradients and its copy without, which sums in another order."""
 
@@ -48,13 +49,15 @@ def terms(network, pretrained, lesson):
     stationary = torch.from_numpy(network.motion_vocabulary().stationary)
     with torch.no_grad():
         before = pretrained(lesson.batch)
-    return policy_terms(network(lesson.batch), before, lesson, stationary, HOW.policy_top_p)
+    how = HOW.policy_top_p, HOW.conflict_penalty
+    return policy_terms(network(lesson.batch), before, lesson, stationary, *how)
 
 
 def worthless(lesson):
     """The same lesson, in which no choice is better than another."""
     names = ("advantage", "type_advantage", "count_advantage")
-    return replace(lesson, **{x: torch.zeros_like(getattr(lesson, x)) for x in names})
+    nothing = {x: torch.zeros_like(getattr(lesson, x)) for x in names}
+    return replace(lesson, conflicts=lesson.conflicts.only(slice(0, 0)), **nothing)
 
 
 def after_a_step(network, lesson):
@@ -121,6 +124,28 @@ def test_choices_with_a_positive_advantage_become_likelier(network, lessons):
 
         # The loss is minus the log-probability, times the sign.
         assert after < before
+
+
+def test_motion_tokens_in_conflict_become_less_likely(network, lessons):
+    lesson = lessons.lessons[0]
+    scene, token, agent = lesson.moved.nonzero()[10].tolist()
+    sampled = int(lesson.batch.agents.motion_token[scene, token, agent])
+    at = torch.tensor([[scene, token, agent, sampled]])
+    only = replace(worthless(lesson), conflicts=Conflicts(at, torch.ones(1)))
+
+    before, after = (
+        each(lesson.batch).motion for each in (network, after_a_step(network, only))
+    )
+
+    def probability(motion):
+        row = motion.rows.number[scene, token - 1, agent]
+        return motion.motion_logits[row].softmax(dim=0)[sampled]
+
+    loss = terms(network, network, only)["policy"].loss
+    most = HOW.conflict_penalty * probability(before) / HOW.policy_top_p
+    assert HOW.conflict_penalty * probability(before) < loss + ROUNDING
+    assert loss < most + ROUNDING  # The nucleus has what is outside of it.
+    assert probability(after) < probability(before)
 
 
 def test_cells_and_headings_of_inserted_agents_are_learned_too(network, lessons):

@@ -1,0 +1,215 @@
+"""Conflicts: motion tokens after which braking no longer averts an overlap.
+
+An overlap is rare, and its reward tells only of the tokens that were sampled. What other
+agents did in a rollout tells more: for every token that an agent might have sampled,
+whether it would have run into one of them. A token is in conflict if the agent, after it,
+brakes at ``BRAKES_MPS2`` and still comes to overlap an agent that it had ahead, all others
+moving as they did in the rollout. Braking, the agent keeps to the way that it went in the
+rollout, at the lateral offset from it at which the token ends. Boxes are compared at the
+middle and the end of token steps.
+
+The cost of a conflict is that of an overlap, discounted by how much later it comes. The
+costs of all tokens are known, so that what is learned is their expectation itself, without
+the noise of sampling (all-action policy gradient, Ciosek and Whiteson 2018).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor
+
+from infgen.geometry import boxes_overlap, to_local, to_world, wrap_angle
+from infgen.model.batching.batch import Agents
+from infgen.model.training.policy_gradient.braking import AgentPath, braking_arc_m
+from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
+from infgen.scene import AgentType
+from infgen.tokens.vocabulary import MotionVocabulary
+
+LOOK_AHEAD_TOKENS = 5
+"""Token steps, that of the motion token included, in which overlaps are looked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conflicts:
+    """Motion tokens in conflict.
+
+    Attributes:
+        at: Rollout, token step at whose end the motion token ends, agent, motion token.
+        cost: Its cost, 1 for an overlap at the end of the motion token.
+    """
+
+    at: Int64[Tensor, "conflict 4"]
+    cost: Float32[Tensor, " conflict"]
+
+    def sampled(self, agents: Agents) -> Float32[Tensor, ""]:
+        """Sum the costs of the motion tokens that were sampled."""
+        rollout, token, agent, motion_token = self.at.T
+        return self.cost[agents.motion_token[rollout, token, agent] == motion_token].sum()
+
+    def only(self, rows: slice) -> "Conflicts":
+        """Take those of some rollouts, numbered from the first of them."""
+        rollout = self.at[:, 0]
+        some = (rollout >= rows.start) & (rollout < rows.stop)
+        at = self.at[some]
+        at[:, 0] -= rows.start
+        return Conflicts(at, self.cost[some])
+
+
+def find_conflicts(
+    rollouts: SimulatedRollouts, vocabulary: MotionVocabulary, discount: float
+) -> Conflicts:
+    """Find the motion tokens in conflict among those that might have been sampled.
+
+    Args:
+        rollouts: Simulated agents, with the motion tokens that might have been sampled.
+        vocabulary: Of the motion tokens.
+        discount: Factor on the cost for each token step that an overlap comes later.
+    """
+    nucleus = rollouts.nucleus.numpy(force=True)
+    cost = np.zeros(len(nucleus), dtype=np.float32)
+    seen, token = _Seen.of(rollouts), nucleus[:, 1]
+    order = np.argsort(token, kind="stable")
+    each, begin = np.unique(token[order], return_index=True)
+    for at, some in zip(each.tolist(), np.split(order, begin[1:]), strict=True):
+        rollout, _, agent, motion_token = nucleus[some].T
+        choices = _Choices.of(seen, at, (rollout, agent), motion_token, vocabulary)
+        cost[some] = choices.costs(seen, discount)
+    conflict = np.flatnonzero(cost)
+    device = rollouts.moved.device
+    return Conflicts(
+        torch.from_numpy(nucleus[conflict]).to(device),
+        torch.from_numpy(cost[conflict]).to(device),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """Simulated agents on the host, as ``Agents`` has them, twice in a token step.
+
+    Token step t ends at time 2 t. In the middle agents are halfway between two ends.
+    """
+
+    pose: Float32[np.ndarray, "rollout time agent 3"]
+    size_lw_m: Float32[np.ndarray, "rollout agent 2"]
+    agent_type: np.ndarray
+    visible: Bool[np.ndarray, "rollout time agent"]
+
+    @classmethod
+    def of(cls, rollouts: SimulatedRollouts) -> "_Seen":
+        agents = rollouts.batch.agents
+        found = agents.pose, agents.visible, agents.size_lwh_m[..., :2], agents.agent_type
+        ends, seen, size_lw_m, agent_type = (each.numpy(force=True) for each in found)
+        pose, visible = ends.repeat(2, axis=1)[:, 1:], seen.repeat(2, axis=1)[:, 1:]
+        change = np.diff(ends, axis=1)
+        change[..., 2] = wrap_angle(change[..., 2])
+        pose[:, 1::2] -= change / 2
+        visible[:, 1::2] &= seen[:, :-1]
+        return cls(pose, size_lw_m, agent_type, visible)
+
+
+@dataclass(frozen=True, slots=True)
+class _Choices:
+    """Motion tokens that agents might sample at a token step, and where they lead.
+
+    Attributes:
+        times: Times of ``_Seen`` in this token step and the next ones, without its begin.
+        rollout: Of each agent [row].
+        agent: Its row in the rollout [row].
+        row: Whose each motion token is, in order [choice].
+        pose: Poses after it, and then braking, at the times [choice, time, 3].
+        reach_m: Longest way of each agent until each time [row, time].
+    """
+
+    times: slice
+    rollout: Int64[np.ndarray, " row"]
+    agent: Int64[np.ndarray, " row"]
+    row: Int64[np.ndarray, " choice"]
+    pose: Float32[np.ndarray, "choice time 3"]
+    reach_m: Float32[np.ndarray, "row time"]
+
+    @classmethod
+    def of(
+        cls,
+        seen: _Seen,
+        token: int,
+        of: tuple[np.ndarray, np.ndarray],
+        motion_token: np.ndarray,
+        vocabulary: MotionVocabulary,
+    ) -> "_Choices":
+        """Brake after every motion token, all agents ``of`` one after the other."""
+        rollout, agent = of
+        first = np.ones(len(rollout), dtype=bool)
+        first[1:] = (np.diff(rollout) != 0) | (np.diff(agent) != 0)
+        row, (rollout, agent) = first.cumsum() - 1, (rollout[first], agent[first])
+        begin = 2 * (token - 1)
+        times = slice(begin + 1, min(begin + 2 * LOOK_AHEAD_TOKENS + 1, seen.pose.shape[1]))
+        at = rollout, slice(begin, times.stop), agent
+        path = AgentPath.of(seen.pose[at], seen.visible[at])
+        end = vocabulary.end_pose[seen.agent_type[rollout, agent][row], motion_token]
+        arc_m = braking_arc_m(end[:, 0].clip(min=0), times.stop - times.start)
+        pose = path.at(row, arc_m)
+        middle, straight = (to_world(x, path.pose[row, 0]) for x in (end / 2, end))
+        aside_m = np.zeros_like(straight)
+        aside_m[:, 1] = to_local(straight, pose[:, 1])[:, 1]
+        pose = to_world(aside_m[:, None], pose)
+        pose[:, 0], pose[:, 1] = middle, straight
+        reach_m = np.zeros((len(rollout), arc_m.shape[1]), dtype=np.float32)
+        np.maximum.at(reach_m, row, arc_m)
+        return cls(times, rollout, agent, row, pose, reach_m)
+
+    def costs(self, seen: _Seen, discount: float) -> Float32[np.ndarray, " choice"]:
+        """Costs of conflicts; zero where there is none."""
+        cost = np.zeros(len(self.row), dtype=np.float32)
+        row, time, other = self._near(seen)
+        pair, choice = self._with_choices(row)
+        row, time, other = row[pair], time[pair], other[pair]
+        rollout = self.rollout[row]
+        hits = boxes_overlap(
+            self.pose[choice, time],
+            seen.size_lw_m[rollout, self.agent[row]],
+            seen.pose[rollout, self.times.start + time, other],
+            seen.size_lw_m[rollout, other],
+        )
+        later = (time[hits] // 2).astype(np.float32)
+        np.maximum.at(cost, choice[hits], discount**later)
+        return cost
+
+    def _with_choices(self, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Go through all choices of rows: position in ``row``, and choice."""
+        count = np.bincount(self.row, minlength=len(self.rollout))
+        begin = (count.cumsum() - count)[row]
+        count = count[row]
+        position = np.arange(len(row)).repeat(count)
+        within = np.arange(len(position)) - (count.cumsum() - count)[position]
+        return position, begin[position] + within
+
+    def _near(self, seen: _Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Agents ahead that might be run into: row, time, row of the other agent."""
+        each, start = np.arange(len(self.rollout)), self.times.start - 1
+        others, own = (
+            seen.pose[self.rollout, start],
+            seen.pose[self.rollout, start, self.agent],
+        )
+        there = seen.visible[self.rollout, start]
+        there[each, self.agent] = False
+        ahead_m = to_local(others, np.broadcast_to(own[:, None], others.shape))[..., 0]
+        walks = seen.agent_type[self.rollout] == AgentType.PEDESTRIAN
+        there &= (ahead_m > 0) & ~(walks & walks[each, self.agent][:, None])
+        sizes = seen.size_lw_m[self.rollout]
+        size = sizes[each, self.agent]
+        reach_m = self.reach_m[..., None] + _radius_m(sizes)[:, None]
+        reach_m += _radius_m(size)[:, None, None]
+        later = seen.pose[self.rollout, self.times]
+        near = np.linalg.norm((later - own[:, None, None])[..., :2], axis=-1) < reach_m
+        near &= seen.visible[self.rollout, self.times] & there[:, None]
+        row, other = near.any(axis=1).nonzero()
+        began = boxes_overlap(own[row], size[row], others[row, other], sizes[row, other])
+        near[row[began], :, other[began]] = False
+        return near.nonzero()
+
+
+def _radius_m(size_lw_m: np.ndarray) -> np.ndarray:
+    """Radius of the circle around a box."""
+    return np.hypot(size_lw_m[..., 0], size_lw_m[..., 1]) / 2

@@ -1,0 +1,147 @@
+"""Conflicts of scenes that are drawn by hand: boxes are 4 by 2 m, token k goes k metres."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from infgen.geometry import to_world
+from infgen.model.training.policy_gradient.braking import BRAKES_MPS2
+from infgen.model.training.policy_gradient.conflicts import find_conflicts
+from infgen.scene import AgentType
+
+TOKENS = 7
+DISCOUNT = 0.9
+
+
+def still(x_m, y_m=0.0):
+    """An agent that stands."""
+    return [[x_m, y_m, 0.0]] * TOKENS
+
+
+def costs(drawn, metres, *ways, agent=0, **changed):
+    """Costs of every motion token that an agent might sample at the first token step."""
+    rollouts = drawn(np.stack(ways, axis=1)[None])
+    agents = replace(rollouts.batch.agents, **changed)
+    choices = torch.arange(metres.num_motion_tokens)
+    at = torch.tensor([0, 1, agent]).expand(len(choices), 3)
+    rollouts = replace(
+        rollouts,
+        batch=replace(rollouts.batch, agents=agents),
+        nucleus=torch.cat([at, choices[:, None]], dim=1),
+    )
+    found = find_conflicts(rollouts, metres, DISCOUNT)
+    cost = torch.zeros(len(choices))
+    cost[found.at[:, 3]] = found.cost
+    return cost.tolist()
+
+
+def first_conflict(drawn, metres, *ways, **changed):
+    """The shortest motion token in conflict; all longer ones are, up to 30 m/s."""
+    found = costs(drawn, metres, *ways, **changed)
+    first = next((at for at, cost in enumerate(found) if cost), len(found))
+    assert all(found[first:16])
+    return first
+
+
+def braked_m(token_m, time):
+    """Way of a token, and of braking, until a quarter of a second times ``time + 1``."""
+    speed_mps, way_m = 2.0 * token_m, token_m / 2 * min(time + 1, 2)
+    for _ in range(500 * (time - 1)):
+        slower_mps = max(0.0, speed_mps - BRAKES_MPS2 * 0.0005)
+        way_m += 0.0005 * (speed_mps + slower_mps) / 2
+        speed_mps = slower_mps
+    return way_m
+
+
+@pytest.mark.parametrize("gap_m", [5.5, 11.0, 20.0])
+def test_a_token_is_in_conflict_if_braking_after_it_does_not_avert_it(drawn, metres, gap_m):
+    found = costs(drawn, metres, still(0), still(gap_m))
+
+    # Boxes overlap while their centres are less than 4 m apart.
+    for token_m, cost in enumerate(found):
+        hits = [abs(gap_m - braked_m(token_m, time)) < 4 for time in range(10)]
+        expected = DISCOUNT ** (hits.index(True) // 2) if any(hits) else 0.0
+        assert cost == pytest.approx(expected), token_m
+
+
+def test_others_move_as_they_did_in_the_rollout(drawn, metres):
+    leads = [[12 + 5 * at, 0, 0] for at in range(TOKENS)]
+    meets = [[24 - 5 * at, 0, np.pi] for at in range(TOKENS)]
+
+    stands, goes = (
+        first_conflict(drawn, metres, still(0), way) for way in (still(12), leads)
+    )
+
+    assert stands < goes
+    assert costs(drawn, metres, still(0), meets)[0] > 0  # It has the other one ahead.
+
+
+def test_who_is_run_into_from_behind_has_no_conflict(drawn, metres):
+    behind = [[-12 + 3 * at, 0, 0] for at in range(TOKENS)]
+
+    assert not any(costs(drawn, metres, still(0), behind))
+
+
+def test_an_agent_that_was_not_there_yet_is_no_conflict(drawn, metres):
+    ways = still(0), still(8)
+    observed = torch.ones((1, TOKENS, 2), dtype=torch.bool)
+    observed[:, 0, 1] = False
+
+    assert any(costs(drawn, metres, *ways))
+    assert not any(costs(drawn, metres, *ways, observed=observed))
+
+
+def test_who_overlapped_from_the_beginning_has_no_conflict(drawn, metres):
+    assert not any(costs(drawn, metres, still(0), still(2)))
+
+
+def test_two_pedestrians_have_no_conflict(drawn, metres):
+    walks = torch.full((1, 2), int(AgentType.PEDESTRIAN))
+
+    assert not any(costs(drawn, metres, still(0), still(8), agent_type=walks))
+
+
+def test_an_agent_that_brakes_keeps_to_its_own_way(drawn, metres):
+    """It turns left on a circle of 12 m: what is straight ahead of it is not on its way."""
+    angle = np.arange(TOKENS) * 5 / 12
+    turns = np.stack([12 * np.sin(angle), 12 * (1 - np.cos(angle)), angle], axis=1)
+    ahead, on_way = still(15), [[10.0, 6.5, 0.7]] * TOKENS
+
+    # The token itself goes straight ahead, and only what follows turns.
+    assert first_conflict(drawn, metres, still(0), ahead) == 4
+    assert costs(drawn, metres, turns, ahead)[:8] == [0.0] * 8
+    assert costs(drawn, metres, turns, on_way)[5] > 0
+    assert not any(costs(drawn, metres, still(0), on_way)[:8])
+
+
+def test_conflicts_do_not_depend_on_where_the_scene_lies(drawn, metres):
+    turns = [[4 * at, 0.3 * at**2, 0.15 * at] for at in range(TOKENS)]
+    crosses = [[16, -15 + 5 * at, np.pi / 2] for at in range(TOKENS)]
+    ways = [np.asarray(way, dtype=np.float64) for way in (turns, crosses)]
+    frame = np.array([31.0, -12.0, 2.5])
+
+    here, there = (
+        costs(drawn, metres, *placed)
+        for placed in (ways, [to_world(way, frame) for way in ways])
+    )
+
+    assert any(here)
+    assert here == there
+
+
+def test_rollouts_are_taken_by_their_rows(drawn, metres):
+    rollouts = drawn(np.array([np.stack([still(0), still(x)], axis=1) for x in (5, 5, 50)]))
+    choices = [[rollout, 1, 0, 9] for rollout in range(3)]
+    rollouts = replace(rollouts, nucleus=torch.tensor(choices))
+
+    found = find_conflicts(rollouts, metres, DISCOUNT)
+
+    assert found.at[:, 0].tolist() == [0, 1]
+    assert found.only(slice(1, 3)).at.tolist() == [[0, 1, 0, 9]]
+    assert not len(found.only(slice(2, 3)).at)
+    agents = rollouts.batch.agents
+    assert not found.sampled(agents)
+    agents.motion_token[0, 1, 0] = 9
+    assert found.sampled(agents) == found.cost[0]
