@@ -23,8 +23,8 @@ from torch import Tensor
 from traffic_drift import STILL_M
 
 from infgen.model.batching.batch import Agents
+from infgen.model.features.signals import CLASSES, LONG_SINCE, StopLines
 from infgen.model.network import Network
-from infgen.model.signal_features import CLASSES, LONG_SINCE, StopLines
 from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import SceneTokens, SignalClass
 from pipeline.commands.screen import show_table

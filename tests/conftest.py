@@ -40,15 +40,17 @@ def pytest_configure() -> None:
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add what CI asks for: all slow tests take an hour there."""
     parser.addoption(
-        "--one-case",
-        action="store_true",
-        help="run one case of each slow test, drawn by the seed of the order of tests",
+        "--slow-share",
+        type=float,
+        help="run one case each of this share of the slow tests; tests and cases are drawn "
+        "by the seed of the order of tests",
     )
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect all but one case of each slow test, with ``--one-case``."""
-    if not config.getoption("one_case"):
+    """Deselect all but one case each of a share of the slow tests, with that option."""
+    share = config.getoption("slow_share")
+    if share is None:
         return
     cases: dict[str, list[str]] = {}
     slow = [item.nodeid for item in items if item.get_closest_marker("slow")]
@@ -56,7 +58,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         cases.setdefault(case.partition("[")[0], []).append(case)
     # Every process that tests draws the same ones.
     draw = random.Random(config.getoption("randomly_seed", 0))
-    drawn = {draw.choice(sorted(some)) for _, some in sorted(cases.items())}
+    tests = draw.sample(sorted(cases), round(share * len(cases)))
+    drawn = {draw.choice(sorted(cases[test])) for test in tests}
     deselected = set(slow) - drawn
     config.hook.pytest_deselected(items=[i for i in items if i.nodeid in deselected])
     items[:] = [item for item in items if item.nodeid not in deselected]

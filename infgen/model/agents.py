@@ -10,6 +10,9 @@ from torch import Tensor, nn
 
 from infgen.clock import CLOCK
 from infgen.model.attention.neighbour_attention import Shared
+from infgen.model.features.approach import ApproachFeatures, MovingPairs
+from infgen.model.features.removal import EgoPlace, RemovalFeatures
+from infgen.model.features.signals import SignalAhead
 from infgen.model.layers import (
     Attention,
     AttentionSources,
@@ -29,10 +32,8 @@ from infgen.model.long_memory import (
 from infgen.model.motion_head import MotionHead
 from infgen.model.neighbours import MapFeatures, NeighbourRows, NeighbourSpec
 from infgen.model.relations import Rows, direction, relation_embedding
-from infgen.model.removal_features import EgoPlace, RemovalFeatures
 from infgen.model.rotary.turns import turned
 from infgen.model.settings import ModelSettings
-from infgen.model.signal_features import SignalAhead
 from infgen.scene import AgentType
 from infgen.tokens.grid import Grid
 from infgen.tokens.scene_tokens import (
@@ -81,6 +82,13 @@ class AgentRows:
     cell: Tensor
     ego: Tensor
     standing: Standing | None
+
+    def moving(self, around: NeighbourRows) -> MovingPairs:
+        """Return how they move, and the others around each."""
+        known = self.known & (self.presence != int(Presence.INSERTED))
+        step_m = (self.pose - self.before)[:, :2] * known[:, None]
+        size_lw_m = self.size_lwh_m[:, :2]
+        return MovingPairs(self.pose, step_m, size_lw_m, around.index, around.present)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +197,7 @@ class AgentContext:
         past_turn: By what features are turned by heading and time [N, P], if they are.
         roads: Map tokens around them.
         agents: Rows of the agents around them.
-        light: Features of the signals ahead [N, D], if they are used.
+        added: Added to their features [N, D], if anything is: ``MotionStack.added``.
         density: Agents around the ego of each [N], if that is used.
         ego_place: Where they are to the ego [N], if that is used.
     """
@@ -199,7 +207,7 @@ class AgentContext:
     past_turn: Tensor | None
     roads: AttentionSources
     agents: NeighbourRows
-    light: Tensor | None
+    added: Tensor | None
     density: Density | None
     ego_place: EgoPlace | None
 
@@ -259,6 +267,7 @@ class MotionStack(nn.Module):
         self.pattern = mlp(width, width, NUM_PATTERNS) if patterns else None
         ahead_m = settings.signal_ahead_m
         self.light = SignalAhead(width, ahead_m) if ahead_m else None
+        self.approach = ApproachFeatures(width) if settings.approach_features else None
 
     def map_reach(self) -> NeighbourSpec:
         """How agents see roads."""
@@ -278,18 +287,34 @@ class MotionStack(nn.Module):
             s.agent_agent_radius_m, s.agent_agent_neighbours, self.agents_relation
         )
 
-    def lights_ahead(
-        self, roads: MapFeatures, pose: Tensor, scene: Tensor, token: Tensor
+    def added(
+        self,
+        agents: AgentRows,
+        around: NeighbourRows,
+        roads: MapFeatures,
+        scene: Tensor,
+        token: Tensor,
     ) -> Tensor | None:
-        """Tell agents on maps [N] at token steps [N] what the lights ahead show [N, D]."""
-        if self.light is None or roads.lines is None:
-            return None
-        told: Tensor = self.light(roads.lines, pose, scene, token)
-        return told
+        """Tell agents what the signals ahead show, and who comes near [N, D].
+
+        Args:
+            agents: The agents.
+            around: Others around each.
+            roads: Maps.
+            scene: Map of each [N].
+            token: Token step of each [N].
+        """
+        found: Tensor | None = None
+        if self.light is not None and roads.lines is not None:
+            found = self.light(roads.lines, agents.pose, scene, token)
+        if self.approach is not None:
+            coming: Tensor = self.approach(agents.moving(around))
+            found = coming if found is None else found + coming
+        return found
 
     def forward(self, x_ND: Tensor, past_index: Tensor, sight: AgentContext) -> Tensor:
         """Update the agents of all tokens; ``past_index`` are rows of their own past."""
-        x_ND = x_ND if sight.light is None else x_ND + sight.light
+        x_ND = x_ND if sight.added is None else x_ND + sight.added
         for block in self.blocks:
             past = AttentionSources(
                 turned(normed(x_ND), sight.past_turn),

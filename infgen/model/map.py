@@ -7,13 +7,13 @@ from torch import Tensor, nn
 
 from infgen.model.batching.batch import MapTokens
 from infgen.model.device.index import MapIndex
+from infgen.model.features.signals import StopLines
 from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.map_grid import MapGrid
 from infgen.model.neighbours import MapFeatures, NeighbourRows, NeighbourSpec, SignalStates
 from infgen.model.relations import Rows, relation_embedding, turn_of_rows
 from infgen.model.rotary.turns import turned
 from infgen.model.settings import ModelSettings
-from infgen.model.signal_features import StopLines
 from infgen.tokens.map import PointType, PolylineType
 from infgen.tokens.scene_tokens import SignalClass
 from infgen.tokens.signals import REMEMBERED

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from infgen.model.attention.neighbour_attention import Shared
+from infgen.model.features.signals import StopLines
 from infgen.model.layers import AttentionSources
 from infgen.model.map_grid import MapGrid
 from infgen.model.relations import (
@@ -21,7 +22,6 @@ from infgen.model.relations import (
     nearest,
     within_radius,
 )
-from infgen.model.signal_features import StopLines
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,9 +10,11 @@ from infgen.clock import CLOCK
 from infgen.model.agents import AgentContext, AgentEmbedding, AgentRows, MotionStack
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import Agents, Batch
-from infgen.model.cell_features import CellSources, OffsetEmbedding, OffsetFeatures
 from infgen.model.device.index import BatchIndex
 from infgen.model.device.together import launched_together
+from infgen.model.features.approach import ApproachFeatures
+from infgen.model.features.cells import CellSources, OffsetEmbedding, OffsetFeatures
+from infgen.model.features.removal import EgoPlace, RemovalFeatures
 from infgen.model.insertion import CellStack, DetailStack
 from infgen.model.layers import initialise, normed
 from infgen.model.logits import (
@@ -41,7 +43,6 @@ from infgen.model.neighbours import (
     find_others,
 )
 from infgen.model.relations import Rows, describe_pairs
-from infgen.model.removal_features import EgoPlace, RemovalFeatures
 from infgen.model.rotary.turns import turned
 from infgen.model.settings import ModelSettings
 from infgen.tokens.grid import Grid, make_grid
@@ -53,9 +54,8 @@ EGO = 0
 """Row of the ego, in batches as in simulation."""
 
 
-AddedPart = (
-    DensityFeatures | StandingFeatures | RemovalFeatures | OffsetEmbedding | OffsetFeatures
-)
+AgentFeatures = DensityFeatures | StandingFeatures | RemovalFeatures | ApproachFeatures
+AddedPart = AgentFeatures | OffsetEmbedding | OffsetFeatures
 """Parts that may be added to trained weights."""
 
 
@@ -165,7 +165,7 @@ class Network(nn.Module):
         density = self._density(agents)
         as_logged = index is not None  # Rows are never taken over in logs.
         return Outputs(
-            motion=self._motion(agents, rows, x, roads, density, as_logged),
+            motion=self._motion(agents, rows, given, x, roads, density, as_logged),
             entries=None
             if cells is None
             else _entries(cells, batch, asked, rows, raw, shown, roads, density),
@@ -188,6 +188,7 @@ class Network(nn.Module):
         self,
         agents: Agents,
         rows: Rows,
+        given: AgentRows,
         x: Tensor,
         roads: MapFeatures,
         density: Density | None,
@@ -199,20 +200,19 @@ class Network(nn.Module):
         by_token = Rows(rows.at, rows.number.flatten(0, 1))
         pose = agents.pose.flatten(0, 1)  # [scene token, agent, 3]
         visible = visible.flatten(0, 1)
-        own_pose = rows.pack(agents.pose)
         past_index, past_present, past_relation = self._past(agents, rows, as_logged)
         reach, token = self.motion.map_reach(), _tokens(agents, rows)
+        around = find_others(self.motion.agents_reach(), by_token, pose, visible)
+        of_row = rows.at // agents.visible[0].numel()
         sight = AgentContext(
             past_relation,
             past_present,
-            self.motion.past_relation.turn(own_pose, token),
+            self.motion.past_relation.turn(given.pose, token),
             find_map_neighbours(
                 reach, by_scene, agents.pose.flatten(1, 2), roads, scene, token
             ),
-            find_others(self.motion.agents_reach(), by_token, pose, visible),
-            self.motion.lights_ahead(
-                roads, own_pose, rows.at // agents.visible[0].numel(), token
-            ),
+            around,
+            self.motion.added(given, around, roads, of_row, token),
             None if density is None else density.take(rows.at // visible.shape[1]),
             _ego_place(agents, rows) if self.motion.ego_place is not None else None,
         )

@@ -107,6 +107,9 @@ class ModelSettings:
     removal_features: Bool = False
     """Whether removal knows how far an agent is from the ego, in which direction, and
     whether it comes nearer: logs lose sight of agents at the edge of what the ego sees."""
+    approach_features: Bool = False
+    """Whether agents know how others around them move relative to themselves, pair by pair,
+    and when and how near they would meet: attention only adds up places and motions."""
     signal_ahead_m: NonNegative = 0.0
     """Every agent sees the signal of its own lane up to so far ahead, and how long it has
     shown that; 0 to see it only among all other map tokens."""

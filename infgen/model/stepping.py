@@ -29,7 +29,8 @@ from torch import Tensor
 from infgen.model.agents import AgentContext, AgentRows
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import MapTokens
-from infgen.model.cell_features import CellSources
+from infgen.model.features.cells import CellSources
+from infgen.model.features.removal import EgoPlace
 from infgen.model.insertion import DetailQuery, InsertionBlocks, InsertionDetails
 from infgen.model.layers import AttentionSources, full_precision, normed
 from infgen.model.long_memory import Density, Standing, count_around, standing_after
@@ -43,7 +44,6 @@ from infgen.model.neighbours import (
 )
 from infgen.model.network import EGO, Network
 from infgen.model.relations import Rows, describe_pairs, within_radius
-from infgen.model.removal_features import EgoPlace
 from infgen.model.rotary.turns import turned, turned_back
 from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.token_step import MotionStep, PositionOutputs, TokenStep
@@ -126,9 +126,9 @@ class Stepper:
         rows = Rows.where(visible) if rows is None else rows
         memory.visible &= (token_step.presence != int(Presence.INSERTED))[..., None]
         standing = standing_after(memory.standing, *memory.last(), token_step)
-        x = self._embed(*memory.last(), standing, token_step, rows)
-        sight = self._context(memory, token_step, rows)
-        x = x if sight.light is None else x + sight.light
+        agents = _agent_rows(*memory.last(), standing, token_step, rows)
+        x, sight = self._embed(agents), self._context(memory, token_step, rows, agents)
+        x = x if sight.added is None else x + sight.added
         place = memory.columns % memory.window
         ring = torch.arange(memory.window, device=visible.device)
         past_index = rows.at[:, None] * memory.window + ring
@@ -228,7 +228,8 @@ class Stepper:
         ego_pose = token_step.pose[:, EGO, None].expand_as(token_step.pose)
         reach, pose = self._asked().cell_agents, fresh.pack(token_step.pose)
         related = reach.describe(fresh.pack(ego_pose), pose[:, None]).values[:, 0]
-        embedded = normed(self._embed(*before, standing, token_step, fresh))
+        agents = _agent_rows(*before, standing, token_step, fresh)
+        embedded = normed(self._embed(agents))
         embedded = turned(embedded, reach.relation.turn(pose))
         within = came & within_radius(ego_pose, token_step.pose, reach.radius_m)
         for kept, new in ((entries.raw, embedded), (entries.relation, related)):
@@ -336,39 +337,19 @@ class Stepper:
             self.network.settings.position_query_radius_m,
         )
 
-    def _embed(
-        self,
-        before: Tensor,
-        known: Tensor,
-        standing: Standing | None,
-        token_step: TokenStep,
-        rows: Rows,
-    ) -> Tensor:
-        """Embed some rows of a token step, given the poses known before it."""
-        agents = AgentRows(
-            agent_type=rows.pack(token_step.agent_type),
-            size_lwh_m=rows.pack(token_step.size_lwh_m),
-            pose=rows.pack(token_step.pose),
-            before=rows.pack(before),
-            known=rows.pack(known),
-            motion_token=rows.pack(token_step.motion_token),
-            presence=rows.pack(token_step.presence),
-            cell=rows.pack(token_step.cell),
-            ego=rows.at % token_step.cell.shape[-1] == EGO,
-            standing=None if standing is None else standing.take(rows.at),
-        )
+    def _embed(self, agents: AgentRows) -> Tensor:
         embedded: Tensor = self.network.embed(agents, self._tables)
         return embedded
 
     def _context(
-        self, memory: StepMemory, token_step: TokenStep, rows: Rows
+        self, memory: StepMemory, token_step: TokenStep, rows: Rows, agents: AgentRows
     ) -> AgentContext:
         """What the visible rows of a column see."""
         visible = token_step.visible
         around = find_others(self._agents_reach, rows, token_step.pose, visible)
-        pose, rollout = rows.pack(token_step.pose), rows.at // visible.shape[1]
+        pose, rollout = agents.pose, rows.at // visible.shape[1]
         scene, token = memory.scene[rollout], memory.columns - memory.begun[rollout]
-        light = self.network.motion.lights_ahead(memory.roads, pose, scene, token)
+        added = self.network.motion.added(agents, around, memory.roads, scene, token)
         roads = find_map_neighbours(
             self._map_reach, rows, token_step.pose, memory.roads, memory.scene, token
         )
@@ -385,14 +366,35 @@ class Stepper:
             density = Density(count, memory.averages_before(count)).take(rollout)
         ego_place = None
         if self.network.motion.ego_place is not None:
-            before, known = memory.last()
             ego_place = EgoPlace(
                 pose,
                 token_step.pose[:, EGO][rollout],
-                rows.pack(before),
-                before[:, EGO][rollout],
-                rows.pack(known),
+                agents.before,
+                memory.last()[0][:, EGO][rollout],
+                agents.known,
             )
         return AgentContext(
-            Shared.of(related), past, turn, roads, around, light, density, ego_place
+            Shared.of(related), past, turn, roads, around, added, density, ego_place
         )
+
+
+def _agent_rows(
+    before: Tensor,
+    known: Tensor,
+    standing: Standing | None,
+    token_step: TokenStep,
+    rows: Rows,
+) -> AgentRows:
+    """Take some rows of a token step, given the poses known before it."""
+    return AgentRows(
+        agent_type=rows.pack(token_step.agent_type),
+        size_lwh_m=rows.pack(token_step.size_lwh_m),
+        pose=rows.pack(token_step.pose),
+        before=rows.pack(before),
+        known=rows.pack(known),
+        motion_token=rows.pack(token_step.motion_token),
+        presence=rows.pack(token_step.presence),
+        cell=rows.pack(token_step.cell),
+        ego=rows.at % token_step.cell.shape[-1] == EGO,
+        standing=None if standing is None else standing.take(rows.at),
+    )

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from infgen.clock import CLOCK
 from infgen.model.batching.batch import MapTokens, collate_maps, to_device
+from infgen.model.features.signals import StopLines
 from infgen.model.neighbours import MapFeatures
-from infgen.model.signal_features import StopLines
 from infgen.rollout.recording import RolloutStart
 from infgen.rollout.rules.density import DensityControl, Segments, segments_of
 from infgen.rollout.rules.insertion_mask import InsertionMask, make_insertion_mask

@@ -284,6 +284,7 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
             "density_features": True,
             "standing_features": True,
             "removal_features": True,
+            "approach_features": True,
         },
         {"motion_noise_neighbours": 5, "closed_loop_population": True},
     ),

@@ -12,9 +12,9 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from infgen.model.batching.batch import Batch, MapTokens
+from infgen.model.features.signals import StopLines
 from infgen.model.map_grid import MapGrid
 from infgen.model.relations import Rows
-from infgen.model.signal_features import StopLines
 
 MOST_SQUARES = 40
 """Searches of the map cross no more of its squares in a row: circles of 190 m."""

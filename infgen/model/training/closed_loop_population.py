@@ -11,8 +11,7 @@ removes agents while the scene is simulated, and learns from the state that it g
   corrected by a share of the excess: half of the correction by insertions, half by
   removals, so that in the mean the flow is that of the log. To be inserted are missing
   agents, those first that came into view last; to be removed are those whom the log
-  removes, and of the surplus those far from the ego whom the network is most ready to
-  remove.
+  removes, and of the surplus those whom the network is most ready to remove.
 - An insertion that the network makes is that of the next agent to be inserted, at its
   logged pose; or of one that it samples, and then nothing is learned of later turns.
 
@@ -53,9 +52,6 @@ SURPLUS_TOP_K = 32
 FRESH_TOKENS = 2
 """An agent that came into view at most so many token steps ago is fresh: it is still about
 where agents come into view."""
-KEPT_WITHIN = 0.4
-"""Surplus agents within this share of the grid radius from the ego are not to be removed:
-logs hardly ever end there, and the network would learn that they do."""
 
 
 @torch.no_grad()
@@ -217,10 +213,8 @@ class _PopulationLoop(Simulation):
         if logit is None:
             return
         more = self._correction(self._excess(token - 1, inserted=True))
-        pose = self.played.pose[:, token - 1]
-        away_m = (pose[..., :2] - pose[:, EGO, None, :2]).norm(dim=-1)
-        far = surplus & (away_m > KEPT_WITHIN * self.network.grid.radius_m)
-        ready = _first(logit.masked_fill(~far, -torch.inf), more) & far
+        readiness = logit.masked_fill(~surplus, -torch.inf)
+        ready = _first(readiness, more) & surplus
         removal |= ready
         self.played.told[:, token] |= known & ready
         leaving = matched & removal

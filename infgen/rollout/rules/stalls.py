@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 
 from infgen.geometry import wrap_angle
-from infgen.model.signal_features import StopLines
+from infgen.model.features.signals import StopLines
 from infgen.rollout.population import Population
 from infgen.rollout.recording import NO_AGENT
 from infgen.rollout.rules.off_road import lane_segments

@@ -11,7 +11,6 @@ from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.batching.supervision import stay_mask
 from infgen.model.training.closed_loop_population import (
     CORRECTION_TOKENS,
-    KEPT_WITHIN,
     close_population_loop,
 )
 from infgen.model.training.losses import losses, total
@@ -179,19 +178,6 @@ def test_a_network_that_inserts_always_is_to_remove_some_surplus_and_learns_noth
     mask = stay_mask(agents)
     assert not (mask[:, :-1] & ~agents.told[:, 1:]).any()
     assert not played.entries.add[:, 3:, 1:].any()
-
-
-def test_surplus_agents_near_the_ego_are_not_to_be_removed(new_network, logged):
-    network = biased(new_network().eval(), add=ALWAYS, remove=NEVER)
-    rows, radius_m = logged.agents.presence.shape[2], network.grid.radius_m
-
-    removed = []
-    for seed in range(4):
-        agents = close_population_loop(network, logged, 3, seed).agents
-        away_m = (agents.pose[..., :2] - agents.pose[:, :, :1, :2]).norm(dim=-1)
-        removed.append(away_m[:, :-1, rows:][agents.removal[:, 1:, rows:]])
-
-    assert torch.cat(removed).min() > KEPT_WITHIN * radius_m
 
 
 @pytest.mark.parametrize("add", [None, NEVER, ALWAYS])

@@ -121,7 +121,11 @@ def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_i
 
 
 ADDED = dict.fromkeys(
-    ("density_features", "standing_features", "removal_features", "offset_token"), True
+    (
+        *("density_features", "standing_features", "removal_features"),
+        *("approach_features", "offset_token"),
+    ),
+    True,
 )
 
 

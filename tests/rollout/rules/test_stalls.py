@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from infgen.model.signal_features import StopLines
+from infgen.model.features.signals import StopLines
 from infgen.rollout.recording import NO_AGENT
 from infgen.rollout.rules.stalls import AWAY_M, IN_LANE_M, WAITS_M, StallRule
 from infgen.rollout.session import Session
 from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence, SignalClass
 from infgen.tokens.signals import REMEMBERED
-from tests.model.test_signal_features import roads
+from tests.model.features.test_signals import roads
 from tests.rollout.rules.test_collision import everyone
 from tests.rollout.rules.test_off_road import street
 from tests.rollout.single_rules import only

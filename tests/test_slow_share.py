@@ -1,4 +1,4 @@
-"""CI runs one case of each slow test, drawn by the seed of the order of tests."""
+"""CI runs a share of the slow tests, drawn by the seed of the order of tests."""
 
 from types import SimpleNamespace
 
@@ -20,9 +20,9 @@ ITEMS += [Item(nodeid="test_a.py::test_kill[fast]", slow=False)]
 
 @pytest.fixture
 def collected():
-    def collect(seed, *, asked=True, order=1):
+    def collect(seed, share=1.0, *, order=1):
         items, left_out = ITEMS[::order], []
-        options = {"one_case": asked, "randomly_seed": seed}
+        options = {"slow_share": share, "randomly_seed": seed}
         hook = SimpleNamespace(pytest_deselected=lambda items: left_out.extend(items))
         config = SimpleNamespace(getoption=lambda name, *_: options[name], hook=hook)
         pytest_collection_modifyitems(config, items)
@@ -43,5 +43,13 @@ def test_all_processes_draw_the_same_cases_in_whatever_order_they_see_them(colle
     assert collected(5) == collected(5, order=-1)
 
 
-def test_every_case_is_drawn_by_some_seed(collected):
-    assert set.union(*(collected(seed) for seed in range(99))) == collected(0, asked=False)
+def test_of_half_the_slow_tests_there_is_one_case_each(collected):
+    assert len(collected(0, 0.5)) == 1 + 3 + 1
+    assert len(collected(0, 0.0)) == 3 + 1
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_every_case_is_drawn_by_some_seed(collected, share):
+    drawn = set.union(*(collected(seed, share) for seed in range(99)))
+
+    assert drawn == collected(0, None)

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from infgen.config import ModelSettings
 from infgen.model.batching.batch import MapTokens
-from infgen.model.signal_features import CLASSES, LONG_SINCE, StopLines, features
+from infgen.model.features.signals import CLASSES, LONG_SINCE, StopLines, features
 from infgen.tokens.scene_tokens import SignalClass
 from infgen.tokens.signals import REMEMBERED
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from infgen.model.batching.batch import collate
-from infgen.model.removal_features import EgoPlace, RemovalFeatures
+from infgen.model.features.removal import EgoPlace, RemovalFeatures
 from infgen.tokens.scene_tokens import Presence
 
 RADIUS_M = 75.0
