@@ -10,6 +10,8 @@ from infgen.geometry import to_world, wrap_angle
 
 BRAKES_MPS2 = 3.0
 """Deceleration of an agent that averts an overlap."""
+LOOK_AHEAD_TOKENS = 5
+"""Token steps, that of the motion token included, in which overlaps are looked for."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,13 +22,14 @@ from torch import Tensor
 
 from infgen.geometry import boxes_overlap, to_local, to_world, wrap_angle
 from infgen.model.batching.batch import Agents
-from infgen.model.training.policy_gradient.braking import AgentPath, braking_arc_m
+from infgen.model.training.policy_gradient.braking import (
+    LOOK_AHEAD_TOKENS,
+    AgentPath,
+    braking_arc_m,
+)
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
 from infgen.scene import AgentType
 from infgen.tokens.vocabulary import MotionVocabulary
-
-LOOK_AHEAD_TOKENS = 5
-"""Token steps, that of the motion token included, in which overlaps are looked for."""
 
 
 @dataclass(frozen=True, slots=True)
