@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from infgen.model.batching.batch import collate
 from infgen.model.features.approach import (
     INPUTS,
     MEETING_TOKENS,
@@ -13,15 +12,9 @@ from infgen.model.features.approach import (
     ApproachFeatures,
     MovingPairs,
 )
-from infgen.tokens.scene_tokens import Presence
 
 TOKENS, CLOSEST = 10, 11
 """Inputs of when and how near two agents come closest."""
-
-
-@pytest.fixture
-def batch(record, limits):
-    return collate([record(3, tokens=9), record(4, agents=9)], limits, 7)
 
 
 @pytest.fixture
@@ -91,26 +84,21 @@ def test_only_agents_that_are_present_count(features):
     assert not torch.allclose(nobody, features(pairs(EAST, CROSSES)))
 
 
-def test_how_an_agent_moved_before_it_was_inserted_does_not_count(tiny, new_network, batch):
-    presence, pose = batch.agents.presence.clone(), batch.agents.pose.clone()
-    presence[:, 4, 1] = int(Presence.INSERTED)
-    inserted = replace(batch.agents, presence=presence)
-    pose[:, 3, 1, :2] += 3.0
-    elsewhere = replace(inserted, pose=pose)
+def test_how_an_agent_moved_before_it_was_inserted_does_not_count(
+    tiny, new_network, inserted_twice
+):
     network = new_network(replace(tiny, approach_features=True)).eval()
-    with torch.no_grad():
-        torch.nn.init.normal_(network.motion.approach.embed[-1].weight)
     seen = []
     network.motion.approach.register_forward_hook(
         lambda _, given, __: seen.append(given[0])
     )
 
-    for agents in (inserted, elsewhere):
-        network(replace(batch, agents=agents))
+    for each in inserted_twice:
+        network(each)
 
     one, two = seen
-    rows = batch.agents.visible.flatten().nonzero()[:, 0].tolist()
-    row = rows.index(4 * batch.agents.visible.shape[2] + 1)
+    visible = inserted_twice[0].agents.visible
+    row = visible.flatten().nonzero()[:, 0].tolist().index(4 * visible.shape[2] + 1)
     assert torch.equal(one.step_m[row], two.step_m[row])
     assert not one.step_m[row].any()
     assert not torch.equal(one.step_m, two.step_m)

@@ -5,16 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from infgen.model.batching.batch import collate
 from infgen.model.features.removal import EgoPlace, RemovalFeatures
-from infgen.tokens.scene_tokens import Presence
 
 RADIUS_M = 75.0
-
-
-@pytest.fixture
-def batch(record, limits):
-    return collate([record(3, tokens=9), record(4, agents=9)], limits, 7)
 
 
 @pytest.fixture
@@ -82,20 +75,13 @@ def test_where_an_unseen_agent_was_before_does_not_count(features):
     assert torch.equal(one, two)
 
 
-def test_who_is_inserted_was_nowhere_before(tiny, new_network, batch):
-    presence, pose = batch.agents.presence.clone(), batch.agents.pose.clone()
-    presence[:, 4, 1] = int(Presence.INSERTED)
-    inserted = replace(batch.agents, presence=presence)
-    pose[:, 3, 1, :2] += 3.0
-    elsewhere = replace(inserted, pose=pose)
+def test_who_is_inserted_was_nowhere_before(tiny, new_network, inserted_twice):
     alone = replace(tiny, removal_features=True, agent_agent_radius_m=0.0)
     network = new_network(alone).eval()
     with torch.no_grad():
         torch.nn.init.normal_(network.motion.ego_place.embed[-1].weight)
 
-    one, two = (
-        network(replace(batch, agents=agents)).motion for agents in (inserted, elsewhere)
-    )
+    one, two = (network(each).motion for each in inserted_twice)
 
     def removal(outputs):
         return outputs.rows.spread(outputs.remove_logit)[:, 4, 1]
