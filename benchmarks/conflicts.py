@@ -21,7 +21,7 @@ from logged_scenes import asked, whole
 from infgen.model.batching.batch import Batch
 from infgen.model.network import Network
 from infgen.model.training.policy_gradient.braking import LOOK_AHEAD_TOKENS
-from infgen.model.training.policy_gradient.conflicts import find_conflicts
+from infgen.model.training.policy_gradient.conflicts import conflict_costs
 from infgen.model.training.policy_gradient.rewards import find_costs
 from infgen.model.training.policy_gradient.road import read_roads
 from infgen.model.training.policy_gradient.rollouts import (
@@ -45,10 +45,9 @@ def logged_moves(network: Network, batch: Batch) -> SimulatedRollouts:
     moved = agents.observed & visible.roll(1, dims=1)
     moved &= (agents.motion_token >= 0) & (agents.motion_token < count)
     moved[:, :HISTORY_TOKENS] = False
-    nucleus = torch.cat([moved.nonzero(), agents.motion_token[moved][:, None]], dim=1)
     inserted = agents.presence == int(Presence.INSERTED)
     inserted[:, :HISTORY_TOKENS] = False
-    return SimulatedRollouts(batch, agents, 1, moved, inserted, visible[:, 1], nucleus)
+    return SimulatedRollouts(batch, agents, 1, moved, inserted, visible[:, 1])
 
 
 def count(network: Network, rollouts: SimulatedRollouts) -> Counter[str]:
@@ -56,10 +55,11 @@ def count(network: Network, rollouts: SimulatedRollouts) -> Counter[str]:
     vocabulary, agents = network.motion_vocabulary(), rollouts.batch.agents
     roads = read_roads(rollouts.batch.roads, network.map_vocabulary())
     overlap = find_costs(rollouts, vocabulary, roads).overlap & rollouts.moved
-    rollout, token, agent, choice = find_conflicts(rollouts, vocabulary, 1.0).at.T
-    taken = agents.motion_token[rollout, token, agent] == choice
+    taken = agents.motion_token[rollouts.moved][:, None]
+    choices = torch.cat([rollouts.moved.nonzero(), taken], dim=1).numpy()
     conflict = torch.zeros_like(rollouts.moved)
-    conflict[rollout[taken], token[taken], agent[taken]] = True
+    cost = torch.from_numpy(conflict_costs(rollouts, choices, vocabulary, 1.0))
+    conflict[rollouts.moved] = cost > 0
     before = conflict.clone()
     for later in range(1, LOOK_AHEAD_TOKENS):
         before[:, later:] |= conflict[:, :-later]

@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from torch import Tensor, nn
 
 from infgen.model.agents import KINDS
-from infgen.model.features.cells import (
+from infgen.model.cell_features import (
     CellFeatures,
     CellSources,
     HeadingFeatures,

@@ -10,10 +10,10 @@ from infgen.clock import CLOCK
 from infgen.model.agents import AgentContext, AgentEmbedding, AgentRows, MotionStack
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import Agents, Batch
+from infgen.model.cell_features import CellSources, OffsetEmbedding, OffsetFeatures
 from infgen.model.device.index import BatchIndex
 from infgen.model.device.together import launched_together
 from infgen.model.features.approach import ApproachFeatures
-from infgen.model.features.cells import CellSources, OffsetEmbedding, OffsetFeatures
 from infgen.model.features.removal import EgoPlace, RemovalFeatures
 from infgen.model.insertion import CellStack, DetailStack
 from infgen.model.layers import initialise, normed

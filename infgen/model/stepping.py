@@ -29,7 +29,7 @@ from torch import Tensor
 from infgen.model.agents import AgentContext, AgentRows
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import MapTokens
-from infgen.model.features.cells import CellSources
+from infgen.model.cell_features import CellSources
 from infgen.model.features.removal import EgoPlace
 from infgen.model.insertion import DetailQuery, InsertionBlocks, InsertionDetails
 from infgen.model.layers import AttentionSources, full_precision, normed

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from infgen.model.features.cells import CellSources
+from infgen.model.cell_features import CellSources
 from infgen.model.insertion import DetailQuery, InsertionDetails
 from infgen.rollout.insertion import sample_offset_and_heading
 

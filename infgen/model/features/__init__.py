@@ -1,1 +1,1 @@
-"""What parts of the network are told beside what attention sees."""
+"""What agents are told beside what attention sees."""

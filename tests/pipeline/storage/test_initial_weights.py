@@ -142,7 +142,7 @@ def test_added_parts_may_be_missing_in_weights_to_begin_with(tmp_path):
 
     found, own = dict(network.named_parameters()), dict(plain.named_parameters())
     parts = tuple(network.added_parts())
-    assert len(parts) == 6
+    assert len(parts) == 7
     added = found.keys() - own.keys()
     assert added
     assert all(name.startswith(parts) for name in added)

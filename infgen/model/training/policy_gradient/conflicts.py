@@ -1,16 +1,17 @@
 """Conflicts: motion tokens after which braking no longer averts an overlap.
 
 An overlap is rare, and its reward tells only of the tokens that were sampled. What other
-agents did in a rollout tells more: for every token that an agent might have sampled,
-whether it would have run into one of them. A token is in conflict if the agent, after it,
-brakes at ``BRAKES_MPS2`` and still comes to overlap an agent that it had ahead, all others
-moving as they did in the rollout. Braking, the agent keeps to the way that it went in the
-rollout, at the lateral offset from it at which the token ends. Boxes are compared at the
-middle and the end of token steps.
+agents did in a rollout tells more: for every token that an agent might have taken, whether
+it would have run into one of them. A token is in conflict if the agent, after it, brakes at
+``BRAKES_MPS2`` and still comes to overlap an agent that it had ahead, all others moving as
+they did in the rollout. Braking, the agent keeps to the way that it went in the rollout, at
+the lateral offset from it at which the token ends. Boxes are compared at the middle and the
+end of token steps.
 
-The cost of a conflict is that of an overlap, discounted by how much later it comes. The
-costs of all tokens are known, so that what is learned is their expectation itself, without
-the noise of sampling (all-action policy gradient, Ciosek and Whiteson 2018).
+The cost of a conflict is that of an overlap, discounted by how much later it comes. Where
+an agent took a token in conflict, the costs of all tokens are found, and it learns to take
+one that averts it. Mostly all likely tokens are in conflict there, so that their expected
+cost hardly changes with their odds; the log-probability of no conflict does.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,6 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from infgen.geometry import boxes_overlap, to_local, to_world, wrap_angle
-from infgen.model.batching.batch import Agents
 from infgen.model.training.policy_gradient.braking import (
     LOOK_AHEAD_TOKENS,
     AgentPath,
@@ -34,20 +34,18 @@ from infgen.tokens.vocabulary import MotionVocabulary
 
 @dataclass(frozen=True, slots=True)
 class Conflicts:
-    """Motion tokens in conflict.
+    """Agents that took a motion token in conflict where others were not.
 
     Attributes:
-        at: Rollout, token step at whose end the motion token ends, agent, motion token.
-        cost: Its cost, 1 for an overlap at the end of the motion token.
+        at: Rollout, token step at whose end the motion token ends, agent.
+        cost: Costs of all motion tokens, less the least of them: those of what could be
+            averted.
+        taken: How many motion tokens in conflict were taken.
     """
 
-    at: Int64[Tensor, "conflict 4"]
-    cost: Float32[Tensor, " conflict"]
-
-    def sampled(self, agents: Agents) -> Float32[Tensor, ""]:
-        """Sum the costs of the motion tokens that were sampled."""
-        rollout, token, agent, motion_token = self.at.T
-        return self.cost[agents.motion_token[rollout, token, agent] == motion_token].sum()
+    at: Int64[Tensor, "conflict 3"]
+    cost: Float32[Tensor, "conflict motion_token"]
+    taken: int
 
     def only(self, rows: slice) -> "Conflicts":
         """Take those of some rollouts, numbered from the first of them."""
@@ -55,34 +53,59 @@ class Conflicts:
         some = (rollout >= rows.start) & (rollout < rows.stop)
         at = self.at[some]
         at[:, 0] -= rows.start
-        return Conflicts(at, self.cost[some])
+        return Conflicts(at, self.cost[some], self.taken)
 
 
 def find_conflicts(
     rollouts: SimulatedRollouts, vocabulary: MotionVocabulary, discount: float
 ) -> Conflicts:
-    """Find the motion tokens in conflict among those that might have been sampled.
+    """Find who took a motion token in conflict.
 
     Args:
-        rollouts: Simulated agents, with the motion tokens that might have been sampled.
+        rollouts: Simulated agents.
+        vocabulary: Of their motion tokens.
+        discount: Factor on the cost for each token step that an overlap comes later.
+    """
+    moved = rollouts.moved
+    taken = torch.cat(
+        [moved.nonzero(), rollouts.batch.agents.motion_token[moved][:, None]], dim=1
+    ).numpy(force=True)
+    at = taken[conflict_costs(rollouts, taken, vocabulary, discount) > 0, :3]
+    every = np.arange(vocabulary.num_motion_tokens)
+    choices = np.column_stack([at.repeat(len(every), axis=0), np.tile(every, len(at))])
+    cost = conflict_costs(rollouts, choices, vocabulary, discount).reshape(-1, len(every))
+    least = cost.min(axis=1, keepdims=True)
+    some = (cost > least).any(axis=1)
+    return Conflicts(
+        torch.from_numpy(at[some]).to(moved.device),
+        torch.from_numpy((cost - least)[some]).to(moved.device),
+        len(at),
+    )
+
+
+def conflict_costs(
+    rollouts: SimulatedRollouts,
+    choices: Int64[np.ndarray, "choice 4"],
+    vocabulary: MotionVocabulary,
+    discount: float,
+) -> Float32[np.ndarray, " choice"]:
+    """Compute costs of motion tokens, on the host; zero where there is no conflict.
+
+    Args:
+        rollouts: Simulated agents.
+        choices: Rollout, token step, agent, motion token; those of an agent at a token step
+            one after the other.
         vocabulary: Of the motion tokens.
         discount: Factor on the cost for each token step that an overlap comes later.
     """
-    nucleus = rollouts.nucleus.numpy(force=True)
-    cost = np.zeros(len(nucleus), dtype=np.float32)
-    seen, token = _Seen.of(rollouts), nucleus[:, 1]
-    order = np.argsort(token, kind="stable")
-    each, begin = np.unique(token[order], return_index=True)
-    for at, some in zip(each.tolist(), np.split(order, begin[1:]), strict=True):
-        rollout, _, agent, motion_token = nucleus[some].T
-        choices = _Choices.of(seen, at, (rollout, agent), motion_token, vocabulary)
-        cost[some] = choices.costs(seen, discount)
-    conflict = np.flatnonzero(cost)
-    device = rollouts.moved.device
-    return Conflicts(
-        torch.from_numpy(nucleus[conflict]).to(device),
-        torch.from_numpy(cost[conflict]).to(device),
-    )
+    cost = np.zeros(len(choices), dtype=np.float32)
+    seen, token = _Seen.of(rollouts), choices[:, 1]
+    for at in np.unique(token).tolist():
+        some = np.flatnonzero(token == at)
+        rollout, _, agent, motion_token = choices[some].T
+        found = _Choices.of(seen, at, (rollout, agent), motion_token, vocabulary)
+        cost[some] = found.costs(seen, discount)
+    return cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +135,7 @@ class _Seen:
 
 @dataclass(frozen=True, slots=True)
 class _Choices:
-    """Motion tokens that agents might sample at a token step, and where they lead.
+    """Motion tokens that agents might take at a token step, and where they lead.
 
     Attributes:
         times: Times of ``_Seen`` in this token step and the next ones, without its begin.

@@ -128,7 +128,7 @@ def _sums(
         "reward": reward,
         "overlap": costs.overlap,
         "off_road": costs.off_road,
-        "conflict": conflicts.sampled(agents),
+        "conflict": torch.tensor(conflicts.taken),
         "energy_score": costs.energy_score,
         "compared": moved & rollouts.known[:, None] & rollouts.logged.observed,
         "overlapping_agents": costs.overlap.any(dim=1),

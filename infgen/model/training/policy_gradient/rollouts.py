@@ -9,7 +9,7 @@ of its log can be compared.
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool
 from torch import Tensor
 
 from infgen.model.batching.batch import Agents, Batch
@@ -51,8 +51,6 @@ class SimulatedRollouts:
         inserted: Agents that the network inserted.
         known: Rows whose agent was there at the end of the history: it is the same one in
             the log, and in all rollouts of the scene.
-        nucleus: Motion tokens that might have been sampled: rollout, token step, agent,
-            motion token; those of an agent at a token step one after the other.
     """
 
     batch: Batch
@@ -61,7 +59,6 @@ class SimulatedRollouts:
     moved: Bool[Tensor, "rollout token agent"]
     inserted: Bool[Tensor, "rollout token agent"]
     known: Bool[Tensor, "rollout agent"]
-    nucleus: Int64[Tensor, "choice 4"]
 
     @property
     def scenes(self) -> int:
@@ -126,7 +123,6 @@ class _FreeSimulation(Simulation):
         vacant: Rows without an agent until then, in order, and behind them the others.
         room: How many vacant rows there are [rollout].
         used: How many of the vacant rows are in use [rollout].
-        nuclei: Motion tokens that might have been sampled, token step by token step.
     """
 
     def __init__(
@@ -155,7 +151,6 @@ class _FreeSimulation(Simulation):
         self.vacant = taken.long().argsort(dim=1, stable=True)
         self.room = (~taken).sum(dim=1)
         self.used = torch.zeros(len(presence), dtype=torch.int64, device=presence.device)
-        self.nuclei = [torch.zeros((0, 4), dtype=torch.int64, device=presence.device)]
         self.asked[:, :HISTORY_TOKENS] = False
         if network.cells is None:
             self.asked[:] = False
@@ -226,7 +221,6 @@ class _FreeSimulation(Simulation):
             moved=self.moved,
             inserted=inserted,
             known=self.known,
-            nucleus=torch.cat(self.nuclei),
         )
 
     def _sample_motion(self, token: int, who: Tensor, said: MotionStep) -> None:
@@ -239,9 +233,6 @@ class _FreeSimulation(Simulation):
         uniform = self.uniforms.draw(*who.shape)[at]
         self.move_by(token, at, sample(likely, uniform))
         self.moved[:, token] = who
-        number, choice = likely.isfinite().nonzero(as_tuple=True)
-        now = torch.full_like(number, token)
-        self.nuclei.append(torch.stack([scene[number], now, row[number], choice], dim=1))
 
 
 def _until_the_last(some: Tensor) -> Tensor:

@@ -37,7 +37,7 @@ class PolicyLesson:
         type_advantage: Of the type of every inserted agent.
         count_advantage: Of a rollout from a token step on: of its insertions there, and of
             the removals of the step before, whose agents are gone by then.
-        conflicts: Motion tokens in conflict.
+        conflicts: Motion tokens in conflict that were taken.
     """
 
     batch: Batch
@@ -67,7 +67,8 @@ def policy_terms(
         conflict_penalty: Cost of a motion token in conflict.
     """
     count = lesson.moved.sum().float()
-    gained = _motion_gain(outputs, lesson, stationary, top_p, conflict_penalty)
+    gained = _motion_gain(outputs, lesson, stationary, top_p)
+    gained = gained + conflict_penalty * _safe_gain(outputs, lesson.conflicts)
     gained = gained + _insertion_gain(outputs, lesson)
     gained = gained + _count_gain(outputs, lesson)
     nothing = gained.new_zeros(())
@@ -101,9 +102,8 @@ def _motion_gain(
     lesson: PolicyLesson,
     stationary: Tensor,
     top_p: float,
-    conflict_penalty: float,
 ) -> Tensor:
-    """Advantages times log-probabilities of motion tokens, less conflicts, summed."""
+    """Advantages times log-probabilities of motion tokens, summed."""
     rows, agents = outputs.motion.rows, lesson.batch.agents
     moves = rows.pack(following(lesson.moved, False))
     chosen = rows.pack(following(agents.motion_token, 0))[moves]
@@ -112,13 +112,15 @@ def _motion_gain(
     apart = stationary[rows.pack(agent_type)[moves]]
     logits = outputs.motion.motion_logits[moves]
     likely = log_probabilities(logits, apart, top_p, chosen)
-    gained = (advantage * likely.gather(1, chosen[:, None])[:, 0]).sum()
-    if not conflict_penalty:
-        return gained
-    scene, token, agent, motion_token = lesson.conflicts.at.T
-    row = (moves.cumsum(dim=0) - 1)[rows.number[scene, token - 1, agent]]
-    probability = likely[row, motion_token].exp()
-    return gained - conflict_penalty * (lesson.conflicts.cost * probability).sum()
+    return (advantage * likely.gather(1, chosen[:, None])[:, 0]).sum()
+
+
+def _safe_gain(outputs: Outputs, conflicts: Conflicts) -> Tensor:
+    """Log-probabilities of no conflict, where there was one, summed."""
+    scene, token, agent = conflicts.at.T
+    row = outputs.motion.rows.number[scene, token - 1, agent]
+    likely = outputs.motion.motion_logits[row].log_softmax(dim=-1)
+    return (likely + torch.log1p(-conflicts.cost)).logsumexp(dim=-1).sum()
 
 
 def _insertion_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:

@@ -52,8 +52,6 @@ def drawn(record, limits):
         )
         moved = torch.ones_like(played.observed)
         moved[:, 0] = False
-        at = moved.nonzero()
-        tokens = played.motion_token[moved][:, None]
         return SimulatedRollouts(
             batch=replace(logged, agents=played),
             logged=played,
@@ -61,7 +59,6 @@ def drawn(record, limits):
             moved=moved,
             inserted=torch.zeros_like(moved),
             known=torch.ones_like(moved[:, 0]),
-            nucleus=torch.cat([at, tokens], dim=1),
         )
 
     return draw

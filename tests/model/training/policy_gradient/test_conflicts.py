@@ -8,10 +8,13 @@ import torch
 
 from infgen.geometry import to_world
 from infgen.model.training.policy_gradient.braking import BRAKES_MPS2
-from infgen.model.training.policy_gradient.conflicts import find_conflicts
+from infgen.model.training.policy_gradient.conflicts import (
+    conflict_costs,
+    find_conflicts,
+)
 from infgen.scene import AgentType
 
-TOKENS = 7
+TOKENS, METRES = 7, 24
 DISCOUNT = 0.9
 
 
@@ -20,21 +23,14 @@ def still(x_m, y_m=0.0):
     return [[x_m, y_m, 0.0]] * TOKENS
 
 
-def costs(drawn, metres, *ways, agent=0, **changed):
-    """Costs of every motion token that an agent might sample at the first token step."""
+def costs(drawn, metres, *ways, **changed):
+    """Costs of all motion tokens that the first agent might take at the first step."""
     rollouts = drawn(np.stack(ways, axis=1)[None])
     agents = replace(rollouts.batch.agents, **changed)
-    choices = torch.arange(metres.num_motion_tokens)
-    at = torch.tensor([0, 1, agent]).expand(len(choices), 3)
-    rollouts = replace(
-        rollouts,
-        batch=replace(rollouts.batch, agents=agents),
-        nucleus=torch.cat([at, choices[:, None]], dim=1),
-    )
-    found = find_conflicts(rollouts, metres, DISCOUNT)
-    cost = torch.zeros(len(choices))
-    cost[found.at[:, 3]] = found.cost
-    return cost.tolist()
+    rollouts = replace(rollouts, batch=replace(rollouts.batch, agents=agents))
+    choices = np.zeros((metres.num_motion_tokens, 4), dtype=np.int64)
+    choices[:, 1], choices[:, 3] = 1, np.arange(len(choices))
+    return conflict_costs(rollouts, choices, metres, DISCOUNT).tolist()
 
 
 def first_conflict(drawn, metres, *ways, **changed):
@@ -131,17 +127,48 @@ def test_conflicts_do_not_depend_on_where_the_scene_lies(drawn, metres):
     assert here == there
 
 
-def test_rollouts_are_taken_by_their_rows(drawn, metres):
-    rollouts = drawn(np.array([np.stack([still(0), still(x)], axis=1) for x in (5, 5, 50)]))
-    choices = [[rollout, 1, 0, 9] for rollout in range(3)]
-    rollouts = replace(rollouts, nucleus=torch.tensor(choices))
+def test_who_took_a_token_in_conflict_is_told_which_would_have_averted_it(drawn, metres):
+    runs = [[5 * at, 0, 0] for at in range(TOKENS)]
+    rollouts = drawn(np.stack([runs, still(13)], axis=1)[None])
 
     found = find_conflicts(rollouts, metres, DISCOUNT)
 
-    assert found.at[:, 0].tolist() == [0, 1]
-    assert found.only(slice(1, 3)).at.tolist() == [[0, 1, 0, 9]]
+    assert found.at.tolist() == [[0, 1, 0], [0, 2, 0]]
+    assert found.cost[0].tolist() == pytest.approx(costs(drawn, metres, runs, still(13)))
+    assert (found.cost.min(dim=1).values == 0).all()
+    assert (found.cost[:, 5] > 0).all()
+    assert found.taken == 2
+
+
+def test_what_nothing_averts_is_told_as_taken_only(drawn, metres):
+    """It stands, and the other one runs into it whatever it does."""
+    meets = [[6 - 2 * at, 0, np.pi] for at in range(TOKENS)]
+    short = replace(metres, path=metres.path[:, :1], real=metres.real[:, :1])
+    rollouts = drawn(np.stack([still(0), meets], axis=1)[None])
+    rollouts.moved[..., 1] = False
+
+    found = find_conflicts(rollouts, short, DISCOUNT)
+
+    assert not len(found.at)
+    assert found.taken > 0
+
+
+def test_without_moves_nothing_is_taken(drawn, metres):
+    rollouts = drawn(np.stack([still(0), still(9)], axis=1)[None])
+    rollouts.moved.fill_(False)
+
+    found = find_conflicts(rollouts, metres, DISCOUNT)
+
+    assert found.cost.shape == (0, METRES)
+    assert found.taken == 0
+
+
+def test_rollouts_are_taken_by_their_rows(drawn, metres):
+    runs = [[5 * at, 0, 0] for at in range(TOKENS)]
+    rollouts = drawn(np.array([np.stack([runs, still(x)], axis=1) for x in (13, 13, 90)]))
+
+    found = find_conflicts(rollouts, metres, DISCOUNT)
+
+    assert found.at[:, 0].tolist() == [0, 0, 1, 1]
+    assert found.only(slice(1, 3)).at.tolist() == [[0, 1, 0], [0, 2, 0]]
     assert not len(found.only(slice(2, 3)).at)
-    agents = rollouts.batch.agents
-    assert not found.sampled(agents)
-    agents.motion_token[0, 1, 0] = 9
-    assert found.sampled(agents) == found.cost[0]

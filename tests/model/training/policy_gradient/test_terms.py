@@ -128,24 +128,23 @@ def test_choices_with_a_positive_advantage_become_likelier(network, lessons):
 
 def test_motion_tokens_in_conflict_become_less_likely(network, lessons):
     lesson = lessons.lessons[0]
-    scene, token, agent = lesson.moved.nonzero()[10].tolist()
-    sampled = int(lesson.batch.agents.motion_token[scene, token, agent])
-    at = torch.tensor([[scene, token, agent, sampled]])
-    only = replace(worthless(lesson), conflicts=Conflicts(at, torch.ones(1)))
+    at = lesson.moved.nonzero()[10]
+    scene, token, agent = at.tolist()
+    cost = torch.zeros((1, network.motion_vocabulary().num_motion_tokens))
+    cost[0, :5], cost[0, 5] = 1.0, 0.5
+    only = replace(worthless(lesson), conflicts=Conflicts(at[None], cost, 1))
 
     before, after = (
         each(lesson.batch).motion for each in (network, after_a_step(network, only))
     )
 
-    def probability(motion):
+    def safe(motion):
         row = motion.rows.number[scene, token - 1, agent]
-        return motion.motion_logits[row].softmax(dim=0)[sampled]
+        return 1 - (motion.motion_logits[row].softmax(dim=0) * cost[0]).sum()
 
     loss = terms(network, network, only)["policy"].loss
-    most = HOW.conflict_penalty * probability(before) / HOW.policy_top_p
-    assert HOW.conflict_penalty * probability(before) < loss + ROUNDING
-    assert loss < most + ROUNDING  # The nucleus has what is outside of it.
-    assert probability(after) < probability(before)
+    torch.testing.assert_close(loss, -HOW.conflict_penalty * safe(before).log())
+    assert safe(after) > safe(before)
 
 
 def test_cells_and_headings_of_inserted_agents_are_learned_too(network, lessons):

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from infgen.model.features.cells import (
+from infgen.model.cell_features import (
     CellFeatures,
     CellSources,
     HeadingFeatures,
