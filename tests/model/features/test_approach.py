@@ -75,13 +75,13 @@ def test_they_are_the_same_wherever_the_scene_lies(features):
 
 
 def test_only_agents_that_are_present_count(features):
-    nobody = features(pairs(EAST, CROSSES, present=False))
+    hidden = features(pairs(EAST, CROSSES, present=False))
     alone = pairs(EAST)
 
-    torch.testing.assert_close(nobody[:1], features(alone))
+    torch.testing.assert_close(hidden[:1], features(alone))
     none = replace(alone, index=alone.index[:, :0], present=alone.present[:, :0])
-    torch.testing.assert_close(nobody[:1], features(none))
-    assert not torch.allclose(nobody, features(pairs(EAST, CROSSES)))
+    torch.testing.assert_close(hidden[:1], features(none))
+    assert not torch.allclose(hidden, features(pairs(EAST, CROSSES)))
 
 
 def test_how_an_agent_moved_before_it_was_inserted_does_not_count(

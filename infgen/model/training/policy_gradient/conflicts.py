@@ -47,6 +47,12 @@ class Conflicts:
     cost: Float32[Tensor, "conflict motion_token"]
     taken: int
 
+    @classmethod
+    def none(cls, vocabulary: MotionVocabulary, device: torch.device) -> "Conflicts":
+        """Return none at all."""
+        cost = torch.zeros((0, vocabulary.num_motion_tokens), device=device)
+        return cls(torch.zeros((0, 3), dtype=torch.int64, device=device), cost, 0)
+
     def only(self, rows: slice) -> "Conflicts":
         """Take those of some rollouts, numbered from the first of them."""
         rollout = self.at[:, 0]

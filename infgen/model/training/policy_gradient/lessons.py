@@ -64,7 +64,9 @@ def simulate_lessons(
     roads = read_roads(batch.roads, network.map_vocabulary())
     vocabulary = network.motion_vocabulary()
     costs = find_costs(rollouts, vocabulary, roads)
-    conflicts = find_conflicts(rollouts, vocabulary, settings.policy_discount)
+    conflicts = Conflicts.none(vocabulary, rollouts.moved.device)
+    if settings.conflict_penalty:
+        conflicts = find_conflicts(rollouts, vocabulary, settings.policy_discount)
     reward = costs.reward(settings)
 
     def grouped(values: Tensor) -> Tensor:
@@ -128,7 +130,7 @@ def _sums(
         "reward": reward,
         "overlap": costs.overlap,
         "off_road": costs.off_road,
-        "conflict": torch.tensor(conflicts.taken),
+        "conflict": torch.full((), conflicts.taken, device=reward.device),
         "energy_score": costs.energy_score,
         "compared": moved & rollouts.known[:, None] & rollouts.logged.observed,
         "overlapping_agents": costs.overlap.any(dim=1),

@@ -4,7 +4,8 @@ The policy term is minus the sum of advantage times log-probability (Williams 19
 divergence is the Kullback-Leibler divergence from the network to the pretrained one, summed
 over all choices of the rollout: motion tokens, removals, insertions, and the cells, types,
 headings and offset tokens of inserted agents. Sizes and regressed offsets, which are not
-sampled, count as means of normal distributions of variance one. Both terms are divided by
+sampled, count as means of normal distributions of variance one. The policy term has the
+log-probability of no conflict beside it (``conflicts``). Both terms are divided by
 the number of motion tokens, so ``divergence_weight`` is in rewards per nat.
 """
 
@@ -64,7 +65,7 @@ def policy_terms(
         lesson: The rollouts.
         stationary: Motion tokens that stand still, by agent type.
         top_p: Share of the probability that motion tokens were sampled from.
-        conflict_penalty: Cost of a motion token in conflict.
+        conflict_penalty: Cost of a nat of the log-probability of no conflict.
     """
     count = lesson.moved.sum().float()
     gained = _motion_gain(outputs, lesson, stationary, top_p)
@@ -98,10 +99,7 @@ def divergence(outputs: Outputs, pretrained: Outputs, lesson: PolicyLesson) -> T
 
 
 def _motion_gain(
-    outputs: Outputs,
-    lesson: PolicyLesson,
-    stationary: Tensor,
-    top_p: float,
+    outputs: Outputs, lesson: PolicyLesson, stationary: Tensor, top_p: float
 ) -> Tensor:
     """Advantages times log-probabilities of motion tokens, summed."""
     rows, agents = outputs.motion.rows, lesson.batch.agents
