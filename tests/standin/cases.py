@@ -292,10 +292,6 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {**FEATURES, "offset_token": True},
         {"closed_loop_population": True, "trained_parts": "details, motion"},
     ),
-    "policy-gradient": (
-        {**FEATURES, "approach_features": True},
-        {"policy_gradient_rollouts": 3, "conflict_penalty": 1.0},
-    ),
     "accumulated": ({}, {"gradient_accumulation": 2}),
     "smart": ({"insertion_and_removal": False}, {}),
     "no-remove-token": ({"remove_token": False}, {}),
