@@ -7,8 +7,9 @@ simulates them (``infgen/model/training/policy_gradient/conflicts.py``)::
         [--split validation] [--scenes 20]
 
 The table has the share of motion tokens that are in conflict, how many overlaps begin in a
-thousand motion tokens, and how many of these were preceded by a motion token in conflict of
-the agent that runs into the other one. The last line is one JSON object.
+thousand motion tokens, and how many of these were foreseen: in an earlier token step,
+within the look-ahead, the agent that runs into the other one took a motion token in
+conflict. The last line is one JSON object.
 """
 
 import json
@@ -60,7 +61,7 @@ def count(network: Network, rollouts: SimulatedRollouts) -> Counter[str]:
     conflict = torch.zeros_like(rollouts.moved)
     cost = torch.from_numpy(conflict_costs(rollouts, choices, vocabulary, 1.0))
     conflict[rollouts.moved] = cost > 0
-    before = conflict.clone()
+    before = torch.zeros_like(conflict)  # The token of the overlap itself is always one.
     for later in range(1, LOOK_AHEAD_TOKENS):
         before[:, later:] |= conflict[:, :-later]
     counted = {
