@@ -73,9 +73,9 @@ class TownsOptions:
     split: Annotated[str, typer.Option(help="Start of the file names.")] = "training"
     scenes_per_file: Annotated[int, typer.Option(help="Most scenes of a file.")] = 20
     jobs: Annotated[int, typer.Option(help="Processes; 0: one per core.")] = 0
-    variety: Annotated[str, typer.Option(help="How much towns differ: basic or broad.")] = (
-        "basic"
-    )
+    variety: Annotated[
+        str, typer.Option(help="Which towns: basic, broad (they differ more), or recovery.")
+    ] = "basic"
 
     def write(self, tell: Callable[[Event], None]) -> "Written":
         """Write their records, with progress events."""

@@ -5,7 +5,7 @@ from itertools import groupby
 
 from infgen.scene import Scene
 from infgen.sources.towns.recording.scenes import draw_place, record
-from infgen.sources.towns.recording.viewpoints import View, draw_views
+from infgen.sources.towns.recording.viewpoints import START_EVERY, View, draw_views
 from infgen.sources.towns.town import Town, make_town, stream
 from infgen.sources.towns.variety import BASIC, Variety
 
@@ -57,12 +57,14 @@ def draw_scenes(
 def _find_town(name: str, num_steps: int, variety: Variety) -> tuple[Town, list[View]]:
     """Draw towns until one has enough to record."""
     spread = max(1.0, num_steps / WIDE_STEPS) ** 0.5
+    wanted, inattention = variety.scenes_per_town, variety.drivers.inattention
+    every = START_EVERY if inattention is None else inattention.period_steps
     attempt = 0
     while True:
         steps = max(LEAST_STEPS, 3 * num_steps // 2)
         town = make_town(stream(name, "town", attempt), steps, spread, variety)
         rng = stream(name, "views", attempt)
-        views = draw_views(town, variety.scenes_per_town, num_steps, FROM_RIM_M, rng)
-        if len(views) == variety.scenes_per_town:
+        views = draw_views(town, wanted, num_steps, FROM_RIM_M, rng, every)
+        if len(views) == wanted:
             return town, views
         attempt += 1

@@ -115,7 +115,14 @@ def make_town(
         seed = int(rng.integers(_MOST_SEED))
         first = sum(trip.drives and trip.depart_s == 0 for trip in trips)
         played = play(
-            net, folder / "town.rou.xml", len(trips), first, warm_up_s, num_steps, seed
+            net,
+            folder / "town.rou.xml",
+            len(trips),
+            first,
+            warm_up_s,
+            num_steps,
+            seed,
+            variety.drivers.inattention,
         )
     if any(trip.stops for trip in trips):
         played = with_parking(played, [trip.stops for trip in trips])

@@ -1,11 +1,12 @@
 """How much towns differ from each other: the ranges that all about them is drawn from.
 
 ``BASIC`` is what the records and the weights of the package were made with; its scenes keep
-their bytes. ``BROAD`` has more layouts, demands and drivers, and vehicles that park.
+their bytes. ``BROAD`` has more layouts, demands and drivers, and vehicles that park. In
+``RECOVERY`` some drivers have not looked ahead as a scene begins, and recover from it.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 Range = tuple[float, float]
@@ -32,6 +33,30 @@ class CarFollowing(Enum):
     IDM = "IDM"
     KRAUSS = "Krauss"
     EIDM = "EIDM"
+
+
+@dataclass(frozen=True, slots=True)
+class Inattention:
+    """Drivers who do not look ahead at times.
+
+    They hold a speed of their own, whatever stands ahead, until they look again. Times are
+    in steps of the simulation, and a recording begins at every ``period_steps``.
+
+    Attributes:
+        period_steps: From one time to the next.
+        before_steps: So long before a recording begins, drivers are drawn who do not look.
+        until_steps: So long after it has begun, all look again.
+        share: Of all drivers, each time.
+        steps: How long one does not look: least and most.
+        brake_mps2: One looks up in time to brake so hard for who is ahead, or for a light.
+    """
+
+    period_steps: int
+    before_steps: int
+    until_steps: int
+    share: float
+    steps: tuple[int, int]
+    brake_mps2: Range
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +97,7 @@ class DriverVariety:
         headway_s: Time kept to who is ahead.
         own_manners: Whether drivers differ in car-following model and in how they change
             lanes.
+        inattention: Who does not look ahead, and when; None if all do.
     """
 
     car_following: Mapping[CarFollowing, float]
@@ -79,6 +105,7 @@ class DriverVariety:
     haste_limits: Range
     headway_s: Range
     own_manners: bool
+    inattention: Inattention | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,5 +198,20 @@ BROAD = Variety(
     ),
     demand=DemandVariety(cars_per_km=(1.0, 24.0), walkers_per_km=(0.2, 16.0), parking=0.4),
 )
-VARIETIES = {each.name: each for each in (BASIC, BROAD)}
+RECOVERY = replace(
+    BASIC,
+    name="recovery",
+    drivers=replace(
+        BASIC.drivers,
+        inattention=Inattention(
+            period_steps=80,
+            before_steps=8,
+            until_steps=10,  # The history that a network is given ends there.
+            share=0.35,
+            steps=(6, 16),
+            brake_mps2=(2.0, 4.5),
+        ),
+    ),
+)
+VARIETIES = {each.name: each for each in (BASIC, BROAD, RECOVERY)}
 """By name, the default first."""

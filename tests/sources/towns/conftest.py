@@ -6,6 +6,9 @@ import pytest
 from infgen.sources.towns.streets.network import read_network
 
 needs_sumo = pytest.mark.skipif(find_spec("sumo") is None, reason="needs the extra towns")
+needs_libsumo = pytest.mark.skipif(
+    find_spec("libsumo") is None, reason="needs libsumo, of the extra towns"
+)
 
 
 @pytest.fixture(scope="session")

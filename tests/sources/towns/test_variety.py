@@ -1,4 +1,4 @@
-"""Towns of both varieties: what differs, and that traffic stays plausible."""
+"""Towns of all varieties: what differs, and that traffic stays plausible."""
 
 from collections import Counter
 
@@ -20,7 +20,7 @@ STEPS = 300
 
 
 def test_basic_comes_first_and_names_are_their_own():
-    assert list(VARIETIES) == ["basic", "broad"]
+    assert list(VARIETIES) == ["basic", "broad", "recovery"]
     assert all(VARIETIES[name].name == name for name in VARIETIES)
 
 

@@ -9,7 +9,7 @@ from infgen.clock import CLOCK
 from infgen.sources.towns.town import Town
 
 START_EVERY = 20
-"""Recordings begin at steps that are multiples of it."""
+"""Recordings begin at steps that are multiples of it, if nothing else is said."""
 LONGEST_EGO_M = 5.6
 DRIVE_STEPS = 311
 """Cars are chosen by how far they go in so many steps at least. Chosen by nine seconds,
@@ -29,7 +29,12 @@ class View:
 
 
 def draw_views(
-    town: Town, count: int, num_steps: int, from_rim_m: float, rng: np.random.Generator
+    town: Town,
+    count: int,
+    num_steps: int,
+    from_rim_m: float,
+    rng: np.random.Generator,
+    start_every: int = START_EVERY,
 ) -> list[View]:
     """Draw views, no two of one car at one time; fewer if the town has not so many.
 
@@ -41,10 +46,11 @@ def draw_views(
         num_steps: Length of each.
         from_rim_m: How far the car keeps away from where streets end.
         rng: Of all that is drawn.
+        start_every: Recordings begin at steps that are multiples of it.
     """
     able = _able(town, from_rim_m)
     drive = max(num_steps, min(DRIVE_STEPS, town.num_steps - num_steps))
-    starts = np.arange(0, town.num_steps - drive + 1, START_EVERY)
+    starts = np.arange(0, town.num_steps - drive + 1, start_every)
     lasting = np.stack(
         [able[:, start : start + num_steps].all(axis=1) for start in starts], axis=1
     )

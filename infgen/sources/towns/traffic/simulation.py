@@ -1,13 +1,18 @@
 """SUMO plays the traffic of a town, and we read who was where."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from infgen.clock import CLOCK
-from infgen.sources.towns.sumo import SumoError, run_program
+from infgen.sources.towns.sumo import SumoError, run_program, run_stepwise
+from infgen.sources.towns.traffic.inattention import InattentiveDrivers
+from infgen.sources.towns.variety import Inattention
 
 LATERAL_M = 0.8
 """Lanes are cut into strips so wide: lane changes then take time, and bodies a width."""
@@ -44,6 +49,7 @@ def play(
     start_s: float,
     num_steps: int,
     seed: int,
+    inattention: Inattention | None = None,
 ) -> Played:
     """Play a town's traffic and record it from some time on.
 
@@ -55,6 +61,7 @@ def play(
         start_s: When the recording begins.
         num_steps: How long it is.
         seed: Of SUMO's draws.
+        inattention: Which drivers do not look ahead, and when; None if all do.
 
     Raises:
         SumoError: if SUMO fails.
@@ -86,8 +93,20 @@ def play(
         "no-warnings": True,
         "seed": seed % _MOST_SEED,
     }
-    run_program("sumo", options | tables)
+    if inattention is None:
+        run_program("sumo", options | tables)
+    else:
+        first = round(start_s / CLOCK.step_s)
+        drivers = partial(_inattentive, inattention, first, seed)
+        run_stepwise(options | tables, first + num_steps, drivers)
     return _gather([_read(path) for path in tables.values()], num_trips, start_s, num_steps)
+
+
+def _inattentive(
+    inattention: Inattention, first: int, seed: int, sumo: ModuleType
+) -> Callable[[int], None]:
+    """Watch over drivers who do not look ahead."""
+    return InattentiveDrivers(sumo, inattention, first, seed).before_step
 
 
 def _read(path: Path) -> Float64[np.ndarray, "row 6"]:

@@ -81,6 +81,12 @@ def test_the_car_that_moves_records(views):
     assert views[0].start % 20 == 0
 
 
+def test_views_begin_as_often_as_is_said(town):
+    views = draw_views(town, 9, 40, RIM_M, np.random.default_rng(0), start_every=40)
+
+    assert {view.start for view in views} == {0, 40}
+
+
 def test_who_sets_off_later_is_chosen_while_it_still_stands(town):
     velocity_mps = np.zeros((2, STEPS, 2))
     velocity_mps[1, 60:, 0] = 10.0
