@@ -125,6 +125,7 @@ class Network(nn.Module):
         *,
         hidden_roads: bool = False,
         index: BatchIndex | None = None,
+        insertions: bool = True,
     ) -> Outputs:
         """Compute all logits, every token given the true ones before it.
 
@@ -134,14 +135,19 @@ class Network(nn.Module):
                 features of the pass that hides them, as a kind of dropout; otherwise they
                 are predicted in a pass of their own.
             index: Which places of the batch hold something, if that is known already.
+            insertions: Also predict who is inserted.
         """
         with launched_together(
             self, together=self.training and batch.agents.pose.device.type != "cpu"
         ):
-            return self._outputs(batch, hidden_roads, index)
+            return self._outputs(batch, hidden_roads, index, insertions)
 
     def _outputs(
-        self, batch: Batch, hidden_roads: bool, index: BatchIndex | None
+        self,
+        batch: Batch,
+        hidden_roads: bool,
+        index: BatchIndex | None,
+        insertions: bool,
     ) -> Outputs:
         of_map = None if index is None else index.roads
         sight = self.roads.look(batch.roads, of_map)
@@ -167,10 +173,10 @@ class Network(nn.Module):
         return Outputs(
             motion=self._motion(agents, rows, given, x, roads, density, as_logged),
             entries=None
-            if cells is None
+            if cells is None or not insertions
             else _entries(cells, batch, asked, rows, raw, shown, roads, density),
             details=None
-            if details is None
+            if details is None or not insertions
             else _details(details, batch, told, rows, shown, roads),
             roads=None if hidden is None else MapOutputs(*hidden),
         )
@@ -279,9 +285,8 @@ def _entries(
     map_seen = find_map_neighbours(reach, asked, ego_pose, roads, scene)
     cell_features = None
     if stack.cell_features is not None:
-        there = agents.visible & (
-            agents.turn < 0
-        )  # Inserted agents differ by slot: left out.
+        # Inserted agents differ by slot: they are left out.
+        there = agents.visible & (agents.turn < 0)
         lying = CellSources(
             raw, *(asked.pack(each) for each in (rows.number, agents.pose, there))
         )

@@ -106,13 +106,22 @@ def each_terms(
     network, pretrained = training.network, training.pretrained
     assert pretrained is not None
     stationary = torch.from_numpy(network.motion_vocabulary().stationary)
+    insertions = _learns_of_insertions(network)
     network.eval()
     for lesson in lessons.rollouts.lessons:
         here = stationary.to(lesson.moved.device)
-        outputs = forward.evaluated(network, lesson.batch)
+        outputs = forward.evaluated(network, lesson.batch, insertions)
         with torch.no_grad():
-            before = forward.evaluated(pretrained, lesson.batch)
+            before = forward.evaluated(pretrained, lesson.batch, insertions)
         how = settings.policy_top_p, settings.conflict_penalty
         terms = policy_terms(outputs, before, lesson, here, *how)
         yield terms, torch.zeros(2, device=here.device)
     network.train()
+
+
+def _learns_of_insertions(network: Network) -> bool:
+    """Whether insertions depend on what is trained: on all but the motion stack."""
+    return any(
+        parameter.requires_grad and not name.startswith("motion.")
+        for name, parameter in network.named_parameters()
+    )

@@ -42,10 +42,10 @@ class Pass:
         with self._casting():
             return in_float32(self._forward(batch, index))
 
-    def evaluated(self, network: Network, batch: Batch) -> Outputs:
+    def evaluated(self, network: Network, batch: Batch, insertions: bool = True) -> Outputs:
         """Compute the outputs of a network in evaluation mode: nothing is hidden."""
         with self._casting():
-            outputs: Outputs = network(batch)
+            outputs: Outputs = network(batch, insertions=insertions)
             return in_float32(outputs)
 
     def averaged(self, batch: Batch, average: Mapping[str, Tensor]) -> Outputs:

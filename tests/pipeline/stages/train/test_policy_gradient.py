@@ -8,6 +8,7 @@ import torch
 
 from infgen.config import TrainSettings
 from infgen.errors import ConfigError
+from infgen.model.network import Network
 from pipeline.engine.signals import Stopped
 from pipeline.stages.train.loop import train
 from pipeline.stages.train.optimizer_step import OptimizerStep
@@ -135,6 +136,35 @@ def test_no_step_is_done_where_nothing_is_better_than_anything_else(tuned, books
     )
 
     assert stepped.norm == pytest.approx(0, abs=1e-5)
+
+
+def test_insertions_are_left_out_where_only_the_motion_stack_is_trained(
+    tuned, books, quiet, monkeypatch
+):
+    how = {"trained_parts": "motion", "count_penalty": 1.0, "agent_type_penalty": 1.0}
+    left_out, asked = tuned("left-out", **how), tuned("asked", **how)
+    calls = []
+
+    def watched(network, batch, **given):
+        calls.append(given.get("insertions", True))
+        return forward(network, batch, **given)
+
+    forward = Network.forward
+    monkeypatch.setattr(Network, "forward", watched)
+    one = begin(left_out, *books)
+    train(left_out, one, quiet)
+    assert False in calls
+    assert len(set(calls)) == 1
+    monkeypatch.setattr(
+        "pipeline.stages.train.lessons._learns_of_insertions", lambda network: True
+    )
+    calls.clear()
+    other = begin(asked, *books)
+    train(asked, other, quiet)
+    assert set(calls) == {True}
+
+    pairs = zip(one.network.parameters(), other.network.parameters(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
 
 
 def test_fine_tuning_needs_weights_to_start_from(tmp_path):
