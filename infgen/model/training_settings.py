@@ -134,6 +134,9 @@ class TrainSettings:
     initial_weights: Annotated[str, NOT_IN_KEY] = ""  # Its fingerprint is a source.
     """Weights to start from: a folder, a key of stage `train`, or `builtin` for those of
     the package; empty for random ones."""
+    initial_share: Share = 0.0
+    """Share of the initial weights in the mean of them and the trained ones, which is what
+    is written at the end; validation is of the trained ones. 0 for the trained ones."""
     trained_parts: str = ""
     """Only parameters whose names begin with one of these, separated by commas, change:
     `details.offset_bins`, say, to add a part to trained weights; empty for all."""

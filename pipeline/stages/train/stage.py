@@ -66,12 +66,13 @@ def reads(root: Path, settings: Mapping[str, Any]) -> list[Source]:
             training is to stay near to them.
     """
     how: TrainSettings = settings["train"]
-    if how.policy_gradient_rollouts and not how.initial_weights:
-        raise ConfigError(
-            f"train.policy_gradient_rollouts is {how.policy_gradient_rollouts}, but "
-            "train.initial_weights is empty; expected the weights to be fine-tuned: "
-            f"{BUILTIN!r}, a folder, or the start of a key of stage train"
-        )
+    for name in ("policy_gradient_rollouts", "initial_share"):
+        if getattr(how, name) and not how.initial_weights:
+            raise ConfigError(
+                f"train.{name} is {getattr(how, name):g}, but "
+                "train.initial_weights is empty; expected the weights to be fine-tuned: "
+                f"{BUILTIN!r}, a folder, or the start of a key of stage train"
+            )
     return find_initial_weights(root, "train.initial_weights", how.initial_weights)
 
 
@@ -135,6 +136,7 @@ def _train(
 ) -> Report:
     import torch  # noqa: PLC0415
 
+    from pipeline.stages.train.initial_share import mixer  # noqa: PLC0415
     from pipeline.stages.train.loop import final_state, train  # noqa: PLC0415
     from pipeline.stages.train.process_group import form_group  # noqa: PLC0415
     from pipeline.stages.train.throughput import peak_memory_mib  # noqa: PLC0415
@@ -147,8 +149,10 @@ def _train(
     call = {"task": dict(unit.task), "target": str(target), "settings": plain}
     with form_group(call, how.peer_timeout_s) as group:
         setup, training = _prepare(unit.task, target, settings)
+        keep = mixer(setup, training)
         found = train(setup, training, progress, group)
-    weights = save_network(target, training.network, final_state(training), how.steps)
+    state = keep(final_state(training))
+    weights = save_network(target, training.network, state, how.steps)
     return {
         "steps": how.steps,
         "scenes": setup.num_scenes,
@@ -231,6 +235,7 @@ STAGE = Stage(
         "pipeline.stages.devices",
         "pipeline.storage.checkpoint",
         "pipeline.stages.train.setup",
+        "pipeline.stages.train.initial_share",
         "pipeline.stages.train.lessons",
         "pipeline.stages.train.optimizer_step",
         "pipeline.stages.train.recorder",

@@ -454,3 +454,23 @@ def test_training_goes_on_from_the_weights_it_begins_with(
     )
 
     assert report["weights"] == whole[1]["weights"]
+
+
+def test_a_share_of_the_weights_it_begins_with_is_kept(
+    whole, train_unit, train_settings, quiet, tmp_path
+):
+    unit = replace(train_unit, task={**train_unit.task, "initial_weights": str(whole[0])})
+    made = {}
+    for share in (0.0, 0.5, 1.0):
+        how = replace(train_settings["train"], steps=2, seed=9, initial_share=share)
+        folder = tmp_path / str(share)
+        work(unit, folder, {**train_settings, "train": how}, quiet)
+        made[share] = load_network(folder).state_dict()
+
+    begun = load_network(whole[0]).state_dict()
+    assert any(not torch.equal(begun[name], made[0.0][name]) for name in begun)
+    for name, before in begun.items():
+        torch.testing.assert_close(made[1.0][name], before, rtol=0, atol=1e-7)
+        if before.is_floating_point():
+            middle = (before + made[0.0][name]) / 2
+            torch.testing.assert_close(made[0.5][name], middle)
