@@ -1,9 +1,7 @@
 """Weights between those that training began with and those that it ended with.
 
 Fine-tuning gains something and loses something else. On the straight line between the two
-there are weights that have most of both (Wortsman et al. 2022, arXiv 2109.01903): of
-weights tuned by policy gradient, and the same trained on logs once more, the mean collides
-less than either (docs/log.md).
+there are weights that have most of both (Wortsman et al. 2022, arXiv 2109.01903).
 """
 
 from collections.abc import Callable, Collection, Mapping
