@@ -1,4 +1,4 @@
-"""Parquet and Feather tables of Argoverse 2, read by polars."""
+"""Parquet and Feather tables of Argoverse 2, read by polars in a process of its own."""
 
 import io
 from collections.abc import Mapping
@@ -6,31 +6,28 @@ from typing import Any
 
 import numpy as np
 
+from infgen.sources.argoverse2.table_process import TABLES
 from infgen.sources.tfrecord import RecordError
 
 MAX_ROWS = 300_000
 """Rows of one table; the largest real one has about 60,000."""
-FLOAT, INTEGER, TEXT = np.float64, np.int64, np.str_
+FLOAT, INTEGER, TEXT = "float", "integer", "text"
+PARQUET, FEATHER = "Parquet", "Feather"
+_TYPES = {FLOAT: np.float64, INTEGER: np.int64}
 
 
-def read_parquet(data: bytes, columns: Mapping[str, type]) -> dict[str, np.ndarray]:
-    """Read columns of a Parquet table; see ``_read``."""
-    import polars as pl  # noqa: PLC0415
-
-    return _read(pl.read_parquet, data, columns, "Parquet")
+def read_parquet(data: bytes, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Read columns of a Parquet table; see ``read_table``."""
+    return TABLES.read(PARQUET, data, columns)
 
 
-def read_feather(data: bytes, columns: Mapping[str, type]) -> dict[str, np.ndarray]:
-    """Read columns of a Feather (Arrow IPC) table; see ``_read``."""
-    import polars as pl  # noqa: PLC0415
-
-    return _read(pl.read_ipc, data, columns, "Feather")
+def read_feather(data: bytes, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Read columns of a Feather (Arrow IPC) table; see ``read_table``."""
+    return TABLES.read(FEATHER, data, columns)
 
 
-def _read(
-    read: Any, data: bytes, columns: Mapping[str, type], kind: str
-) -> dict[str, np.ndarray]:
-    """Read some columns of a table as arrays of the types asked for.
+def read_table(kind: str, data: bytes, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Read some columns of a table as arrays of the types asked for, in this process.
 
     Raises:
         RecordError: if it is no such table, a column is missing, of another type or has
@@ -38,6 +35,7 @@ def _read(
     """
     import polars as pl  # noqa: PLC0415
 
+    read: Any = {PARQUET: pl.read_parquet, FEATHER: pl.read_ipc}[kind]
     try:
         table = read(io.BytesIO(data), columns=list(columns), n_rows=MAX_ROWS + 1)
     except (pl.exceptions.PolarsError, OSError, ValueError) as error:
@@ -52,7 +50,7 @@ def _read(
     return {name: _column(table[name], kind) for name, kind in columns.items()}
 
 
-def _column(column: Any, kind: type) -> np.ndarray:
+def _column(column: Any, kind: str) -> np.ndarray:
     dtype, name = column.dtype, column.name
     fits = {
         FLOAT: dtype.is_float() or dtype.is_integer(),
@@ -63,10 +61,10 @@ def _column(column: Any, kind: type) -> np.ndarray:
         raise RecordError(f"column {name} is of type {dtype}")
     if column.null_count():
         raise RecordError(f"column {name} has {column.null_count()} missing values")
-    if kind is TEXT:
+    if kind == TEXT:
         return np.array(column.to_list(), object)
     with np.errstate(over="ignore", invalid="ignore"):
-        return column.to_numpy().astype(kind)
+        return column.to_numpy().astype(_TYPES[kind])
 
 
 def _line(error: BaseException) -> str:
