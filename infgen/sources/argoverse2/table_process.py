@@ -60,6 +60,9 @@ class TableProcess:
                     answer = _ask(process, about, data)
                 except OSError:
                     code = self.end()
+                except BaseException:  # Its answer would be taken for the next one's.
+                    self.end()
+                    raise
                 else:
                     break
             else:

@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from infgen.sources.argoverse2 import table_process
 from infgen.sources.argoverse2.table_process import TableProcess, serve
 from infgen.sources.argoverse2.tables import FLOAT, PARQUET, TEXT, read_table
 from infgen.sources.tfrecord import RecordError
@@ -67,6 +68,23 @@ def test_a_reader_that_something_else_ended_is_started_again(reader, table):
 
     assert reader.read(PARQUET, table, COLUMNS)["x"].tolist() == [1.5, -2.0]
     assert reader.process is not first
+
+
+def test_an_answer_that_nobody_waited_for_is_not_taken_for_the_next(
+    reader, table, monkeypatch
+):
+    def interrupted(process, about, data):
+        process.stdin.write(data)
+        raise KeyboardInterrupt
+
+    ask = table_process._ask
+    monkeypatch.setattr(table_process, "_ask", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        reader.read(PARQUET, table, COLUMNS)
+    assert reader.process is None
+
+    monkeypatch.setattr(table_process, "_ask", ask)
+    assert reader.read(PARQUET, table, COLUMNS)["x"].tolist() == [1.5, -2.0]
 
 
 def test_one_process_reads_all_tables_and_ends_with_its_input(reader, table):
