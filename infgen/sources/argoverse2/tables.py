@@ -27,7 +27,7 @@ def read_feather(data: bytes, columns: Mapping[str, str]) -> dict[str, np.ndarra
 
 
 def read_table(kind: str, data: bytes, columns: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """Read some columns of a table as arrays of the types asked for, in this process.
+    """Read some columns of a table as arrays of the given types, in this process.
 
     Raises:
         RecordError: if it is no such table, a column is missing, of another type or has

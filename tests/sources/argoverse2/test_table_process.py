@@ -70,7 +70,7 @@ def test_a_reader_that_something_else_ended_is_started_again(reader, table):
     assert reader.process is not first
 
 
-def test_an_answer_that_nobody_waited_for_is_not_taken_for_the_next(
+def test_the_answer_to_an_interrupted_request_is_not_taken_for_the_next(
     reader, table, monkeypatch
 ):
     def interrupted(process, about, data):

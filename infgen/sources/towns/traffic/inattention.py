@@ -38,7 +38,7 @@ _LEAST_MPS, _LEAST_M = 0.1, 0.1
 
 @dataclass(frozen=True, slots=True)
 class _Unaware:
-    """Somebody who does not look.
+    """A driver who does not look ahead.
 
     Attributes:
         until: Step at which they look again at the latest.
@@ -55,7 +55,7 @@ class InattentiveDrivers:
     """Who looks ahead and who does not, in the simulation that SUMO runs in this process.
 
     Attributes:
-        planned: Steps from which, and until which, somebody will not look, by name.
+        planned: Steps from which, and until which, drivers will not look, by name.
         unaware: Who does not look, by name.
     """
 

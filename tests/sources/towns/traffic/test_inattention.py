@@ -17,7 +17,7 @@ from tests.sources.towns.conftest import needs_libsumo, needs_sumo
 NET = Path(__file__).parents[1] / "crossing.net.xml"
 STEPS = 300
 DRIVER = replace(draw_motorist(np.random.default_rng(0)), hesitation_s=0.0)
-EVERYBODY = Inattention(
+ALL_DRIVERS = Inattention(
     period_steps=40,
     before_steps=0,
     until_steps=20,
@@ -41,22 +41,22 @@ def play_trips(folder, inattention):
 
 
 def hardest_brakes_mps2(played):
-    """How hard everybody brakes at most, of those who are there at a step and the next."""
+    """How hard each brakes at most, of those who are there at a step and the next."""
     there = played.present[:, 1:] & played.present[:, :-1]
     change = np.diff(played.speed_mps, axis=1) / CLOCK.step_s
     return -np.where(there, change, 0.0).min(axis=1)
 
 
-def test_if_nobody_is_drawn_all_is_as_without(tmp_path):
+def test_if_no_driver_is_drawn_all_is_as_without(tmp_path):
     attentive = play_trips(tmp_path, None)
-    same = play_trips(tmp_path, replace(EVERYBODY, share=0.0))
+    same = play_trips(tmp_path, replace(ALL_DRIVERS, share=0.0))
 
     assert np.array_equal(attentive.front_m, same.front_m)
     assert np.array_equal(attentive.present, same.present)
 
 
 def test_who_looks_up_late_brakes_harder(tmp_path):
-    attentive, not_so = (play_trips(tmp_path, each) for each in (None, EVERYBODY))
+    attentive, not_so = (play_trips(tmp_path, each) for each in (None, ALL_DRIVERS))
 
     calm, hard = hardest_brakes_mps2(attentive), hardest_brakes_mps2(not_so)
     assert hard.max() > 1.2 * calm.max()
@@ -64,10 +64,10 @@ def test_who_looks_up_late_brakes_harder(tmp_path):
 
 
 def test_drivers_hold_a_speed_until_all_look_again(tmp_path):
-    away = replace(EVERYBODY, period_steps=100)
+    away = replace(ALL_DRIVERS, period_steps=100)
     attentive, not_so = (play_trips(tmp_path, each) for each in (None, away))
 
-    # From step 100 on nobody looks; at the latest from step 120 on all do.
+    # From step 100 on no driver looks; at the latest from step 120 on all do.
     assert share_holding(not_so, 106, 112) > share_holding(attentive, 106, 112) + 0.2
     assert share_holding(not_so, 125, 131) < share_holding(not_so, 106, 112)
 
@@ -80,7 +80,7 @@ def share_holding(played, begin, end):
 
 
 def test_the_same_seed_plays_the_same(tmp_path):
-    one, other = (play_trips(tmp_path, EVERYBODY) for _ in range(2))
+    one, other = (play_trips(tmp_path, ALL_DRIVERS) for _ in range(2))
 
     assert np.array_equal(one.front_m, other.front_m)
     assert np.array_equal(one.speed_mps, other.speed_mps)
