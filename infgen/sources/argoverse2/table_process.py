@@ -123,12 +123,15 @@ def _ask(
     assert process.stdout is not None
     _send(process.stdin, about, data)
     line = process.stdout.readline()
-    if not line:
+    if not line.endswith(b"\n"):
         raise BrokenPipeError
     answer = json.loads(line)
     if "error" in answer:
         return str(answer["error"])
-    return _unpack(answer, process.stdout.read(answer["bytes"]))
+    packed = process.stdout.read(answer["bytes"])
+    if len(packed) < answer["bytes"]:
+        raise BrokenPipeError
+    return _unpack(answer, packed)
 
 
 def _pack(columns: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], bytes]:
@@ -143,10 +146,8 @@ def _pack(columns: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], bytes]:
             rows = [place.setdefault(word, len(place)) for word in values.tolist()]
             values = np.array(rows, np.int32)
         parts.append(values.tobytes())
-        described.append(
-            {"name": name, "type": values.dtype.str, "rows": len(values)}
-            | {"words": list(place)}
-        )
+        about = {"name": name, "type": values.dtype.str, "rows": len(values)}
+        described.append({**about, "words": list(place)})
     data = b"".join(parts)
     return {"columns": described, "bytes": len(data)}, data
 
