@@ -22,7 +22,7 @@ from logged_scenes import asked, whole
 from infgen.model.batching.batch import Batch
 from infgen.model.network import Network
 from infgen.model.training.policy_gradient.braking import LOOK_AHEAD_TOKENS
-from infgen.model.training.policy_gradient.conflicts import conflict_costs
+from infgen.model.training.policy_gradient.conflicts import conflicts_taken
 from infgen.model.training.policy_gradient.rewards import find_costs
 from infgen.model.training.policy_gradient.road import read_roads
 from infgen.model.training.policy_gradient.rollouts import (
@@ -53,14 +53,10 @@ def logged_moves(network: Network, batch: Batch) -> SimulatedRollouts:
 
 def count(network: Network, rollouts: SimulatedRollouts) -> Counter[str]:
     """Count motion tokens, those in conflict, and overlaps."""
-    vocabulary, agents = network.motion_vocabulary(), rollouts.batch.agents
+    vocabulary = network.motion_vocabulary()
     roads = read_roads(rollouts.batch.roads, network.map_vocabulary())
     overlap = find_costs(rollouts, vocabulary, roads).overlap & rollouts.moved
-    taken = agents.motion_token[rollouts.moved][:, None]
-    choices = torch.cat([rollouts.moved.nonzero(), taken], dim=1).numpy()
-    conflict = torch.zeros_like(rollouts.moved)
-    cost = torch.from_numpy(conflict_costs(rollouts, choices, vocabulary, 1.0))
-    conflict[rollouts.moved] = cost > 0
+    conflict = torch.from_numpy(conflicts_taken(rollouts, vocabulary))
     before = torch.zeros_like(conflict)  # The token of the overlap itself is always one.
     for later in range(1, LOOK_AHEAD_TOKENS):
         before[:, later:] |= conflict[:, :-later]

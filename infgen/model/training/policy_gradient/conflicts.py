@@ -8,10 +8,11 @@ they did in the rollout. Braking, the agent keeps to the way that it went in the
 the lateral offset from it at which the token ends. Boxes are compared at the middle and the
 end of token steps.
 
-The cost of a conflict is that of an overlap, discounted by how much later it comes. Where
-an agent took a token in conflict, the costs of all tokens are found, and it learns to take
-one that averts it. Mostly all likely tokens are in conflict there, so that their expected
-cost hardly changes with their odds; the log-probability of no conflict does.
+Where an agent comes into conflict, all motion tokens are looked at, and it learns to take
+one that is not: the log-probability of no conflict, as mostly the likely tokens are all in
+conflict, so that their expected number hardly changes with their odds. Nothing is learned
+of the tokens that follow while it is in conflict: two in three are such, and hardly a
+likely token averts it any more.
 """
 
 from dataclasses import dataclass
@@ -34,24 +35,25 @@ from infgen.tokens.vocabulary import MotionVocabulary
 
 @dataclass(frozen=True, slots=True)
 class Conflicts:
-    """Agents that took a motion token in conflict where others were not.
+    """Agents that came into conflict by a motion token where others would have averted it.
 
     Attributes:
         at: Rollout, token step at whose end the motion token ends, agent.
-        cost: Costs of all motion tokens, less the least of them: those of what could be
-            averted.
-        taken: How many motion tokens in conflict were taken.
+        in_conflict: Which motion tokens are in conflict there, some but not all.
+        taken: How many motion tokens in conflict were taken, those while an agent was in
+            conflict already included.
     """
 
     at: Int64[Tensor, "conflict 3"]
-    cost: Float32[Tensor, "conflict motion_token"]
+    in_conflict: Bool[Tensor, "conflict motion_token"]
     taken: int
 
     @classmethod
     def none(cls, vocabulary: MotionVocabulary, device: torch.device) -> "Conflicts":
         """Return none at all."""
-        cost = torch.zeros((0, vocabulary.num_motion_tokens), device=device)
-        return cls(torch.zeros((0, 3), dtype=torch.int64, device=device), cost, 0)
+        size = 0, vocabulary.num_motion_tokens
+        in_conflict = torch.zeros(size, dtype=torch.bool, device=device)
+        return cls(torch.zeros((0, 3), dtype=torch.int64, device=device), in_conflict, 0)
 
     def only(self, rows: slice) -> "Conflicts":
         """Take those of some rollouts, numbered from the first of them."""
@@ -59,59 +61,69 @@ class Conflicts:
         some = (rollout >= rows.start) & (rollout < rows.stop)
         at = self.at[some]
         at[:, 0] -= rows.start
-        return Conflicts(at, self.cost[some], self.taken)
+        return Conflicts(at, self.in_conflict[some], self.taken)
 
 
-def find_conflicts(
-    rollouts: SimulatedRollouts, vocabulary: MotionVocabulary, discount: float
-) -> Conflicts:
-    """Find who took a motion token in conflict.
+def find_conflicts(rollouts: SimulatedRollouts, vocabulary: MotionVocabulary) -> Conflicts:
+    """Find who came into conflict.
 
     Args:
         rollouts: Simulated agents.
         vocabulary: Of their motion tokens.
-        discount: Factor on the cost for each token step that an overlap comes later.
     """
-    moved = rollouts.moved
-    taken = torch.cat(
-        [moved.nonzero(), rollouts.batch.agents.motion_token[moved][:, None]], dim=1
-    ).numpy(force=True)
-    at = taken[conflict_costs(rollouts, taken, vocabulary, discount) > 0, :3]
+    taken = conflicts_taken(rollouts, vocabulary)
+    begins = taken.copy()
+    begins[:, 1:] &= ~taken[:, :-1]
+    at = np.argwhere(begins)
     every = np.arange(vocabulary.num_motion_tokens)
     choices = np.column_stack([at.repeat(len(every), axis=0), np.tile(every, len(at))])
-    cost = conflict_costs(rollouts, choices, vocabulary, discount).reshape(-1, len(every))
-    least = cost.min(axis=1, keepdims=True)
-    some = (cost > least).any(axis=1)
+    found = are_in_conflict(rollouts, choices, vocabulary).reshape(-1, len(every))
+    some, device = ~found.all(axis=1), rollouts.moved.device
     return Conflicts(
-        torch.from_numpy(at[some]).to(moved.device),
-        torch.from_numpy((cost - least)[some]).to(moved.device),
-        len(at),
+        torch.from_numpy(at[some]).to(device),
+        torch.from_numpy(found[some]).to(device),
+        int(taken.sum()),
     )
 
 
-def conflict_costs(
+def conflicts_taken(
+    rollouts: SimulatedRollouts, vocabulary: MotionVocabulary
+) -> Bool[np.ndarray, "rollout token agent"]:
+    """Tell which motion tokens that were taken are in conflict, on the host.
+
+    Args:
+        rollouts: Simulated agents.
+        vocabulary: Of their motion tokens.
+    """
+    moved = rollouts.moved.numpy(force=True)
+    motion_token = rollouts.batch.agents.motion_token.numpy(force=True)[moved]
+    choices = np.column_stack([np.argwhere(moved), motion_token])
+    taken = np.zeros_like(moved)
+    taken[moved] = are_in_conflict(rollouts, choices, vocabulary)
+    return taken
+
+
+def are_in_conflict(
     rollouts: SimulatedRollouts,
     choices: Int64[np.ndarray, "choice 4"],
     vocabulary: MotionVocabulary,
-    discount: float,
-) -> Float32[np.ndarray, " choice"]:
-    """Compute costs of motion tokens, on the host; zero where there is no conflict.
+) -> Bool[np.ndarray, " choice"]:
+    """Tell which motion tokens are in conflict, on the host.
 
     Args:
         rollouts: Simulated agents.
         choices: Rollout, token step, agent, motion token; those of an agent at a token step
             one after the other.
         vocabulary: Of the motion tokens.
-        discount: Factor on the cost for each token step that an overlap comes later.
     """
-    cost = np.zeros(len(choices), dtype=np.float32)
+    found = np.zeros(len(choices), dtype=bool)
     seen, token = _Seen.of(rollouts), choices[:, 1]
     for at in np.unique(token).tolist():
         some = np.flatnonzero(token == at)
         rollout, _, agent, motion_token = choices[some].T
-        found = _Choices.of(seen, at, (rollout, agent), motion_token, vocabulary)
-        cost[some] = found.costs(seen, discount)
-    return cost
+        tokens = _Choices.of(seen, at, (rollout, agent), motion_token, vocabulary)
+        found[some] = tokens.are_in_conflict(seen)
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,9 +201,9 @@ class _Choices:
         np.maximum.at(reach_m, row, arc_m)
         return cls(times, rollout, agent, row, pose, reach_m)
 
-    def costs(self, seen: _Seen, discount: float) -> Float32[np.ndarray, " choice"]:
-        """Costs of conflicts; zero where there is none."""
-        cost = np.zeros(len(self.row), dtype=np.float32)
+    def are_in_conflict(self, seen: _Seen) -> Bool[np.ndarray, " choice"]:
+        """Tell which of them come to overlap an agent ahead."""
+        found = np.zeros(len(self.row), dtype=bool)
         row, time, other = self._near(seen)
         pair, choice = self._with_choices(row)
         row, time, other = row[pair], time[pair], other[pair]
@@ -202,9 +214,8 @@ class _Choices:
             seen.pose[rollout, self.times.start + time, other],
             seen.size_lw_m[rollout, other],
         )
-        later = (time[hits] // 2).astype(np.float32)
-        np.maximum.at(cost, choice[hits], discount**later)
-        return cost
+        found[choice[hits]] = True
+        return found
 
     def _with_choices(self, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Go through all choices of rows: position in ``row``, and choice."""

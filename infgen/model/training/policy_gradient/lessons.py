@@ -66,7 +66,7 @@ def simulate_lessons(
     costs = find_costs(rollouts, vocabulary, roads)
     conflicts = Conflicts.none(vocabulary, rollouts.moved.device)
     if settings.conflict_penalty:
-        conflicts = find_conflicts(rollouts, vocabulary, settings.policy_discount)
+        conflicts = find_conflicts(rollouts, vocabulary)
     reward = costs.reward(settings)
 
     def grouped(values: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ log-probability of no conflict beside it (``conflicts``). Both terms are divided
 the number of motion tokens, so ``divergence_weight`` is in rewards per nat.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -24,6 +25,9 @@ from infgen.model.training.losses import Term, Terms
 from infgen.model.training.policy_gradient.conflicts import Conflicts
 from infgen.model.training.policy_gradient.nucleus import log_probabilities
 from infgen.tokens.scene_tokens import Presence
+
+LEAST_ODDS = 1e-3
+"""Where no conflict is less likely than this, little is learned any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +122,8 @@ def _safe_gain(outputs: Outputs, conflicts: Conflicts) -> Tensor:
     scene, token, agent = conflicts.at.T
     row = outputs.motion.rows.number[scene, token - 1, agent]
     likely = outputs.motion.motion_logits[row].log_softmax(dim=-1)
-    return (likely + torch.log1p(-conflicts.cost)).logsumexp(dim=-1).sum()
+    counts = conflicts.in_conflict * math.log(LEAST_ODDS)
+    return (likely + counts).logsumexp(dim=-1).sum()
 
 
 def _insertion_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:

@@ -9,13 +9,13 @@ import torch
 from infgen.geometry import to_world
 from infgen.model.training.policy_gradient.braking import BRAKES_MPS2
 from infgen.model.training.policy_gradient.conflicts import (
-    conflict_costs,
+    are_in_conflict,
+    conflicts_taken,
     find_conflicts,
 )
 from infgen.scene import AgentType
 
 TOKENS, METRES = 7, 24
-DISCOUNT = 0.9
 
 
 def still(x_m, y_m=0.0):
@@ -23,20 +23,20 @@ def still(x_m, y_m=0.0):
     return [[x_m, y_m, 0.0]] * TOKENS
 
 
-def costs(drawn, metres, *ways, **changed):
-    """Costs of all motion tokens that the first agent might take at the first step."""
+def conflicts(drawn, metres, *ways, **changed):
+    """Which of all motion tokens that the first agent might take first are in conflict."""
     rollouts = drawn(np.stack(ways, axis=1)[None])
     agents = replace(rollouts.batch.agents, **changed)
     rollouts = replace(rollouts, batch=replace(rollouts.batch, agents=agents))
     choices = np.zeros((metres.num_motion_tokens, 4), dtype=np.int64)
     choices[:, 1], choices[:, 3] = 1, np.arange(len(choices))
-    return conflict_costs(rollouts, choices, metres, DISCOUNT).tolist()
+    return are_in_conflict(rollouts, choices, metres).tolist()
 
 
 def first_conflict(drawn, metres, *ways, **changed):
     """The shortest motion token in conflict; all longer ones are, up to 30 m/s."""
-    found = costs(drawn, metres, *ways, **changed)
-    first = next((at for at, cost in enumerate(found) if cost), len(found))
+    found = conflicts(drawn, metres, *ways, **changed)
+    first = found.index(True) if any(found) else len(found)
     assert all(found[first:16])
     return first
 
@@ -53,13 +53,12 @@ def braked_m(token_m, time):
 
 @pytest.mark.parametrize("gap_m", [5.5, 11.0, 20.0])
 def test_a_token_is_in_conflict_if_braking_after_it_does_not_avert_it(drawn, metres, gap_m):
-    found = costs(drawn, metres, still(0), still(gap_m))
+    found = conflicts(drawn, metres, still(0), still(gap_m))
 
     # Boxes overlap while their centres are less than 4 m apart.
-    for token_m, cost in enumerate(found):
-        hits = [abs(gap_m - braked_m(token_m, time)) < 4 for time in range(10)]
-        expected = DISCOUNT ** (hits.index(True) // 2) if any(hits) else 0.0
-        assert cost == pytest.approx(expected), token_m
+    for token_m, in_conflict in enumerate(found):
+        hits = any(abs(gap_m - braked_m(token_m, time)) < 4 for time in range(10))
+        assert in_conflict == hits, token_m
 
 
 def test_others_move_as_they_did_in_the_rollout(drawn, metres):
@@ -71,13 +70,13 @@ def test_others_move_as_they_did_in_the_rollout(drawn, metres):
     )
 
     assert stands < goes
-    assert costs(drawn, metres, still(0), meets)[0] > 0  # It has the other one ahead.
+    assert conflicts(drawn, metres, still(0), meets)[0]  # It has the other one ahead.
 
 
 def test_who_is_run_into_from_behind_has_no_conflict(drawn, metres):
     behind = [[-12 + 3 * at, 0, 0] for at in range(TOKENS)]
 
-    assert not any(costs(drawn, metres, still(0), behind))
+    assert not any(conflicts(drawn, metres, still(0), behind))
 
 
 def test_an_agent_that_was_not_there_yet_is_no_conflict(drawn, metres):
@@ -85,18 +84,18 @@ def test_an_agent_that_was_not_there_yet_is_no_conflict(drawn, metres):
     observed = torch.ones((1, TOKENS, 2), dtype=torch.bool)
     observed[:, 0, 1] = False
 
-    assert any(costs(drawn, metres, *ways))
-    assert not any(costs(drawn, metres, *ways, observed=observed))
+    assert any(conflicts(drawn, metres, *ways))
+    assert not any(conflicts(drawn, metres, *ways, observed=observed))
 
 
 def test_who_overlapped_from_the_beginning_has_no_conflict(drawn, metres):
-    assert not any(costs(drawn, metres, still(0), still(2)))
+    assert not any(conflicts(drawn, metres, still(0), still(2)))
 
 
 def test_two_pedestrians_have_no_conflict(drawn, metres):
     walks = torch.full((1, 2), int(AgentType.PEDESTRIAN))
 
-    assert not any(costs(drawn, metres, still(0), still(8), agent_type=walks))
+    assert not any(conflicts(drawn, metres, still(0), still(8), agent_type=walks))
 
 
 def test_an_agent_that_brakes_keeps_to_its_own_way(drawn, metres):
@@ -107,9 +106,9 @@ def test_an_agent_that_brakes_keeps_to_its_own_way(drawn, metres):
 
     # The token itself goes straight ahead, and only what follows turns.
     assert first_conflict(drawn, metres, still(0), ahead) == 4
-    assert costs(drawn, metres, turns, ahead)[:8] == [0.0] * 8
-    assert costs(drawn, metres, turns, on_way)[5] > 0
-    assert not any(costs(drawn, metres, still(0), on_way)[:8])
+    assert conflicts(drawn, metres, turns, ahead)[:8] == [False] * 8
+    assert conflicts(drawn, metres, turns, on_way)[5]
+    assert not any(conflicts(drawn, metres, still(0), on_way)[:8])
 
 
 def test_conflicts_do_not_depend_on_where_the_scene_lies(drawn, metres):
@@ -119,7 +118,7 @@ def test_conflicts_do_not_depend_on_where_the_scene_lies(drawn, metres):
     frame = np.array([31.0, -12.0, 2.5])
 
     here, there = (
-        costs(drawn, metres, *placed)
+        conflicts(drawn, metres, *placed)
         for placed in (ways, [to_world(way, frame) for way in ways])
     )
 
@@ -127,17 +126,32 @@ def test_conflicts_do_not_depend_on_where_the_scene_lies(drawn, metres):
     assert here == there
 
 
-def test_who_took_a_token_in_conflict_is_told_which_would_have_averted_it(drawn, metres):
+def test_who_comes_into_conflict_is_told_which_token_would_have_averted_it(drawn, metres):
     runs = [[5 * at, 0, 0] for at in range(TOKENS)]
     rollouts = drawn(np.stack([runs, still(13)], axis=1)[None])
 
-    found = find_conflicts(rollouts, metres, DISCOUNT)
+    found = find_conflicts(rollouts, metres)
 
-    assert found.at.tolist() == [[0, 1, 0], [0, 2, 0]]
-    assert found.cost[0].tolist() == pytest.approx(costs(drawn, metres, runs, still(13)))
-    assert (found.cost.min(dim=1).values == 0).all()
-    assert (found.cost[:, 5] > 0).all()
+    assert found.at.tolist() == [[0, 1, 0]]
+    assert found.in_conflict[0].tolist() == conflicts(drawn, metres, runs, still(13))
+    assert not found.in_conflict[0].all()
+    assert found.in_conflict[0, 5]
+    # It is too late at the second token step, but that token is in conflict as well.
+    assert conflicts_taken(rollouts, metres).nonzero()[1].tolist() == [1, 2]
     assert found.taken == 2
+
+
+def test_who_comes_into_conflict_again_is_told_again(drawn, metres):
+    """It drives through one that stands, and later into another one."""
+    runs = [[5 * at, 0, 0] for at in range(TOKENS)]
+    rollouts = drawn(np.stack([runs, still(8), still(28)], axis=1)[None])
+
+    taken = conflicts_taken(rollouts, metres)[0, :, 0].nonzero()[0].tolist()
+    found = find_conflicts(rollouts, metres)
+
+    begins = [at for at in taken if at - 1 not in taken]
+    assert len(begins) == 2
+    assert found.at.tolist() == [[0, at, 0] for at in begins]
 
 
 def test_what_nothing_averts_is_told_as_taken_only(drawn, metres):
@@ -147,7 +161,7 @@ def test_what_nothing_averts_is_told_as_taken_only(drawn, metres):
     rollouts = drawn(np.stack([still(0), meets], axis=1)[None])
     rollouts.moved[..., 1] = False
 
-    found = find_conflicts(rollouts, short, DISCOUNT)
+    found = find_conflicts(rollouts, short)
 
     assert not len(found.at)
     assert found.taken > 0
@@ -157,9 +171,9 @@ def test_without_moves_nothing_is_taken(drawn, metres):
     rollouts = drawn(np.stack([still(0), still(9)], axis=1)[None])
     rollouts.moved.fill_(False)
 
-    found = find_conflicts(rollouts, metres, DISCOUNT)
+    found = find_conflicts(rollouts, metres)
 
-    assert found.cost.shape == (0, METRES)
+    assert found.in_conflict.shape == (0, METRES)
     assert found.taken == 0
 
 
@@ -167,8 +181,8 @@ def test_rollouts_are_taken_by_their_rows(drawn, metres):
     runs = [[5 * at, 0, 0] for at in range(TOKENS)]
     rollouts = drawn(np.array([np.stack([runs, still(x)], axis=1) for x in (13, 13, 90)]))
 
-    found = find_conflicts(rollouts, metres, DISCOUNT)
+    found = find_conflicts(rollouts, metres)
 
-    assert found.at[:, 0].tolist() == [0, 0, 1, 1]
-    assert found.only(slice(1, 3)).at.tolist() == [[0, 1, 0], [0, 2, 0]]
+    assert found.at[:, 0].tolist() == [0, 1]
+    assert found.only(slice(1, 3)).at.tolist() == [[0, 1, 0]]
     assert not len(found.only(slice(2, 3)).at)

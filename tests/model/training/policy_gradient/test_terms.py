@@ -16,7 +16,7 @@ from infgen.model.training.policy_gradient.lessons import (
     simulate_lessons,
 )
 from infgen.model.training.policy_gradient.rollouts import HISTORY_TOKENS
-from infgen.model.training.policy_gradient.terms import divergence, policy_terms
+from infgen.model.training.policy_gradient.terms import LEAST_ODDS, divergence, policy_terms
 from infgen.tokens.scene_tokens import Presence
 
 HOW = TrainSettings(policy_gradient_rollouts=3, policy_top_p=0.9, conflict_penalty=2.0)
@@ -130,9 +130,9 @@ def test_motion_tokens_in_conflict_become_less_likely(network, lessons):
     lesson = lessons.lessons[0]
     at = lesson.moved.nonzero()[10]
     scene, token, agent = at.tolist()
-    cost = torch.zeros((1, network.motion_vocabulary().num_motion_tokens))
-    cost[0, :5], cost[0, 5] = 1.0, 0.5
-    only = replace(worthless(lesson), conflicts=Conflicts(at[None], cost, 1))
+    in_conflict = torch.zeros((1, network.motion_vocabulary().num_motion_tokens)).bool()
+    in_conflict[0, :5] = True
+    only = replace(worthless(lesson), conflicts=Conflicts(at[None], in_conflict, 1))
 
     before, after = (
         each(lesson.batch).motion for each in (network, after_a_step(network, only))
@@ -140,10 +140,11 @@ def test_motion_tokens_in_conflict_become_less_likely(network, lessons):
 
     def safe(motion):
         row = motion.rows.number[scene, token - 1, agent]
-        return 1 - (motion.motion_logits[row].softmax(dim=0) * cost[0]).sum()
+        return motion.motion_logits[row].softmax(dim=0)[~in_conflict[0]].sum()
 
     loss = terms(network, network, only)["policy"].loss
-    torch.testing.assert_close(loss, -HOW.conflict_penalty * safe(before).log())
+    odds = safe(before) + LEAST_ODDS * (1 - safe(before))
+    torch.testing.assert_close(loss, -HOW.conflict_penalty * odds.log())
     assert safe(after) > safe(before)
 
 
