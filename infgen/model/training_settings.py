@@ -163,8 +163,8 @@ class TrainSettings:
     overlap_penalty: NonNegative = 1.0
     """Cost of running into another agent."""
     conflict_penalty: NonNegative = 0.0
-    """Cost, per nat of the log-probability of those that avert it, of a motion token after
-    which an agent that brakes would still run into another one."""
+    """Cost, per nat of the log-probability of motion tokens that avert it, of coming into
+    conflict: of a token after which an agent that brakes still runs into another one."""
     off_road_penalty: NonNegative = 0.5
     """Cost of each token step in which a vehicle leaves the road or gets farther off it."""
     log_distance_penalty: NonNegative = 0.1
