@@ -1,9 +1,12 @@
 """Logs of a root's tokens, and the weights that are asked about them."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from loader import shards
 
 from infgen.model.batching.batch import Batch, Limits, collate
@@ -41,3 +44,22 @@ def whole(network: Network, scene: SceneTokens) -> Batch:
     roads = max(1, scene.num_map_tokens)
     limits = Limits(scene.num_agents, roads, 1, scene.num_tokens, network.grid_settings)
     return collate([scene], limits, draw=0)
+
+
+def sum_over_logs(
+    doc: str | None,
+    arguments: Sequence[str] | None,
+    look: Callable[[Network, SceneTokens], Any],
+    report: Callable[[Any], list[dict[str, object]]],
+) -> None:
+    """Add up what is found in every scene, and print a table and a JSON object of it.
+
+    Args:
+        doc: The benchmark's description.
+        arguments: Its arguments.
+        look: Finds sums in a scene, an array.
+        report: Prints the table of the sums of all scenes, and returns its rows.
+    """
+    network, scenes = asked(doc, arguments)
+    found = [look(network, scene) for scene in scenes]
+    print(json.dumps({"scenes": len(found), "rows": report(np.sum(found, axis=0))}))

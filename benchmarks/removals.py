@@ -11,13 +11,12 @@ expected. A network that is right in sum may still remove too many that drive cl
 ego. The last line is one JSON object.
 """
 
-import json
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
-from logged_scenes import asked, whole
+from logged_scenes import sum_over_logs, whole
 from torch import Tensor
 
 from infgen.model.batching.batch import Agents
@@ -102,9 +101,7 @@ def report(found: Float64[np.ndarray, "3 state ring"]) -> list[dict[str, object]
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Look at the logs of a root's tokens."""
-    network, scenes = asked(__doc__, arguments)
-    found = [look(network, scene) for scene in scenes]
-    print(json.dumps({"scenes": len(found), "rows": report(np.sum(found, axis=0))}))
+    sum_over_logs(__doc__, arguments, look, report)
 
 
 if __name__ == "__main__":
