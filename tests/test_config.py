@@ -115,6 +115,7 @@ def test_windows_are_whole_token_steps(name, value, near):
         ("train", {"gradient_accumulation": 17}, "more than the 16 scenes of a batch"),
         ("train", {"closed_loop_top_k": 5, "lateral_drift_share": 0.5}, "set one of them"),
         ("train", {"policy_gradient_rollouts": 2}, "expected 0, or 3 or more"),
+        ("train", {"policy_minibatches": 2}, "2; expected at most 1, policy_gradient"),
         ("tokenize", {"heading_bin_deg": 7}, "does not divide 360"),
     ],
 )

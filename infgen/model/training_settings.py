@@ -158,6 +158,12 @@ class TrainSettings:
     policy_insertion_mask: Bool = False
     """Agents of these rollouts are inserted at free positions only, as by the rule
     `insertion_mask` of rollouts but for its distance to lanes."""
+    policy_minibatches: AtLeastOne = 1
+    """Parts that the rollouts of a step are cut into, with an update of the weights for
+    each."""
+    policy_epochs: AtLeastOne = 1
+    """Times that the rollouts of a step are learned from: to simulate them costs as much as
+    to learn from them once or twice."""
     policy_discount: Share = 0.9
     """Factor on rewards for each token step that they come later."""
     overlap_penalty: NonNegative = 1.0
@@ -224,6 +230,12 @@ class TrainSettings:
                 f"policy_gradient_rollouts is {self.policy_gradient_rollouts}; expected 0, "
                 f"or {LEAST_ROLLOUTS} or more, that each can be compared with others"
             )
+        parts = self.policy_gradient_rollouts * self.gradient_accumulation
+        if self.policy_minibatches > max(1, parts):
+            raise ValueError(
+                f"policy_minibatches is {self.policy_minibatches}; expected at most "
+                f"{max(1, parts)}, policy_gradient_rollouts times gradient_accumulation"
+            )
         if self.max_scenes and self.source_share:
             raise ValueError(
                 "max_scenes and source_share both say which scenes are read; leave one out"
@@ -244,6 +256,11 @@ class TrainSettings:
         return weight if learns_log else weight * self.log_weight
 
     @property
+    def updates(self) -> int:
+        """Updates of the weights in a step."""
+        return self.policy_minibatches * self.policy_epochs
+
+    @property
     def of_the_log(self) -> "TrainSettings":
         """Return them without policy gradient: the loss of held-out logs."""
-        return replace(self, policy_gradient_rollouts=0)
+        return replace(self, policy_gradient_rollouts=0, policy_minibatches=1)

@@ -5,8 +5,11 @@ atomically, so a kill at any time leaves the old or the new checkpoint. Random n
 place in the data and the learning rate follow from the step alone.
 """
 
+import copy
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,6 +67,19 @@ def load_checkpoint(folder: Path, training: TrainingState) -> int:
         training.average[name].copy_(value)
     _restore_optimiser(training, read_tensors(source / "optimiser.safetensors"))
     return int(about["step"])
+
+
+@contextmanager
+def undone_on_error(training: TrainingState) -> Iterator[None]:
+    """Bring the network and its optimiser back to what they were if this fails."""
+    network = copy.deepcopy(training.network.state_dict())
+    optimiser = copy.deepcopy(training.optimiser.state_dict())
+    try:
+        yield
+    except BaseException:
+        training.network.load_state_dict(network)
+        training.optimiser.load_state_dict(optimiser)
+        raise
 
 
 def remove_checkpoints(folder: Path) -> None:

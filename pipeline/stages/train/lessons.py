@@ -1,6 +1,6 @@
 """What is learned from one part of a batch: from logs, from rollouts, or from both."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,7 +15,9 @@ from infgen.model.training.closed_loop import close_loop
 from infgen.model.training.closed_loop_population import close_population_loop
 from infgen.model.training.diagnostics import motion_surprise
 from infgen.model.training.losses import Terms, losses
+from infgen.model.training.policy_gradient.choices import choices_made
 from infgen.model.training.policy_gradient.lessons import PolicyLessons, simulate_lessons
+from infgen.model.training.policy_gradient.policy_lesson import PolicyLesson
 from infgen.model.training.policy_gradient.terms import policy_terms
 from pipeline.stages.train.precision import Pass
 from pipeline.storage.checkpoint import TrainingState
@@ -46,19 +48,28 @@ class Lessons:
     log: LogLesson | None
     rollouts: PolicyLessons | None
 
+    def only(self, rollouts: Sequence[int]) -> "Lessons":
+        """Leave out all rollouts but these, by number."""
+        assert self.rollouts is not None
+        lessons = [self.rollouts.lessons[number] for number in rollouts]
+        return replace(self, rollouts=replace(self.rollouts, lessons=lessons))
+
     def weight(self, settings: TrainSettings) -> Tensor:
         """Sum the weights of every term of the loss [term]."""
         found = []
         if self.log is not None:
             found.append(self.log.supervision.weight(settings))
-        for lesson in self.rollouts.lessons if self.rollouts else ():
-            found.append(supervised_choices(lesson.moved.sum()))
+        if self.rollouts is not None:
+            counts = [lesson.moved.sum() for lesson in self.rollouts.lessons]
+            none = self.rollouts.sums.new_zeros(())
+            found.append(supervised_choices(sum(counts, start=none)))
         return torch.stack(found).sum(dim=0)
 
 
 def prepare_lessons(
     part: Batch | PackedBatch,
     network: Network,
+    forward: Pass,
     settings: TrainSettings,
     device: torch.device,
     seed: int,
@@ -68,10 +79,30 @@ def prepare_lessons(
     rollouts = None
     if settings.policy_gradient_rollouts:
         rollouts = simulate_lessons(network, here.batch, settings, seed)
+        if settings.updates > 1:
+            rollouts = _with_log_probabilities(rollouts, network, forward, settings)
     if rollouts is not None and not settings.log_weight:
         return Lessons(None, rollouts)
     log = _near_log(here, network, settings, seed)
     return Lessons(LogLesson(log, log.supervision or Supervision.of(log.batch)), rollouts)
+
+
+def _with_log_probabilities(
+    rollouts: PolicyLessons, network: Network, forward: Pass, settings: TrainSettings
+) -> PolicyLessons:
+    """Note how likely the choices were before the weights change."""
+    stationary, insertions = _stationary(network), _learns_of_insertions(network)
+
+    def noted(lesson: PolicyLesson) -> PolicyLesson:
+        outputs = forward.evaluated(network, lesson.batch, insertions)
+        made = choices_made(outputs, lesson, stationary, settings.policy_top_p)
+        return replace(lesson, log_probability=made.log_probability)
+
+    network.eval()
+    with torch.no_grad():
+        found = replace(rollouts, lessons=[noted(each) for each in rollouts.lessons])
+    network.train()
+    return found
 
 
 def _near_log(
@@ -105,18 +136,22 @@ def each_terms(
         return
     network, pretrained = training.network, training.pretrained
     assert pretrained is not None
-    stationary = torch.from_numpy(network.motion_vocabulary().stationary)
-    insertions = _learns_of_insertions(network)
+    stationary, insertions = _stationary(network), _learns_of_insertions(network)
     network.eval()
     for lesson in lessons.rollouts.lessons:
-        here = stationary.to(lesson.moved.device)
         outputs = forward.evaluated(network, lesson.batch, insertions)
         with torch.no_grad():
             before = forward.evaluated(pretrained, lesson.batch, insertions)
         how = settings.policy_top_p, settings.conflict_penalty
-        terms = policy_terms(outputs, before, lesson, here, *how)
-        yield terms, torch.zeros(2, device=here.device)
+        terms = policy_terms(outputs, before, lesson, stationary, *how)
+        yield terms, torch.zeros(2, device=lesson.moved.device)
     network.train()
+
+
+def _stationary(network: Network) -> Tensor:
+    """Motion tokens that stand still, by agent type, on the network's device."""
+    found = torch.from_numpy(network.motion_vocabulary().stationary)
+    return found.to(next(network.parameters()).device)
 
 
 def _learns_of_insertions(network: Network) -> bool:

@@ -3,11 +3,15 @@
 A batch may be cut into parts, done one after the other and by several processes. Every
 loss term is its sum over all parts divided by the sum of its weights over all parts; the
 latter are known beforehand (``Supervision``), so gradients simply add up.
+
+A step that simulates rollouts may have several updates (``updates``), each of them such a
+sum over its part of the rollouts. It is done whole or not at all.
 """
 
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -23,7 +27,8 @@ from pipeline.stages.train.lessons import Lessons, each_terms, prepare_lessons
 from pipeline.stages.train.precision import Pass
 from pipeline.stages.train.process_group import ProcessGroup
 from pipeline.stages.train.setup import TrainingError
-from pipeline.storage.checkpoint import TrainingState
+from pipeline.stages.train.updates import cut_into_updates
+from pipeline.storage.checkpoint import TrainingState, undone_on_error
 
 LEAST_WEIGHT = 1e-6
 SEED_BITS = 16
@@ -59,6 +64,20 @@ class StepResult:
     norm: float
     surprise: Tensor
     rollouts: Tensor | None = None
+
+    @classmethod
+    def of(cls, updates: Sequence["StepResult"]) -> "StepResult":
+        """Put the updates of a step together: sums of terms, the mean of norms."""
+        first, *others = updates
+        if not others:
+            return first
+        terms = dict(first.terms)
+        for each in others:
+            for name, term in each.terms.items():
+                terms[name] = terms[name] + term if name in terms else term
+        norm = sum(each.norm for each in updates) / len(updates)
+        surprise = torch.stack([each.surprise for each in updates]).sum(dim=0)
+        return cls(terms, norm, surprise, first.rollouts)
 
     @property
     def perplexity(self) -> float:
@@ -127,12 +146,23 @@ class OptimizerStep:
             prepare_lessons(
                 part,
                 training.network,
+                self.forward,
                 settings,
                 self._sums.device,
                 noise_of_part(step, settings.seed, number),
             )
             for number, part in zip(own, parts, strict=True)
         ]
+        seed = noise_of_part(step, settings.seed, own.start)
+        updates = cut_into_updates(lessons, settings, seed)
+        with undone_on_error(training) if settings.updates > 1 else nullcontext():
+            stepped = StepResult.of([self._update(each, own, step) for each in updates])
+        _move_average(training, settings, step)
+        return stepped
+
+    def _update(self, lessons: Sequence[Lessons], own: range, step: int) -> StepResult:
+        """Update the weights once, by what all processes learn."""
+        training, settings = self._training, self._settings
         weight = torch.stack([each.weight(settings) for each in lessons]).sum(dim=0)
         self._process_group.add_up(weight)
         self._sums.zero_()
@@ -148,7 +178,6 @@ class OptimizerStep:
         for group in training.optimiser.param_groups:
             group["lr"] = learning_rate(settings, step)
         training.optimiser.step()
-        _move_average(training, settings, step)
         simulated = rollouts if settings.policy_gradient_rollouts else None
         return StepResult(terms, norm, surprise, simulated)
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from infgen.model.batching.batch import Batch
 from infgen.model.network import Network
 from infgen.model.training.policy_gradient.conflicts import Conflicts, find_conflicts
+from infgen.model.training.policy_gradient.policy_lesson import PolicyLesson
 from infgen.model.training.policy_gradient.returns import (
     advantages,
     discounted_returns,
@@ -22,7 +23,6 @@ from infgen.model.training.policy_gradient.rollouts import (
     SimulatedRollouts,
     simulate_rollouts,
 )
-from infgen.model.training.policy_gradient.terms import PolicyLesson
 from infgen.model.training.simulation import REMOVED
 from infgen.model.training_settings import TrainSettings
 

@@ -1,6 +1,7 @@
 """What rollouts teach: good choices become likelier, near to the pretrained network."""
 
 import copy
+import math
 from dataclasses import replace
 
 import pytest
@@ -9,14 +10,16 @@ from torch.nn.functional import logsigmoid
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
+from infgen.model.training.policy_gradient.choices import choices_made
 from infgen.model.training.policy_gradient.conflicts import Conflicts
+from infgen.model.training.policy_gradient.divergence import divergence
 from infgen.model.training.policy_gradient.lessons import (
     SUMS,
     figures,
     simulate_lessons,
 )
 from infgen.model.training.policy_gradient.rollouts import HISTORY_TOKENS
-from infgen.model.training.policy_gradient.terms import LEAST_ODDS, divergence, policy_terms
+from infgen.model.training.policy_gradient.terms import CLIP, LEAST_ODDS, policy_terms
 from infgen.tokens.scene_tokens import Presence
 
 HOW = TrainSettings(policy_gradient_rollouts=3, policy_top_p=0.9, conflict_penalty=2.0)
@@ -146,6 +149,52 @@ def test_motion_tokens_in_conflict_become_less_likely(network, lessons):
     odds = safe(before) + LEAST_ODDS * (1 - safe(before))
     torch.testing.assert_close(loss, -HOW.conflict_penalty * odds.log())
     assert safe(after) > safe(before)
+
+
+def gradient(network, lesson):
+    """Of the policy term, all of it."""
+    network.zero_grad()
+    loss = terms(network, network, lesson)["policy"].loss
+    loss.backward()
+    found = [p.grad.flatten() for p in network.parameters() if p.grad is not None]
+    network.zero_grad(set_to_none=True)
+    return loss.detach(), torch.cat(found)
+
+
+def test_ratios_have_the_gradient_of_log_probabilities_until_the_weights_change(
+    network, lessons
+):
+    lesson = lessons.lessons[0]
+    stationary = torch.from_numpy(network.motion_vocabulary().stationary)
+    with torch.no_grad():
+        made = choices_made(network(lesson.batch), lesson, stationary, HOW.policy_top_p)
+
+    loss, noted = gradient(network, replace(lesson, log_probability=made.log_probability))
+    other_loss, plain = gradient(network, lesson)
+
+    torch.testing.assert_close(noted, plain, atol=1e-5, rtol=1e-4)
+    gained = made.advantage.sum() - (made.advantage * made.log_probability).sum()
+    torch.testing.assert_close(other_loss - loss, gained, atol=1e-3, rtol=1e-4)
+
+
+@pytest.mark.parametrize("good", [True, False])
+@pytest.mark.parametrize("likelier", [True, False])
+def test_a_choice_whose_probability_has_changed_enough_teaches_nothing_more(
+    network, lessons, good, likelier
+):
+    only = worthless(lessons.lessons[0])
+    chosen = only.moved.nonzero()[10]
+    only.advantage[tuple(chosen)] = 1.0 if good else -1.0
+    stationary = torch.from_numpy(network.motion_vocabulary().stationary)
+    with torch.no_grad():
+        made = choices_made(network(only.batch), only, stationary, HOW.policy_top_p)
+    change = math.log(1 + 2 * CLIP) if likelier else math.log(1 - 2 * CLIP)
+
+    _, found = gradient(
+        network, replace(only, log_probability=made.log_probability - change)
+    )
+
+    assert bool(found.any()) == (good != likelier)
 
 
 def test_cells_and_headings_of_inserted_agents_are_learned_too(network, lessons):

@@ -10,15 +10,19 @@ from infgen.config import TrainSettings
 from infgen.errors import ConfigError
 from infgen.model.network import Network
 from pipeline.engine.signals import Stopped
+from pipeline.stages.train.lessons import prepare_lessons
 from pipeline.stages.train.loop import train
-from pipeline.stages.train.optimizer_step import OptimizerStep
+from pipeline.stages.train.optimizer_step import NotFiniteError, OptimizerStep
+from pipeline.stages.train.precision import Pass
 from pipeline.stages.train.process_group import ProcessGroup
 from pipeline.stages.train.setup import begin
 from pipeline.stages.train.stage import reads
 from pipeline.stages.train.train_log import read_log
+from pipeline.stages.train.updates import cut_into_updates
 from pipeline.storage.checkpoint import load_checkpoint
 from pipeline.storage.weights import save_network, state_dict_of
 
+CPU = torch.device("cpu")
 HOW = {
     "policy_gradient_rollouts": 3,
     "max_token_steps": 6,
@@ -75,14 +79,17 @@ def test_the_log_can_be_learned_from_besides(tuned, books, quiet):
     assert lines[0]["total"] > 0.4 * lines[0]["motion"]
 
 
-def test_a_run_that_is_stopped_goes_on_to_the_same_bits(tuned, books, quiet, monkeypatch):
+@pytest.mark.parametrize("updates", [{}, {"policy_minibatches": 3, "policy_epochs": 2}])
+def test_a_run_that_is_stopped_goes_on_to_the_same_bits(
+    tuned, books, quiet, monkeypatch, updates
+):
     monkeypatch.setattr("pipeline.stages.train.throughput.TELL_EVERY_S", 0.0)
 
     def stop(done, total, note=""):
         if done == 1:
             raise Stopped(signal.SIGTERM)
 
-    whole, cut = tuned("whole"), tuned("cut")
+    whole, cut = tuned("whole", **updates), tuned("cut", **updates)
     one = begin(whole, *books)
     train(whole, one, quiet)
     with pytest.raises(Stopped):
@@ -136,6 +143,80 @@ def test_no_step_is_done_where_nothing_is_better_than_anything_else(tuned, books
     )
 
     assert stepped.norm == pytest.approx(0, abs=1e-5)
+
+
+def test_every_rollout_is_learned_from_once_an_epoch(tuned, books):
+    how = {"policy_minibatches": 4, "policy_epochs": 3, "gradient_accumulation": 2}
+    setup = tuned("run", batch_scenes=2, **how)
+    training, recipe = begin(setup, *books), setup.recipe(ProcessGroup())
+    forward = Pass(training.network, setup.train)
+    lessons = [
+        prepare_lessons(part, training.network, forward, setup.train, CPU, number)
+        for number, part in enumerate(recipe[0])
+    ]
+
+    updates = list(cut_into_updates(lessons, setup.train, 5))
+
+    assert len(updates) == 12
+    every = sorted(id(x) for each in lessons for x in each.rollouts.lessons)
+    orders = []
+    for epoch in range(3):
+        learned = [
+            id(lesson)
+            for update in updates[4 * epoch : 4 * epoch + 4]
+            for part in update
+            for lesson in part.rollouts.lessons
+        ]
+        assert sorted(learned) == every
+        orders.append(tuple(learned))
+    assert len(set(orders)) > 1
+    sizes = [sum(len(part.rollouts.lessons) for part in each) for each in updates]
+    assert set(sizes) == {1, 2}  # Six rollouts in four parts.
+
+
+def test_several_updates_of_a_step_learn_more_than_one(tuned, books, quiet):
+    found = []
+    for folder, updates in (("one", {}), ("more", {"policy_epochs": 4})):
+        setup = tuned(folder, steps=1, warmup_steps=0, learning_rate=1e-3, **updates)
+        training = begin(setup, *books)
+        train(setup, training, quiet)
+        (line,) = read_log(setup.folder / "train.jsonl")[:1]
+        pairs = zip(
+            training.network.parameters(), training.pretrained.parameters(), strict=True
+        )
+        found.append((line, sum(float((a - b).detach().abs().sum()) for a, b in pairs)))
+
+    (one, moved), (more, moved_more) = found
+    assert moved_more > 2 * moved
+    assert more["policy_count"] == 4 * one["policy_count"]
+    assert more["rollout_entries"] == one["rollout_entries"]
+    assert more["divergence"] > one["divergence"]
+
+
+def test_a_step_that_fails_in_its_second_update_is_not_done_at_all(
+    tuned, books, monkeypatch
+):
+    setup = tuned("run", policy_epochs=2, learning_rate=1e-2)
+    training, recipe = begin(setup, *books), setup.recipe(ProcessGroup())
+    stepper = OptimizerStep(training, setup.train, ProcessGroup(), recipe.parts)
+    before = [each.clone() for each in training.network.parameters()]
+    norms = []
+
+    def fail(norm, terms, bad):
+        norms.append(norm)
+        if len(norms) == 2:
+            raise NotFiniteError(["policy"], [0])
+
+    monkeypatch.setattr("pipeline.stages.train.optimizer_step._check", fail)
+    with pytest.raises(NotFiniteError):
+        stepper.step(recipe[0], recipe.own, 0)
+    undone = [each.clone() for each in training.network.parameters()]
+    stepper.step(recipe[0], recipe.own, 0)
+
+    assert all(torch.equal(a, b) for a, b in zip(undone, before, strict=True))
+    after = training.network.parameters()
+    assert not all(torch.equal(a, b) for a, b in zip(after, before, strict=True))
+    assert norms[2:] == norms[:2]  # The same step again.
 
 
 def test_insertions_are_left_out_where_only_the_motion_stack_is_trained(
