@@ -99,7 +99,7 @@ def _optimiser_state(training: TrainingState) -> dict[str, Tensor]:
     return {
         f"{name}/{what}": value
         for name, parameter in training.network.named_parameters()
-        for what, value in training.optimiser.state[parameter].items()
+        for what, value in training.optimiser.state.get(parameter, {}).items()
     }
 
 

@@ -79,7 +79,10 @@ def test_the_log_can_be_learned_from_besides(tuned, books, quiet):
     assert lines[0]["total"] > 0.4 * lines[0]["motion"]
 
 
-@pytest.mark.parametrize("updates", [{}, {"policy_minibatches": 3, "policy_epochs": 2}])
+@pytest.mark.parametrize(
+    "updates",
+    [{}, {"policy_minibatches": 3, "policy_epochs": 2, "trained_parts": "motion"}],
+)
 def test_a_run_that_is_stopped_goes_on_to_the_same_bits(
     tuned, books, quiet, monkeypatch, updates
 ):
@@ -89,7 +92,8 @@ def test_a_run_that_is_stopped_goes_on_to_the_same_bits(
         if done == 1:
             raise Stopped(signal.SIGTERM)
 
-    whole, cut = tuned("whole", **updates), tuned("cut", **updates)
+    whole = tuned("whole", **updates, checkpoint_every_steps=1)
+    cut = tuned("cut", **updates)
     one = begin(whole, *books)
     train(whole, one, quiet)
     with pytest.raises(Stopped):
