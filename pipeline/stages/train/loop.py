@@ -134,7 +134,11 @@ def _run_steps(
                 if group.any(stop is not None or signals.pending_signal() > 0):
                     stop = stop or Stopped(signals.pending_signal() or SIGTERM)
                     break
-                stepped = _step(optimizer_step, recipe, parts, step)
+                try:
+                    stepped = _step(optimizer_step, recipe, parts, step)
+                except Stopped as asked:
+                    stop = asked
+                    break
                 try:
                     if run is not None:
                         run.after(step + 1, stepped)

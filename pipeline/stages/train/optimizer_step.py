@@ -13,6 +13,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from signal import SIGTERM
 
 import torch
 from torch import Tensor
@@ -23,6 +24,8 @@ from infgen.model.batching.supervision import TERMS
 from infgen.model.device.packed import PackedBatch
 from infgen.model.training.losses import Term, Terms
 from infgen.model.training.policy_gradient.lessons import SUMS
+from pipeline.engine import signals
+from pipeline.engine.signals import Stopped
 from pipeline.stages.train.lessons import Lessons, each_terms, prepare_lessons
 from pipeline.stages.train.precision import Pass
 from pipeline.stages.train.process_group import ProcessGroup
@@ -138,7 +141,9 @@ class OptimizerStep:
 
         Raises:
             NotFiniteError: on all processes, if the gradient is not finite.
-            PeerError: if another process is gone. In both cases the weights are as before.
+            PeerError: if another process is gone.
+            Stopped: on all processes, if the run is to stop between two updates. In all
+                cases the weights are as before.
         """
         training, settings = self._training, self._settings
         training.network.train()
@@ -156,9 +161,20 @@ class OptimizerStep:
         seed = noise_of_part(step, settings.seed, own.start)
         updates = cut_into_updates(lessons, settings, seed)
         with undone_on_error(training) if settings.updates > 1 else nullcontext():
-            stepped = StepResult.of([self._update(each, own, step) for each in updates])
+            stepped = StepResult.of(self._updates(updates, own, step))
         _move_average(training, settings, step)
         return stepped
+
+    def _updates(
+        self, updates: Iterable[Sequence[Lessons]], own: range, step: int
+    ) -> list[StepResult]:
+        """Do all updates of a step, unless the run is to stop before the last one."""
+        found: list[StepResult] = []
+        for lessons in updates:
+            if found and self._process_group.any(signals.pending_signal() > 0):
+                raise Stopped(signals.pending_signal() or SIGTERM)
+            found.append(self._update(lessons, own, step))
+        return found
 
     def _update(self, lessons: Sequence[Lessons], own: range, step: int) -> StepResult:
         """Update the weights once, by what all processes learn."""

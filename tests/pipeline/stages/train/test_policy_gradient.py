@@ -223,6 +223,36 @@ def test_a_step_that_fails_in_its_second_update_is_not_done_at_all(
     assert norms[2:] == norms[:2]  # The same step again.
 
 
+def test_a_signal_between_two_updates_ends_the_step_and_the_run_goes_on_to_the_same_bits(
+    tuned, books, quiet, monkeypatch
+):
+    whole, cut = (tuned(folder, steps=2, policy_epochs=3) for folder in ("whole", "cut"))
+    one, other = begin(whole, *books), begin(cut, *books)
+    train(whole, one, quiet)
+    updates, update = [], OptimizerStep._update
+
+    def watched(self, lessons, own, step):
+        updates.append(step)
+        return update(self, lessons, own, step)
+
+    monkeypatch.setattr(OptimizerStep, "_update", watched)
+    with monkeypatch.context() as asked:
+        asked.setattr(
+            "pipeline.engine.signals.pending_signal",
+            lambda: signal.SIGTERM if len(updates) == 5 else 0,
+        )
+        with pytest.raises(Stopped):
+            train(cut, other, quiet)
+    assert updates == [0, 0, 0, 1, 1]
+    other = begin(cut, *books)
+    assert load_checkpoint(cut.folder, other) == 1
+    train(cut, other, quiet)
+
+    assert updates[5:] == [1, 1, 1]
+    pairs = zip(one.network.parameters(), other.network.parameters(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+
+
 def test_insertions_are_left_out_where_only_the_motion_stack_is_trained(
     tuned, books, quiet, monkeypatch
 ):
