@@ -143,3 +143,8 @@ def test_the_command_says_in_one_line_what_is_wrong(tmp_path, capsys, word):
     assert left.value.code == 2
     assert said.count("\n") == 1
     assert word.split("=")[0] in said
+
+
+def test_a_step_has_several_updates_only_with_rollouts():
+    assert TrainSettings(policy_epochs=2).updates == 1
+    assert TrainSettings(policy_gradient_rollouts=4, policy_epochs=2).updates == 2

@@ -257,8 +257,9 @@ class TrainSettings:
 
     @property
     def updates(self) -> int:
-        """Updates of the weights in a step."""
-        return self.policy_minibatches * self.policy_epochs
+        """Updates of the weights in a step: more than one only with rollouts."""
+        several = self.policy_minibatches * self.policy_epochs
+        return several if self.policy_gradient_rollouts else 1
 
     @property
     def of_the_log(self) -> "TrainSettings":
