@@ -4,6 +4,8 @@ The vocabulary moves by decimetres straight ahead, and the agents by a metre eac
 step, so every expected number can be done in the head.
 """
 
+import functools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -33,6 +35,7 @@ def straight_moves(step_m=0.1, count=31):
     return MotionVocabulary(BOX_LW_M, path, np.ones((3, count), bool))
 
 
+@functools.cache
 def fan_moves():
     """About five metres ahead, to either side, facing anywhere ahead."""
     ahead_m, left_m, turn_rad = np.meshgrid(
@@ -44,8 +47,15 @@ def fan_moves():
     return MotionVocabulary(BOX_LW_M, path, np.ones(path.shape[:2], bool))
 
 
+@functools.cache
+def fan_matches():
+    return make_match_table(fan_moves())
+
+
 def noise_of(vocabulary, moves, share=1.0, drift=0.0):
-    return Perturbation(make_match_table(vocabulary), moves, share, drift, ITSELF)
+    wide = vocabulary is fan_moves()
+    matches = fan_matches() if wide else make_match_table(vocabulary)
+    return Perturbation(matches, moves, share, drift, ITSELF)
 
 
 def five_metre_drives(vocabulary, agents=400, tokens=18):

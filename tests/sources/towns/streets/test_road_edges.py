@@ -26,6 +26,12 @@ def crosses(one_m, other_m):
     return bool(np.all([(share >= 0) & (share <= 1) for share in shares], axis=0).any())
 
 
+def touches(one_m, other_m):
+    """Tell whether the upright boxes around two lines of points meet."""
+    low = np.maximum(one_m.min(axis=0), other_m.min(axis=0))
+    return bool((low <= np.minimum(one_m.max(axis=0), other_m.max(axis=0))).all())
+
+
 def boundaries(network):
     return [
         edge.xy_m for edge in draw_road_edges(network) if edge.kind is RoadEdgeType.BOUNDARY
@@ -37,7 +43,8 @@ def across(network):
     lanes = [lane.xy_m for edge in network.edges.values() for lane in edge.driven]
     driven = [*lanes, *(way.xy_m for way in network.connectors)]
     return sum(
-        any(crosses(xy_m, way_m) for way_m in driven) for xy_m in boundaries(network)
+        any(touches(xy_m, way_m) and crosses(xy_m, way_m) for way_m in driven)
+        for xy_m in boundaries(network)
     )
 
 
