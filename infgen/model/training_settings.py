@@ -171,6 +171,9 @@ class TrainSettings:
     conflict_penalty: NonNegative = 0.0
     """Cost, per nat of the log-probability of motion tokens that avert it, of coming into
     conflict: of a token after which an agent that brakes still runs into another one."""
+    insertion_overlap_penalty: NonNegative = 0.0
+    """Cost, per nat of the log-probability of places that avert it, of inserting an agent
+    onto another one."""
     off_road_penalty: NonNegative = 0.5
     """Cost of each token step in which a vehicle leaves the road or gets farther off it."""
     log_distance_penalty: NonNegative = 0.1

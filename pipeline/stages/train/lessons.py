@@ -142,8 +142,7 @@ def each_terms(
         outputs = forward.evaluated(network, lesson.batch, insertions)
         with torch.no_grad():
             before = forward.evaluated(pretrained, lesson.batch, insertions)
-        how = settings.policy_top_p, settings.conflict_penalty
-        terms = policy_terms(outputs, before, lesson, stationary, *how)
+        terms = policy_terms(outputs, before, lesson, stationary, settings)
         yield terms, torch.zeros(2, device=lesson.moved.device)
     network.train()
 

@@ -9,6 +9,10 @@ from torch import Tensor
 from infgen.model.batching.batch import Batch
 from infgen.model.network import Network
 from infgen.model.training.policy_gradient.conflicts import Conflicts, find_conflicts
+from infgen.model.training.policy_gradient.insertion_overlaps import (
+    InsertionOverlaps,
+    find_insertion_overlaps,
+)
 from infgen.model.training.policy_gradient.policy_lesson import PolicyLesson
 from infgen.model.training.policy_gradient.returns import (
     advantages,
@@ -30,6 +34,7 @@ SUMS = (
     *("choices", "agents", "token_steps"),
     *("reward", "overlap", "off_road", "conflict", "energy_score", "compared"),
     *("overlapping_agents", "departing_agents", "present", "logged", "entries", "exits"),
+    "insertion_overlap",
 )
 """Sums over the rollouts of a batch, in this order."""
 
@@ -67,6 +72,9 @@ def simulate_lessons(
     conflicts = Conflicts.none(vocabulary, rollouts.moved.device)
     if settings.conflict_penalty:
         conflicts = find_conflicts(rollouts, vocabulary)
+    overlaps = InsertionOverlaps.none(network.grid, rollouts.moved.device)
+    if settings.insertion_overlap_penalty:
+        overlaps = find_insertion_overlaps(rollouts, network.grid)
     reward = costs.reward(settings)
 
     def grouped(values: Tensor) -> Tensor:
@@ -91,17 +99,20 @@ def simulate_lessons(
             of_type[number],
             of_count[number],
             conflicts.only(rollouts.rows(number)),
+            overlaps.only(rollouts.rows(number)),
         )
         for number in range(group)
     ]
-    return PolicyLessons(lessons, _sums(rollouts, costs, conflicts, reward))
+    taken = {"conflict": conflicts.taken, "insertion_overlap": overlaps.taken}
+    return PolicyLessons(lessons, _sums(rollouts, costs, taken, reward))
 
 
 def figures(sums: Tensor) -> dict[str, float]:
     """Means of the rollouts of a batch, by name, of its ``SUMS``."""
     found = dict(zip(SUMS, sums.tolist(), strict=True))
-    choices, agents, steps, compared = (
-        max(1.0, found[name]) for name in ("choices", "agents", "token_steps", "compared")
+    choices, agents, steps, compared, entries = (
+        max(1.0, found[name])
+        for name in ("choices", "agents", "token_steps", "compared", "entries")
     )
     costs = ("reward", "overlap", "off_road", "conflict")
     return {
@@ -113,11 +124,12 @@ def figures(sums: Tensor) -> dict[str, float]:
         "rollout_agents_logged": found["logged"] / steps,
         "rollout_entries": found["entries"] / steps,
         "rollout_exits": found["exits"] / steps,
+        "rollout_insertion_overlap": found["insertion_overlap"] / entries,
     }
 
 
 def _sums(
-    rollouts: SimulatedRollouts, costs: Costs, conflicts: Conflicts, reward: Tensor
+    rollouts: SimulatedRollouts, costs: Costs, taken: dict[str, int], reward: Tensor
 ) -> Tensor:
     moved, inserted = rollouts.moved, rollouts.inserted
     agents, there = rollouts.batch.agents, moved | inserted
@@ -130,7 +142,7 @@ def _sums(
         "reward": reward,
         "overlap": costs.overlap,
         "off_road": costs.off_road,
-        "conflict": torch.full((), conflicts.taken, device=reward.device),
+        **{name: torch.tensor(x, device=reward.device) for name, x in taken.items()},
         "energy_score": costs.energy_score,
         "compared": moved & rollouts.known[:, None] & rollouts.logged.observed,
         "overlapping_agents": costs.overlap.any(dim=1),

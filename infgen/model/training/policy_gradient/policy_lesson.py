@@ -8,6 +8,7 @@ from torch import Tensor
 from infgen.model.batching.batch import Batch
 from infgen.model.network import EGO
 from infgen.model.training.policy_gradient.conflicts import Conflicts
+from infgen.model.training.policy_gradient.insertion_overlaps import InsertionOverlaps
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +24,7 @@ class PolicyLesson:
         count_advantage: Of a rollout from a token step on: of its insertions there, and of
             the removals of the step before, whose agents are gone by then.
         conflicts: Motion tokens in conflict that were taken.
+        insertion_overlaps: Places onto other agents, of all insertions.
         log_probability: Of all choices, in the order of ``choices_made``, by the network
             that the rollouts are of; None where it has not been trained since.
     """
@@ -33,6 +35,7 @@ class PolicyLesson:
     type_advantage: Float32[Tensor, "scene token agent"]
     count_advantage: Float32[Tensor, "scene token"]
     conflicts: Conflicts
+    insertion_overlaps: InsertionOverlaps
     log_probability: Float32[Tensor, " choice"] | None = None
 
     @property

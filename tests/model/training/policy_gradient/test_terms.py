@@ -52,8 +52,7 @@ def terms(network, pretrained, lesson):
     stationary = torch.from_numpy(network.motion_vocabulary().stationary)
     with torch.no_grad():
         before = pretrained(lesson.batch)
-    how = HOW.policy_top_p, HOW.conflict_penalty
-    return policy_terms(network(lesson.batch), before, lesson, stationary, *how)
+    return policy_terms(network(lesson.batch), before, lesson, stationary, HOW)
 
 
 def worthless(lesson):
