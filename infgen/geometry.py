@@ -85,6 +85,14 @@ def box_corners(
     return turned_m + pose[..., None, :2]
 
 
+def box_radius_m(
+    size_lw_m: Float[np.ndarray, "*batch 2"],
+) -> Float[np.ndarray, "*batch"]:
+    """Radius of the circle around each box."""
+    radius_m: np.ndarray = np.hypot(size_lw_m[..., 0], size_lw_m[..., 1]) / 2
+    return radius_m
+
+
 def boxes_overlap(
     pose: Float[np.ndarray, "... 3"],
     size_lw_m: Float[np.ndarray, "... 2"],

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from infgen.geometry import (
     SQUARES_PER_COLUMN,
     box_corners,
+    box_radius_m,
     boxes_overlap,
     grid_squares,
     to_local,
@@ -31,6 +32,10 @@ FLAT = np.array([[0.0, 0.0, 0.0]])
 )
 def test_boxes_overlap_where_they_do(other, expected):
     assert boxes_overlap(FLAT, CAR, np.array([other]), CAR).tolist() == [expected]
+
+
+def test_the_circle_around_a_box_holds_its_corners():
+    assert box_radius_m(np.array([[3.0, 4.0], [0.0, 2.0]])).tolist() == [2.5, 1.0]
 
 
 def test_boxes_that_touch_do_not_overlap():

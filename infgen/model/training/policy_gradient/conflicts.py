@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from infgen.geometry import boxes_overlap, to_local, to_world, wrap_angle
+from infgen.geometry import box_radius_m, boxes_overlap, to_local, to_world, wrap_angle
 from infgen.model.training.policy_gradient.braking import (
     LOOK_AHEAD_TOKENS,
     AgentPath,
@@ -240,8 +240,8 @@ class _Choices:
         there &= (ahead_m > 0) & ~(walks & walks[each, self.agent][:, None])
         sizes = seen.size_lw_m[self.rollout]
         size = sizes[each, self.agent]
-        reach_m = self.reach_m[..., None] + _radius_m(sizes)[:, None]
-        reach_m += _radius_m(size)[:, None, None]
+        reach_m = self.reach_m[..., None] + box_radius_m(sizes)[:, None]
+        reach_m += box_radius_m(size)[:, None, None]
         later = seen.pose[self.rollout, self.times]
         near = np.linalg.norm((later - own[:, None, None])[..., :2], axis=-1) < reach_m
         near &= seen.visible[self.rollout, self.times] & there[:, None]
@@ -249,8 +249,3 @@ class _Choices:
         began = boxes_overlap(own[row], size[row], others[row, other], sizes[row, other])
         near[row[began], :, other[began]] = False
         return near.nonzero()
-
-
-def _radius_m(size_lw_m: np.ndarray) -> np.ndarray:
-    """Radius of the circle around a box."""
-    return np.hypot(size_lw_m[..., 0], size_lw_m[..., 1]) / 2

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from infgen.geometry import boxes_overlap, wrap_angle
+from infgen.geometry import box_radius_m, boxes_overlap, wrap_angle
 from infgen.model.batching.batch import Details
 from infgen.model.network import EGO
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
@@ -173,7 +173,9 @@ class _Inserted:
     ) -> Bool[np.ndarray, "inserted option"]:
         """Tell which of the poses that each agent might have overlap another one."""
         found = np.zeros(options.shape[:2], dtype=bool)
-        reach_m = _radius_m(self.size_lw_m)[self.whose] + _radius_m(self.other_size_lw_m)
+        reach_m = box_radius_m(self.size_lw_m)[self.whose] + box_radius_m(
+            self.other_size_lw_m
+        )
         for first in range(0, len(self.whose), PAIRS_AT_ONCE):
             some = slice(first, first + PAIRS_AT_ONCE)
             whose, other = self.whose[some], self.other[some]
@@ -207,8 +209,3 @@ def _told(details: Details, at: Int64[np.ndarray, "inserted 2"]) -> _Told:
     names = "agent", "token", "turn", "cell", "offset", "heading"
     rollout, place = at.T
     return _Told(*(getattr(details, x).numpy(force=True)[rollout, place] for x in names))
-
-
-def _radius_m(size_lw_m: np.ndarray) -> np.ndarray:
-    """Radius of the circle around a box."""
-    return np.hypot(size_lw_m[..., 0], size_lw_m[..., 1]) / 2
