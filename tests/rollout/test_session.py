@@ -261,6 +261,7 @@ def test_who_would_leave_the_road_draws_again_if_asked(drive, start, simulator):
     assert careful < careless / 5
 
 
+@pytest.mark.slow
 def test_who_has_to_steer_does_not_stop_for_it(drive, start, simulator):
     """Nobody else stands than would have anyway, though many draw again."""
     begin = [start(drive(), at) for at in range(200)]

@@ -400,6 +400,7 @@ def test_lights_are_those_that_were_played(scenes, tmp_path, played, later):
     assert light["state"]["object_state"][90] == f"LANE_STATE_{later}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to", FORMATS)
 def test_one_process_at_a_time_writes_an_export(order, tmp_path, to):
     """A second one is refused, and the first writes what it would have written alone."""

@@ -79,6 +79,7 @@ def test_the_log_can_be_learned_from_besides(tuned, books, quiet):
     assert lines[0]["total"] > 0.4 * lines[0]["motion"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "updates",
     [{}, {"policy_minibatches": 3, "policy_epochs": 2, "trained_parts": "motion"}],
@@ -223,6 +224,7 @@ def test_a_step_that_fails_in_its_second_update_is_not_done_at_all(
     assert norms[2:] == norms[:2]  # The same step again.
 
 
+@pytest.mark.slow
 def test_a_signal_between_two_updates_ends_the_step_and_the_run_goes_on_to_the_same_bits(
     tuned, books, quiet, monkeypatch
 ):
@@ -253,6 +255,7 @@ def test_a_signal_between_two_updates_ends_the_step_and_the_run_goes_on_to_the_s
     assert all(torch.equal(a, b) for a, b in pairs)
 
 
+@pytest.mark.slow
 def test_insertions_are_left_out_where_only_the_motion_stack_is_trained(
     tuned, books, quiet, monkeypatch
 ):
