@@ -28,6 +28,7 @@ from infgen.tokens.scene_tokens import Presence
 AHEAD_RAD = np.float32(np.pi / 2)
 """The ego's own heading in its grid frame."""
 PAIRS_AT_ONCE = 1024
+"""Pairs of agents whose distances in every cell are in memory at once (16 MB)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,14 +86,14 @@ def find_insertion_overlaps(rollouts: SimulatedRollouts, grid: Grid) -> Insertio
         _poses(grid.centre_m + offset_m[:, None], heading_rad[:, None]),
         _poses(cell_m[:, None] + grid.offset_m, heading_rad[:, None]),
         _poses(position_m[:, None], all_headings_rad[None]),
-        _poses(position_m[:, None], heading_rad[:, None]),
     )
-    *found, taken = (seen.overlapping(each) for each in options)
+    found = [seen.overlapping(each) for each in options]
+    taken = int(found[0][np.arange(len(seen.at)), seen.cell].sum())
     device = rollouts.moved.device
-    cell, offset, heading = (torch.from_numpy(each).to(device) for each in found)
-    return InsertionOverlaps(
-        torch.from_numpy(seen.at).to(device), cell, offset, heading, int(taken.sum())
+    at, cell, offset, heading = (
+        torch.from_numpy(each).to(device) for each in (seen.at, *found)
     )
+    return InsertionOverlaps(at, cell, offset, heading, taken)
 
 
 def _poses(
@@ -108,7 +109,7 @@ def _poses(
 
 @dataclass(frozen=True, slots=True)
 class _Inserted:
-    """Inserted agents, and near which others, in the grid frame of their ego.
+    """Inserted agents, and the others that are there, in the grid frame of their ego.
 
     Attributes:
         at: Rollout, and place among its details [inserted, 2].
@@ -132,7 +133,7 @@ class _Inserted:
 
     @classmethod
     def of(cls, rollouts: SimulatedRollouts, grid: Grid) -> "_Inserted":
-        """Find all inserted agents, and the others within reach of the grid."""
+        """Find all inserted agents, and the others that each might overlap."""
         agents, details = rollouts.batch.agents, rollouts.batch.details
         at = (details.present & details.inserted).nonzero().numpy(force=True)
         rollout, _ = at.T

@@ -4,8 +4,8 @@ The policy term is minus the sum of advantage times log-probability (Williams 19
 choices of the rollout (``choices``); the divergence is that from the network to the
 pretrained one, summed over the same choices (``divergence``). The policy term has the
 log-probability of no conflict beside it (``conflicts``), and that of no overlap of inserted
-agents (``insertion_overlaps``). Both terms are divided by the
-number of motion tokens, so ``divergence_weight`` is in rewards per nat.
+agents (``insertion_overlaps``). Both terms are divided by the number of motion tokens, so
+``divergence_weight`` is in rewards per nat.
 
 Where the network has been trained since the rollouts were simulated, a choice counts by the
 ratio of its probability to what it was then, and no further than ``CLIP`` from one in the
@@ -24,7 +24,6 @@ from infgen.model.training.losses import Term, Terms
 from infgen.model.training.policy_gradient.choices import choices_made
 from infgen.model.training.policy_gradient.conflicts import Conflicts
 from infgen.model.training.policy_gradient.divergence import divergence
-from infgen.model.training.policy_gradient.insertion_overlaps import InsertionOverlaps
 from infgen.model.training.policy_gradient.policy_lesson import PolicyLesson
 from infgen.model.training_settings import TrainSettings
 
@@ -87,7 +86,7 @@ def _safe_gain(outputs: Outputs, conflicts: Conflicts) -> Tensor:
 
 def _free_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:
     """Log-probabilities of no overlap, of all choices of all insertions, summed."""
-    overlaps: InsertionOverlaps = lesson.insertion_overlaps
+    overlaps = lesson.insertion_overlaps
     scene, place = overlaps.at.T
     gained = outputs.motion.motion_logits.new_zeros(())
     entries = outputs.entries
