@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from infgen.model.latent_rates import RateProcess
 from infgen.model.relations import Rows
 
 
@@ -85,9 +86,11 @@ class Outputs:
         entries: Whether and where inserted agents enter; None without a life cycle.
         details: Details of inserted agents; None for motion-only networks.
         roads: Hidden map tokens, if they were to be predicted.
+        rates: Latent rates of insertion and removal; logits are those without.
     """
 
     motion: MotionOutputs
     entries: InsertionOutputs | None
     details: DetailOutputs | None
     roads: MapOutputs | None
+    rates: RateProcess | None = None

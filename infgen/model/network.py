@@ -16,6 +16,7 @@ from infgen.model.device.together import launched_together
 from infgen.model.features.approach import ApproachFeatures
 from infgen.model.features.removal import EgoPlace, RemovalFeatures
 from infgen.model.insertion import CellStack, DetailStack
+from infgen.model.latent_rates import LatentRates
 from infgen.model.layers import initialise, normed
 from infgen.model.logits import (
     DetailOutputs,
@@ -55,7 +56,7 @@ EGO = 0
 
 
 AgentFeatures = DensityFeatures | StandingFeatures | RemovalFeatures | ApproachFeatures
-AddedPart = AgentFeatures | OffsetEmbedding | OffsetFeatures
+AddedPart = AgentFeatures | OffsetEmbedding | OffsetFeatures | LatentRates
 """Parts that may be added to trained weights."""
 
 
@@ -87,10 +88,10 @@ class Network(nn.Module):
         self.roads = MapEncoder(settings, roads)
         self.embed = AgentEmbedding(settings, motion, cells)
         self.motion = MotionStack(settings, motion, CLOCK.token_s)
-        self.cells = CellStack(settings, cells) if settings.insertion_and_removal else None
-        self.details = (
-            DetailStack(settings, cells) if settings.insertion_and_removal else None
-        )
+        inserts = settings.insertion_and_removal
+        self.cells = CellStack(settings, cells) if inserts else None
+        self.details = DetailStack(settings, cells) if inserts else None
+        self.rates = LatentRates() if inserts and settings.latent_rates else None
         self.apply(initialise)
         for part in self.added_parts().values():
             part.begin_at_zero()
@@ -179,6 +180,7 @@ class Network(nn.Module):
             if details is None or not insertions
             else _details(details, batch, told, rows, shown, roads),
             roads=None if hidden is None else MapOutputs(*hidden),
+            rates=None if self.rates is None else self.rates(),
         )
 
     def _density(self, agents: Agents) -> Density | None:
@@ -207,7 +209,8 @@ class Network(nn.Module):
         pose = agents.pose.flatten(0, 1)  # [scene token, agent, 3]
         visible = visible.flatten(0, 1)
         past_index, past_present, past_relation = self._past(agents, rows, as_logged)
-        reach, token = self.motion.map_reach(), _tokens(agents, rows)
+        _, tokens, places = agents.visible.shape
+        reach, token = self.motion.map_reach(), rows.at // places % tokens
         around = find_others(self.motion.agents_reach(), by_token, pose, visible)
         of_row = rows.at // agents.visible[0].numel()
         sight = AgentContext(
@@ -340,12 +343,6 @@ def _details(
         offset_logits=stack.offset_logits(x, agent_type, pose, near),
         heading_logits=stack.heading_logits(x, agent_type, offset, pose, near),
     )
-
-
-def _tokens(agents: Agents, rows: Rows) -> Tensor:
-    """Half second of every row."""
-    _, tokens, places = agents.visible.shape
-    return rows.at // places % tokens
 
 
 def _count(like: Tensor) -> Tensor:

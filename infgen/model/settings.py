@@ -107,6 +107,10 @@ class ModelSettings:
     removal_features: Bool = False
     """Whether removal knows how far an agent is from the ego, in which direction, and
     whether it comes nearer: logs lose sight of agents at the edge of what the ego sees."""
+    latent_rates: Bool = False
+    """Whether insertions and removals have latent rates, the same for all agents of a
+    rollout, that vary in time as no feature tells: numbers of agents in logs vary several
+    times as much as those of independent choices."""
     approach_features: Bool = False
     """Whether agents know how others around them move relative to themselves, pair by pair,
     and when and how near they would meet: attention only adds up places and motions."""

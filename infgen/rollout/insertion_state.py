@@ -37,6 +37,7 @@ class InsertionRequest:
         insertion_mask: Rejects positions; None allows all.
         most: Most agents of each rollout at any one time.
         wanted: Number of other agents wanted around each ego; None for no control.
+        rate: Latent rates, added to the log-odds of ADD; None without.
     """
 
     simulator: Simulator
@@ -44,6 +45,7 @@ class InsertionRequest:
     insertion_mask: InsertionMask | None
     most: Int64[np.ndarray, " rollout"]
     wanted: Float64[np.ndarray, " rollout"] | None = None
+    rate: Float64[np.ndarray, " rollout"] | None = None
 
     @property
     def attempts(self) -> int:
@@ -182,6 +184,8 @@ class InsertionState:
         """Return what is added to the logit of ADD, with density control."""
         simulator, wanted = self.request.simulator, self.request.wanted
         bias = np.full(len(rollouts), simulator.settings.add_bias)
+        if self.request.rate is not None:
+            bias += self.request.rate[rollouts]
         if wanted is not None:
             there = self.num_others[rollouts]
             # Insertions are sampled one by one: their number is proportional to the odds.

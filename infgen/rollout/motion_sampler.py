@@ -4,16 +4,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
+from infgen.clock import CLOCK
 from infgen.model.token_step import MotionStep
-from infgen.rollout.population import Population
+from infgen.rollout.population import EGO_ROW, Population
 from infgen.rollout.random_streams import Purpose, Streams
 from infgen.rollout.rules.rejection import MotionCheck
 from infgen.rollout.rules.stalls import StallRule
 from infgen.rollout.sampling import choose, sample_event
 from infgen.rollout.simulator import Simulator
+from infgen.tokens.scene_tokens import Presence
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +31,28 @@ class Choices:
     motion_token: Int64[np.ndarray, "rollout row"]
     remove: Bool[np.ndarray, "rollout row"]
     pattern: Int64[np.ndarray, "rollout row"] | None
+
+    def observed_steps(
+        self, before: Population, moved: Population
+    ) -> Bool[np.ndarray, "rollout row 5"]:
+        """Tell at which of the five steps each agent is observed.
+
+        The ego is observed at all of them, an inserted agent at its first and a removed
+        agent at its last, so that recorded entries and exits are exact.
+
+        Args:
+            before: All agents at the begin of the token step ...
+            moved: ... and at its end.
+        """
+        steps = CLOCK.steps_per_token
+        shown = np.ones((*moved.agent_number.shape, steps), dtype=bool)
+        if self.pattern is None:
+            return shown
+        shown &= (self.pattern[..., None] >> np.arange(steps) & 1).astype(bool)
+        shown[:, EGO_ROW] = True
+        shown[..., 0] |= before.presence == Presence.INSERTED
+        shown[..., -1] |= moved.presence == Presence.REMOVED
+        return shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +73,21 @@ class MotionSampler:
     stall_rule: StallRule | None
     stationary: Bool[Tensor, "3 motion_token"]
 
-    def sample(self, before: Population, said: MotionStep, token: int) -> Choices:
-        """Sample motion tokens, removals and patterns; the host waits once."""
+    def sample(
+        self,
+        before: Population,
+        said: MotionStep,
+        token: int,
+        removal_rate: Float64[np.ndarray, " rollout"] | None = None,
+    ) -> Choices:
+        """Sample motion tokens, removals and patterns; the host waits once.
+
+        Args:
+            before: All agents.
+            said: What the network expects of them.
+            token: Token step that is sampled.
+            removal_rate: Latent rates, added to the log-odds of removals; None without.
+        """
         simulator, packed = self.simulator, said.packed
         visible, shape = before.visible, before.agent_number.shape
         agent_type = simulator.tensor(before.agent_type[visible].astype(np.int64))
@@ -60,7 +97,11 @@ class MotionSampler:
         removes = packed.remove_logit is not None and settings.removes
         if packed.remove_logit is not None and removes:
             uniforms = self._uniforms(visible, token, Purpose.LEAVE)
-            drawn.append(sample_event(packed.remove_logit, uniforms, settings.remove_bias))
+            bias: Tensor | float = settings.remove_bias
+            if removal_rate is not None:
+                rollout, _ = visible.nonzero()
+                bias = simulator.tensor(removal_rate[rollout] + settings.remove_bias)
+            drawn.append(sample_event(packed.remove_logit, uniforms, bias))
         patterns = packed.pattern_logits is not None and settings.validity_patterns
         if packed.pattern_logits is not None and patterns:
             uniforms = self._uniforms(visible, token, Purpose.PATTERN)

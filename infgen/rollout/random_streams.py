@@ -39,6 +39,7 @@ class Purpose(IntEnum):
     HEADING = 5
     PATTERN = 6
     OFFSET = 7
+    RATE = 8
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,10 +18,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Float32, Int64
 
 from infgen.clock import CLOCK
 from infgen.geometry import wrap_angle
+from infgen.model.latent_rates import Rate
 from infgen.model.token_step import MotionStep
 from infgen.rollout.begun_step import BegunStep, logged_step
 from infgen.rollout.device.insertion import DeviceInsertion
@@ -37,11 +38,11 @@ from infgen.rollout.population import (
     remove_beyond,
 )
 from infgen.rollout.random_streams import Streams
+from infgen.rollout.rate_states import RateStates
 from infgen.rollout.recording import NO_AGENT, Frame, RolloutStart
 from infgen.rollout.rules.density import DensityControl
 from infgen.rollout.simulator import Simulator
 from infgen.tokens.motion_tokens import follow, make_match_table
-from infgen.tokens.scene_tokens import Presence
 
 
 class Session:
@@ -87,6 +88,8 @@ class Session:
             np.maximum(simulator.settings.max_agents, history[0].num_agents),
         )
         self._device = _make_device_insertion(self._asking)
+        rates = simulator.rates
+        self._rates = None if rates is None else RateStates(rates, len(starts))
         self._density = _make_density_control(simulator, starts, history[-1])
         for population in history[:-1]:
             self._ask_motion(population)
@@ -200,6 +203,8 @@ class Session:
         most[at] = others._asking.most
         if self._density is not None and others._density is not None:
             self._density = self._density.put(at, others._density)
+        if self._rates is not None and others._rates is not None:
+            self._rates.put(at, others._rates)
         self._starts = everyone
         self._go_to_maps(at, most)
         return begun.with_rows(rows).put(at, logged_step(starts, rows))
@@ -242,10 +247,13 @@ class Session:
 
     def _begin(self, before: Population, path: np.ndarray | None) -> BegunStep:
         """Let all agents move, egos along their paths if these are known."""
-        said = self._ask_motion(before)
-        choices = self._sampler.sample(before, said, self.token + 1)
+        said, removal_rate = self._ask_motion(before), None
+        if self._rates is not None:
+            self._rates.advance(self._streams, self.token + 1)
+            removal_rate = self._rates.log_odds(Rate.REMOVAL)
+        choices = self._sampler.sample(before, said, self.token + 1, removal_rate)
         moved, paths = self._move(before, choices, said, path)
-        shown = self._observed_steps(before, moved, choices)
+        shown = choices.observed_steps(before, moved)
         none_gone = np.zeros(len(self._streams), dtype=bool)
         return BegunStep(before, moved, paths, shown, none_gone, path is not None)
 
@@ -296,11 +304,13 @@ class Session:
         )
 
     def _query_network(self, moved: Population) -> InsertionRequest:
-        """Return the insertion request, with the density wanted around the egos."""
-        if self._density is None:
-            return self._asking
-        wanted = self._density.wanted(moved.pose[:, EGO_ROW, :2])
-        return replace(self._asking, wanted=wanted)
+        """Return the insertion request, with latent rates and wanted densities."""
+        asking, density, rates = self._asking, self._density, self._rates
+        if density is not None:
+            asking = replace(asking, wanted=density.wanted(moved.pose[:, EGO_ROW, :2]))
+        if rates is not None:
+            asking = replace(asking, rate=rates.log_odds(Rate.INSERTION))
+        return asking
 
     def _ego_path(self, ego_pose: np.ndarray) -> Float32[np.ndarray, "rollout step 3"]:
         """Return the ego poses at the five steps, interpolated if only the end is given.
@@ -362,24 +372,6 @@ class Session:
             paths = paths.copy()  # The population goes on from the quantised pose.
             paths[:, EGO_ROW] = path
         return moved, paths
-
-    def _observed_steps(
-        self, before: Population, moved: Population, choices: Choices
-    ) -> Bool[np.ndarray, "rollout row 5"]:
-        """Tell at which of the five steps each agent is observed.
-
-        The ego is observed at all of them, an inserted agent at its first and a removed
-        agent at its last, so that recorded entries and exits are exact.
-        """
-        steps = CLOCK.steps_per_token
-        shown = np.ones((*moved.agent_number.shape, steps), dtype=bool)
-        if choices.pattern is None:
-            return shown
-        shown &= (choices.pattern[..., None] >> np.arange(steps) & 1).astype(bool)
-        shown[:, EGO_ROW] = True
-        shown[..., 0] |= before.presence == Presence.INSERTED
-        shown[..., -1] |= moved.presence == Presence.REMOVED
-        return shown
 
 
 def _make_device_insertion(request: InsertionRequest) -> DeviceInsertion | None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int16
+from jaxtyping import Bool, Float64, Int16
 from torch import Tensor
 
 from infgen.model.relations import Rows
@@ -52,6 +52,15 @@ class Simulator:
     def inserts(self) -> bool:
         """Whether agents enter: they may, and the network can tell who."""
         return self.settings.inserts and self.stepper.insertion_and_removal
+
+    @property
+    def rates(self) -> Float64[np.ndarray, "3 2"] | None:
+        """Mean, scale and persistence of latent rates, by ``Rate``; None without."""
+        rates, share = self.stepper.network.rates, self.settings.latent_rate_scale
+        if rates is None or not share:
+            return None
+        mean, scale, persistence = rates().on_host().numpy()
+        return np.stack([share**2 * mean, share * scale, persistence])
 
     @property
     def simulates(self) -> str:

@@ -46,6 +46,7 @@ class RolloutOverrides(TypedDict, total=False):
     heading_temperature: float
     add_bias: float
     remove_bias: float
+    latent_rate_scale: float
     max_insertions: int
     max_agents: int
     seed: int

@@ -49,6 +49,7 @@ OF_ENTRIES = (
     "heading_temperature",
 )
 OF_EXITS = ("remove_bias", "removal_radius_m")
+OF_BOTH = ("latent_rate_scale",)
 
 
 def normalize(sections: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -57,6 +58,7 @@ def normalize(sections: Mapping[str, Any]) -> Mapping[str, Any]:
     if settings.recordings:
         return {"rollout": RolloutSettings(recordings=settings.recordings)}
     idle = (() if settings.inserts else OF_ENTRIES) + (() if settings.removes else OF_EXITS)
+    idle += () if settings.inserts or settings.removes else OF_BOTH
     usual = RolloutSettings()
     return {"rollout": replace(settings, **{name: getattr(usual, name) for name in idle})}
 

@@ -27,6 +27,7 @@ VARIANTS = {
     "offset token": {"offset_token": True, "cell_feature_width": 4},
     "patterns": {"validity_pattern_tokens": True},
     "rotary": {"relations": "rotary"},
+    "latent rates": {"latent_rates": True},
 }
 FASTEST_M = 20.0
 """The longest move of the vocabulary of these tests."""

@@ -6,7 +6,7 @@ to be sampled from, so they must be calibrated. Each is supervised once per deci
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.batching.supervision import OF_ROLLOUTS, AgentMasks, following
+from infgen.model.latent_rates import Rate, RateProcess
 from infgen.model.logits import (
     DetailOutputs,
     InsertionOutputs,
@@ -24,6 +25,7 @@ from infgen.model.logits import (
 from infgen.model.neighbours import grid_place
 from infgen.model.network import EGO
 from infgen.model.relations import Rows, wrap_angle
+from infgen.model.training.rate_likelihood import Decisions, rate_likelihood
 from infgen.model.training_settings import TrainSettings
 from infgen.tokens.scene_tokens import Presence
 
@@ -97,14 +99,14 @@ def losses(
     terms = {"motion": _motion(motion, batch.agents, settings, masks.motion)}
     if motion.remove_logit is not None:
         logit = motion.remove_logit
-        terms["keep"] = _stay(motion.rows, logit, batch.agents, masks.stay)
+        terms["keep"] = _stay(motion.rows, logit, batch.agents, masks.stay, outputs.rates)
     if motion.pattern_logits is not None:
         logits = motion.pattern_logits
         terms["validity_pattern"] = _pattern(
             motion.rows, logits, batch.agents, masks.pattern
         )
     if outputs.entries is not None:
-        terms |= _entries(outputs.entries, batch, smoothing)
+        terms |= _entries(outputs.entries, batch, smoothing, outputs.rates)
     if outputs.details is not None:
         terms |= _details(outputs.details, batch)
     if outputs.roads is not None:
@@ -154,10 +156,21 @@ def _motion(
     )
 
 
-def _stay(rows: Rows, remove_logit: Tensor, agents: Agents, mask: Tensor) -> Term:
+def _stay(
+    rows: Rows,
+    remove_logit: Tensor,
+    agents: Agents,
+    mask: Tensor,
+    rates: RateProcess | None,
+) -> Term:
     chosen = Chosen.of(rows.pack(mask))
     leaves = chosen.take(rows.pack(following(agents.removal, False)))
-    return _event(chosen, chosen.take(remove_logit), leaves)
+    term = _event(chosen, chosen.take(remove_logit), leaves)
+    if rates is None:
+        return term
+    token_step = rows.at // agents.visible.shape[2]
+    decisions = chosen.take(remove_logit), leaves, chosen.take(token_step)
+    return _varying(term, chosen, decisions, Rate.REMOVAL, rates, agents)
 
 
 def _pattern(rows: Rows, pattern_logits: Tensor, agents: Agents, mask: Tensor) -> Term:
@@ -166,7 +179,9 @@ def _pattern(rows: Rows, pattern_logits: Tensor, agents: Agents, mask: Tensor) -
     return _choice(chosen, chosen.take(pattern_logits), chosen.take(target), 0.0)
 
 
-def _entries(outputs: InsertionOutputs, batch: Batch, smoothing: float) -> Terms:
+def _entries(
+    outputs: InsertionOutputs, batch: Batch, smoothing: float, rates: RateProcess | None
+) -> Terms:
     """Terms of ADD (BEGIN MOTION once after the last) and of the position tokens."""
     entries = batch.entries
     count = outputs.rows.pack(entries.count)[:, None]
@@ -174,7 +189,14 @@ def _entries(outputs: InsertionOutputs, batch: Batch, smoothing: float) -> Terms
     comes = outputs.rows.pack(entries.agent) >= 0
     decided, inserted = Chosen.of(slot <= count), Chosen.of(comes)
     happens = decided.take(outputs.rows.pack(entries.add))
-    terms = {"add": _event(decided, decided.take(outputs.add_logit), happens)}
+    add_logit = decided.take(outputs.add_logit)
+    terms = {"add": _event(decided, add_logit, happens)}
+    if rates is not None:
+        token_step = outputs.rows.at[:, None].expand(outputs.add_logit.shape)
+        decisions = add_logit, happens, decided.take(token_step)
+        terms["add"] = _varying(
+            terms["add"], decided, decisions, Rate.INSERTION, rates, batch.agents
+        )
     if outputs.position_logits is not None:
         cell = inserted.take(outputs.rows.pack(entries.cell))
         logits = inserted.take(outputs.position_logits)
@@ -301,6 +323,31 @@ def _event(chosen: Chosen, logit: Tensor, happens: Tensor) -> Term:
     )
     predicted, count = chosen.sum(torch.sigmoid(logit)), chosen.count(each)
     return Term(chosen.sum(each), count, count, predicted, chosen.sum(happens))
+
+
+def _varying(
+    term: Term,
+    chosen: Chosen,
+    decisions: tuple[Tensor, Tensor, Tensor],
+    rate: Rate,
+    rates: RateProcess,
+    agents: Agents,
+) -> Term:
+    """Turn a term of independent events into that of events of a latent rate.
+
+    Args:
+        term: Of the same decisions.
+        chosen: Which count.
+        decisions: Log-odds, whether it happened, and token step of each.
+        rate: What is decided.
+        rates: Latent rates.
+        agents: Those of the batch.
+    """
+    scenes, tokens = agents.visible.shape[:2]
+    logit, happens, token_step = decisions
+    told = Decisions(logit, happens.float(), token_step, chosen.counted)
+    found = rate_likelihood(told, rate, rates, scenes, tokens)
+    return replace(term, loss=found.loss, right=found.predicted)
 
 
 def _distance(chosen: Chosen, gap: Tensor) -> Term:

@@ -27,6 +27,7 @@ class RunningInsertions:
         tried: ... and their cells.
         most: Most agents that it may have.
         wanted: Number of agents wanted around its ego; None without density control.
+        rate: Latent rates, added to the log-odds of ADD; None without.
         num_agents: Agents in it.
         num_others: Agents around its ego, which is not counted.
         soon: Poses one token step ahead; None without an insertion mask.
@@ -42,6 +43,7 @@ class RunningInsertions:
     tried: Bool[Tensor, "rollout cell"]
     most: Int64[Tensor, " rollout"]
     wanted: Float64[Tensor, " rollout"] | None
+    rate: Float64[Tensor, " rollout"] | None
     num_agents: Int64[Tensor, " rollout"]
     num_others: Int64[Tensor, " rollout"]
     soon: Float32[Tensor, "rollout row 3"] | None

@@ -147,7 +147,10 @@ def test_of_limited_scenes_those_far_apart_are_played(inputs, tmp_path):
     [
         (
             {"mode": "motion-only"},
-            {"add_bias": 1.0, "remove_bias": 1.0, "heading_top_p": 0.5},
+            {
+                **{"add_bias": 1.0, "remove_bias": 1.0, "heading_top_p": 0.5},
+                "latent_rate_scale": 0.3,
+            },
         ),
         ({"insert": False}, {"add_bias": 1.0, "max_insertions": 3, "position_top_k": 5}),
         ({"remove": False}, {"remove_bias": 1.0, "removal_radius_m": 70.0}),

@@ -123,7 +123,7 @@ def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_i
 ADDED = dict.fromkeys(
     (
         *("density_features", "standing_features", "removal_features"),
-        *("approach_features", "offset_token"),
+        *("approach_features", "offset_token", "latent_rates"),
     ),
     True,
 )
@@ -142,7 +142,7 @@ def test_added_parts_may_be_missing_in_weights_to_begin_with(tmp_path):
 
     found, own = dict(network.named_parameters()), dict(plain.named_parameters())
     parts = tuple(network.added_parts())
-    assert len(parts) == 7
+    assert len(parts) == 8
     added = found.keys() - own.keys()
     assert added
     assert all(name.startswith(parts) for name in added)

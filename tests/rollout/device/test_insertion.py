@@ -27,6 +27,11 @@ VARIANTS = {
     ),
     "features": ({"cell_feature_width": 8, "ego_embedding": True}, {}),
     "rotary": ({"relations": "rotary", "cell_feature_width": 8}, {}),
+    "latent rates": ({"latent_rates": True}, {}),
+    "latent rates, density control": (
+        {"latent_rates": True},
+        only(**MASK, density_control=2.0),
+    ),
 }
 
 
