@@ -176,11 +176,11 @@ class RolloutSettings:
     `calibrate` finds."""
     remove_bias: Float = 0.0
     """The same for the removal of an agent."""
-    latent_rate_scale: NonNegative = 0.6
+    latent_rate_scale: NonNegative = 0.5
     """Standard deviations of latent rates (`model.latent_rates`) are multiplied by it,
     means by its square; 0 for no latent rates. At 1 rates vary as in logs, but numbers of
-    agents vary more: in logs entries and exits keep in balance, and latent rates are
-    independent of each other."""
+    agents more than there: the two rates are independent of each other and of who is
+    present."""
     max_insertions: Count = 16
     """Insertions per token step."""
     max_agents: AtLeastOne = 128
