@@ -169,11 +169,13 @@ class TrainSettings:
     overlap_penalty: NonNegative = 1.0
     """Cost of running into another agent."""
     conflict_penalty: NonNegative = 0.0
-    """Cost, per nat of the log-probability of motion tokens that avert it, of coming into
-    conflict: of a token after which an agent that brakes still runs into another one."""
+    """Cost of motion tokens by which agents come into conflict, after which an agent that
+    brakes still runs into another one: of a nat of the divergence from what the pretrained
+    network would have sampled of all others."""
+    departure_penalty: NonNegative = 0.0
+    """The same of motion tokens by which vehicles drive off the road or stay off it."""
     insertion_overlap_penalty: NonNegative = 0.0
-    """Cost, per nat of the log-probability of places that avert it, of inserting an agent
-    onto another one."""
+    """The same of places at which an agent is inserted onto another one."""
     off_road_penalty: NonNegative = 0.5
     """Cost of each token step in which a vehicle leaves the road or gets farther off it."""
     log_distance_penalty: NonNegative = 0.1

@@ -285,6 +285,7 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
             "standing_features": True,
             "removal_features": True,
             "approach_features": True,
+            "latent_rates": True,
         },
         {"motion_noise_neighbours": 5, "closed_loop_population": True},
     ),

@@ -141,7 +141,11 @@ class DeviceInsertion:
             ),
             most=simulator.tensor(request.most),
             wanted=None if request.wanted is None else simulator.tensor(request.wanted),
-            rate=None if request.rate is None else simulator.tensor(request.rate),
+            add_bias=(
+                simulator.settings.add_bias
+                if request.rate is None
+                else simulator.tensor(simulator.settings.add_bias + request.rate)
+            ),
             num_agents=there.sum(dim=1),
             num_others=near[:, EGO + 1 :].sum(dim=1),
             soon=None if self._mask is None else self._mask.soon(token_step),
@@ -188,14 +192,13 @@ class DeviceInsertion:
 
     def _add_bias(self, running: RunningInsertions) -> Tensor | float:
         """Return what is added to the logit of ADD, with density control."""
-        simulator, asked = self._simulator, running.entries.rollout
-        bias: Tensor | float = simulator.settings.add_bias
-        if running.rate is not None:
-            bias = running.rate[asked] + bias
+        asked, bias = running.entries.rollout, running.add_bias
+        if isinstance(bias, Tensor):
+            bias = bias[asked]
         if running.wanted is None:
             return bias
         odds = (running.wanted[asked] + 1) / (running.num_others[asked] + 1)
-        return bias + simulator.rules.density_control * odds.log()
+        return bias + self._simulator.rules.density_control * odds.log()
 
     def _propose(
         self, running: RunningInsertions, query: PositionOutputs, numbers: Tensor

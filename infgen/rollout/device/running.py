@@ -27,7 +27,7 @@ class RunningInsertions:
         tried: ... and their cells.
         most: Most agents that it may have.
         wanted: Number of agents wanted around its ego; None without density control.
-        rate: Latent rates, added to the log-odds of ADD; None without.
+        add_bias: Added to the logit of ADD, latent rates included if there are any.
         num_agents: Agents in it.
         num_others: Agents around its ego, which is not counted.
         soon: Poses one token step ahead; None without an insertion mask.
@@ -43,7 +43,7 @@ class RunningInsertions:
     tried: Bool[Tensor, "rollout cell"]
     most: Int64[Tensor, " rollout"]
     wanted: Float64[Tensor, " rollout"] | None
-    rate: Float64[Tensor, " rollout"] | None
+    add_bias: Float64[Tensor, " rollout"] | float
     num_agents: Int64[Tensor, " rollout"]
     num_others: Int64[Tensor, " rollout"]
     soon: Float32[Tensor, "rollout row 3"] | None

@@ -9,18 +9,14 @@ the lateral offset from it at which the token ends. Boxes are compared at the mi
 end of token steps.
 
 Where an agent comes into conflict, all motion tokens are looked at, and it learns to take
-one that is not: the log-probability of no conflict, as mostly the likely tokens are all in
-conflict, so that their expected number hardly changes with their odds. Nothing is learned
-of the tokens that follow while it is in conflict: two in three are such, and hardly a
-likely token averts it any more.
+one that is not (``terms``). Nothing is learned of the tokens that follow while it is in
+conflict: two in three are such, and hardly a likely token averts it any more.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float32, Int64
-from torch import Tensor
 
 from infgen.geometry import box_radius_m, boxes_overlap, to_local, to_world, wrap_angle
 from infgen.model.training.policy_gradient.braking import (
@@ -28,43 +24,15 @@ from infgen.model.training.policy_gradient.braking import (
     AgentPath,
     braking_arc_m,
 )
+from infgen.model.training.policy_gradient.policy_lesson import AvoidedTokens
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
 from infgen.scene import AgentType
 from infgen.tokens.vocabulary import MotionVocabulary
 
 
-@dataclass(frozen=True, slots=True)
-class Conflicts:
-    """Agents that came into conflict by a motion token where others would have averted it.
-
-    Attributes:
-        at: Rollout, token step at whose end the motion token ends, agent.
-        in_conflict: Which motion tokens are in conflict there, some but not all.
-        taken: How many motion tokens in conflict were taken, those while an agent was in
-            conflict already included.
-    """
-
-    at: Int64[Tensor, "conflict 3"]
-    in_conflict: Bool[Tensor, "conflict motion_token"]
-    taken: int
-
-    @classmethod
-    def none(cls, vocabulary: MotionVocabulary, device: torch.device) -> "Conflicts":
-        """Return none at all."""
-        size = 0, vocabulary.num_motion_tokens
-        in_conflict = torch.zeros(size, dtype=torch.bool, device=device)
-        return cls(torch.zeros((0, 3), dtype=torch.int64, device=device), in_conflict, 0)
-
-    def only(self, rows: slice) -> "Conflicts":
-        """Take those of some rollouts, numbered from the first of them."""
-        rollout = self.at[:, 0]
-        some = (rollout >= rows.start) & (rollout < rows.stop)
-        at = self.at[some]
-        at[:, 0] -= rows.start
-        return Conflicts(at, self.in_conflict[some], self.taken)
-
-
-def find_conflicts(rollouts: SimulatedRollouts, vocabulary: MotionVocabulary) -> Conflicts:
+def find_conflicts(
+    rollouts: SimulatedRollouts, vocabulary: MotionVocabulary
+) -> AvoidedTokens:
     """Find who came into conflict.
 
     Args:
@@ -78,12 +46,7 @@ def find_conflicts(rollouts: SimulatedRollouts, vocabulary: MotionVocabulary) ->
     every = np.arange(vocabulary.num_motion_tokens)
     choices = np.column_stack([at.repeat(len(every), axis=0), np.tile(every, len(at))])
     found = are_in_conflict(rollouts, choices, vocabulary).reshape(-1, len(every))
-    some, device = ~found.all(axis=1), rollouts.moved.device
-    return Conflicts(
-        torch.from_numpy(at[some]).to(device),
-        torch.from_numpy(found[some]).to(device),
-        int(taken.sum()),
-    )
+    return AvoidedTokens.where_some(at, found, int(taken.sum()), rollouts.moved.device)
 
 
 def conflicts_taken(

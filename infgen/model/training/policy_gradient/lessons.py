@@ -8,12 +8,13 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Batch
 from infgen.model.network import Network
-from infgen.model.training.policy_gradient.conflicts import Conflicts, find_conflicts
+from infgen.model.training.policy_gradient.conflicts import find_conflicts
+from infgen.model.training.policy_gradient.departures import find_departures
 from infgen.model.training.policy_gradient.insertion_overlaps import (
     InsertionOverlaps,
     find_insertion_overlaps,
 )
-from infgen.model.training.policy_gradient.policy_lesson import PolicyLesson
+from infgen.model.training.policy_gradient.policy_lesson import AvoidedTokens, PolicyLesson
 from infgen.model.training.policy_gradient.returns import (
     advantages,
     discounted_returns,
@@ -34,7 +35,7 @@ SUMS = (
     *("choices", "agents", "token_steps"),
     *("reward", "overlap", "off_road", "conflict", "energy_score", "compared"),
     *("overlapping_agents", "departing_agents", "present", "logged", "entries", "exits"),
-    "insertion_overlap",
+    *("insertion_overlap", "departure"),
 )
 """Sums over the rollouts of a batch, in this order."""
 
@@ -69,9 +70,11 @@ def simulate_lessons(
     roads = read_roads(batch.roads, network.map_vocabulary())
     vocabulary = network.motion_vocabulary()
     costs = find_costs(rollouts, vocabulary, roads)
-    conflicts = Conflicts.none(vocabulary, rollouts.moved.device)
+    conflicts = departures = AvoidedTokens.none(vocabulary, rollouts.moved.device)
     if settings.conflict_penalty:
         conflicts = find_conflicts(rollouts, vocabulary)
+    if settings.departure_penalty:
+        departures = find_departures(rollouts, vocabulary, roads)
     overlaps = InsertionOverlaps.none(network.grid, rollouts.moved.device)
     if settings.insertion_overlap_penalty:
         overlaps = find_insertion_overlaps(rollouts, network.grid)
@@ -99,11 +102,16 @@ def simulate_lessons(
             of_type[number],
             of_count[number],
             conflicts.only(rollouts.rows(number)),
+            departures.only(rollouts.rows(number)),
             overlaps.only(rollouts.rows(number)),
         )
         for number in range(group)
     ]
-    taken = {"conflict": conflicts.taken, "insertion_overlap": overlaps.taken}
+    taken = {
+        "conflict": conflicts.taken,
+        "departure": departures.taken,
+        "insertion_overlap": overlaps.taken,
+    }
     return PolicyLessons(lessons, _sums(rollouts, costs, taken, reward))
 
 
@@ -114,7 +122,7 @@ def figures(sums: Tensor) -> dict[str, float]:
         max(1.0, found[name])
         for name in ("choices", "agents", "token_steps", "compared", "entries")
     )
-    costs = ("reward", "overlap", "off_road", "conflict")
+    costs = ("reward", "overlap", "off_road", "conflict", "departure")
     return {
         **{f"rollout_{name}": found[name] / choices for name in costs},
         "rollout_energy_score": found["energy_score"] / compared,

@@ -96,7 +96,7 @@ def find_costs(
     seen, device = _Seen.of(rollouts), rollouts.moved.device
     return Costs(
         torch.from_numpy(find_overlaps(seen, vocabulary)).to(device),
-        torch.from_numpy(find_departures(seen, roads)).to(device),
+        torch.from_numpy(find_off_road(seen, roads)).to(device),
         *log_distance(rollouts),
         torch.from_numpy(placement_costs(rollouts, roads)).to(device),
         speed_costs(rollouts),
@@ -215,7 +215,7 @@ def _begin_to_overlap(
     return np.where(moved, (end | overlap(middle)) & ~overlap(before), end)
 
 
-def find_departures(
+def find_off_road(
     seen: _Seen, roads: list[Road]
 ) -> Bool[np.ndarray, "rollout token agent"]:
     """Tell which vehicles leave the road, or get farther off it, in a token step."""

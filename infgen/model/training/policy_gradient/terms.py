@@ -2,15 +2,22 @@
 
 The policy term is minus the sum of advantage times log-probability (Williams 1992) over all
 choices of the rollout (``choices``); the divergence is that from the network to the
-pretrained one, summed over the same choices (``divergence``). The policy term has the
-log-probability of no conflict beside it (``conflicts``), and that of no overlap of inserted
-agents (``insertion_overlaps``). Both terms are divided by the number of motion tokens, so
-``divergence_weight`` is in rewards per nat.
+pretrained one, summed over the same choices (``divergence``). Both terms are divided by the
+number of motion tokens, so ``divergence_weight`` is in rewards per nat.
+
+The policy term has what is to be avoided beside it: motion tokens in conflict
+(``conflicts``) and off the road (``departures``), and places onto other agents
+(``insertion_overlaps``). There the network learns what the pretrained one would sample of
+all other choices: minus the divergence of its own from the pretrained distribution without
+what is to be avoided. Of what is avoided nothing else is learned than to take another, and
+the odds of all others beside each other stay as they were. At first that is the
+log-probability of all others; their expected number would not do, as mostly all the likely
+choices are to be avoided, and it hardly changes with their odds.
 
 Where the network has been trained since the rollouts were simulated, a choice counts by the
 ratio of its probability to what it was then, and no further than ``CLIP`` from one in the
-direction of its advantage (PPO: Schulman et al. 2017). Conflicts and insertion overlaps
-need no ratio: what was sampled says only in which state the agent was.
+direction of its advantage (PPO: Schulman et al. 2017). What is to be avoided needs no
+ratio: what was sampled says only in which state the agent was.
 """
 
 import math
@@ -22,13 +29,13 @@ from torch import Tensor
 from infgen.model.logits import Outputs
 from infgen.model.training.losses import Term, Terms
 from infgen.model.training.policy_gradient.choices import choices_made
-from infgen.model.training.policy_gradient.conflicts import Conflicts
 from infgen.model.training.policy_gradient.divergence import divergence
-from infgen.model.training.policy_gradient.policy_lesson import PolicyLesson
+from infgen.model.training.policy_gradient.policy_lesson import AvoidedTokens, PolicyLesson
 from infgen.model.training_settings import TrainSettings
 
 LEAST_ODDS = 1e-3
-"""Where no conflict (no overlap) is less likely than this, little is learned any more."""
+"""Factor on the pretrained probabilities of choices to be avoided. Where all others are
+less likely than this, little is learned any more."""
 CLIP = 0.2
 """How far the probability of a choice, beside what it was, is changed by its advantage."""
 
@@ -47,13 +54,18 @@ def policy_terms(
         pretrained: The same of the pretrained network.
         lesson: The rollouts.
         stationary: Motion tokens that stand still, by agent type.
-        settings: How motion tokens were sampled, and what conflicts and overlaps cost.
+        settings: How motion tokens were sampled, and what is to be avoided costs.
     """
     count = lesson.moved.sum().float()
     gained = _gain(outputs, lesson, stationary, settings.policy_top_p)
-    gained = gained + settings.conflict_penalty * _safe_gain(outputs, lesson.conflicts)
-    free = _free_gain(outputs, lesson)
-    gained = gained + settings.insertion_overlap_penalty * free
+    both = outputs, pretrained
+    for penalty, tokens in (
+        (settings.conflict_penalty, lesson.conflicts),
+        (settings.departure_penalty, lesson.departures),
+    ):
+        gained = gained - penalty * _from_other_tokens(*both, tokens)
+    overlap = _from_other_places(*both, lesson)
+    gained = gained - settings.insertion_overlap_penalty * overlap
     nothing = gained.new_zeros(())
 
     def term(loss: Tensor) -> Term:
@@ -77,36 +89,49 @@ def _gain(
     return torch.minimum(made.advantage * ratio, made.advantage * near).sum()
 
 
-def _safe_gain(outputs: Outputs, conflicts: Conflicts) -> Tensor:
-    """Log-probabilities of no conflict, where there was one, summed."""
-    scene, token, agent = conflicts.at.T
+def _from_other_tokens(
+    outputs: Outputs, pretrained: Outputs, tokens: AvoidedTokens
+) -> Tensor:
+    """Divergences from motion tokens that are not to be avoided, summed."""
+    scene, token, agent = tokens.at.T
     row = outputs.motion.rows.number[scene, token - 1, agent]
-    return _log_avoids(outputs.motion.motion_logits[row], conflicts.in_conflict)
+    own, theirs = outputs.motion.motion_logits, pretrained.motion.motion_logits
+    return _from_others(own[row], theirs[row], tokens.avoided)
 
 
-def _free_gain(outputs: Outputs, lesson: PolicyLesson) -> Tensor:
-    """Log-probabilities of no overlap, of all choices of all insertions, summed."""
-    overlaps = lesson.insertion_overlaps
+def _from_other_places(
+    outputs: Outputs, pretrained: Outputs, lesson: PolicyLesson
+) -> Tensor:
+    """Divergences from places without overlap, of all choices of insertions, summed."""
+    overlaps, details = lesson.insertion_overlaps, lesson.batch.details
     scene, place = overlaps.at.T
-    gained = outputs.motion.motion_logits.new_zeros(())
-    entries = outputs.entries
-    if entries is not None and entries.position_logits is not None:
-        details = lesson.batch.details
+    found = outputs.motion.motion_logits.new_zeros(())
+    one, other = outputs.entries, pretrained.entries
+    if one is not None and other is not None:
         token, turn = details.token[scene, place], details.turn[scene, place]
-        row = entries.rows.number[scene, token]
-        gained = gained + _log_avoids(entries.position_logits[row, turn], overlaps.cell)
-    if outputs.details is not None:
-        row = outputs.details.rows.number[scene, place]
-        for logits, avoided in (
-            (outputs.details.offset_logits, overlaps.offset),
-            (outputs.details.heading_logits, overlaps.heading),
+        at = one.rows.number[scene, token], turn
+        if one.position_logits is not None and other.position_logits is not None:
+            logits = one.position_logits[at], other.position_logits[at]
+            found = found + _from_others(*logits, overlaps.cell)
+    if outputs.details is not None and pretrained.details is not None:
+        own, theirs = outputs.details, pretrained.details
+        row = own.rows.number[scene, place]
+        for choice, others, avoided in (
+            (own.offset_logits, theirs.offset_logits, overlaps.offset),
+            (own.heading_logits, theirs.heading_logits, overlaps.heading),
         ):
-            if logits is not None:
-                gained = gained + _log_avoids(logits[row], avoided)
-    return gained
+            if choice is not None and others is not None:
+                found = found + _from_others(choice[row], others[row], avoided)
+    return found
 
 
-def _log_avoids(logits: Tensor, avoided: Bool[Tensor, "row choice"]) -> Tensor:
-    """Log-probabilities of choices that are not to be avoided [row, choice], summed."""
-    likely = logits.log_softmax(dim=-1) + avoided * math.log(LEAST_ODDS)
-    return likely.logsumexp(dim=-1).sum()
+def _from_others(logits: Tensor, others: Tensor, avoided: Tensor) -> Tensor:
+    """Sum the divergences from pretrained choices that are not to be avoided.
+
+    Args:
+        logits: Of the network [row, choice].
+        others: Of the pretrained network [row, choice].
+        avoided: Choices to be avoided [row, choice].
+    """
+    wanted = (others + avoided * math.log(LEAST_ODDS)).log_softmax(dim=-1)
+    return (wanted.exp() * (wanted - logits.log_softmax(dim=-1))).sum()

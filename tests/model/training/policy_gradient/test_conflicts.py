@@ -133,9 +133,9 @@ def test_who_comes_into_conflict_is_told_which_token_would_have_averted_it(drawn
     found = find_conflicts(rollouts, metres)
 
     assert found.at.tolist() == [[0, 1, 0]]
-    assert found.in_conflict[0].tolist() == conflicts(drawn, metres, runs, still(13))
-    assert not found.in_conflict[0].all()
-    assert found.in_conflict[0, 5]
+    assert found.avoided[0].tolist() == conflicts(drawn, metres, runs, still(13))
+    assert not found.avoided[0].all()
+    assert found.avoided[0, 5]
     # It is too late at the second token step, but that token is in conflict as well.
     assert conflicts_taken(rollouts, metres).nonzero()[1].tolist() == [1, 2]
     assert found.taken == 2
@@ -173,7 +173,7 @@ def test_without_moves_nothing_is_taken(drawn, metres):
 
     found = find_conflicts(rollouts, metres)
 
-    assert found.in_conflict.shape == (0, METRES)
+    assert found.avoided.shape == (0, METRES)
     assert found.taken == 0
 
 

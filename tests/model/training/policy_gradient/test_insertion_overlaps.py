@@ -1,6 +1,7 @@
 """Choices that put an inserted agent onto another one."""
 
 import copy
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -195,8 +196,12 @@ def test_places_on_others_become_less_likely(network, logged, rollouts):
             if each.grad is not None:
                 each -= 1e-3 * each.grad
 
-    odds = [1 - (1 - LEAST_ODDS) * each for each in avoided(network)]
-    torch.testing.assert_close(before, -sum(each.log().sum() for each in odds))
+    expected = torch.zeros(())
+    for likely in avoided(network):
+        odds = 1 - (1 - LEAST_ODDS) * likely
+        left = likely * LEAST_ODDS / odds
+        expected += (left * math.log(LEAST_ODDS) - odds.log()).sum()
+    torch.testing.assert_close(before, expected, atol=1e-4, rtol=1e-4)
     assert loss(student) < before
     for one, other in zip(avoided(student), avoided(network), strict=True):
         assert one.sum() < other.sum()

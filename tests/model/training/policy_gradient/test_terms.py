@@ -11,18 +11,23 @@ from torch.nn.functional import logsigmoid
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
 from infgen.model.training.policy_gradient.choices import choices_made
-from infgen.model.training.policy_gradient.conflicts import Conflicts
 from infgen.model.training.policy_gradient.divergence import divergence
 from infgen.model.training.policy_gradient.lessons import (
     SUMS,
     figures,
     simulate_lessons,
 )
+from infgen.model.training.policy_gradient.policy_lesson import AvoidedTokens
 from infgen.model.training.policy_gradient.rollouts import HISTORY_TOKENS
 from infgen.model.training.policy_gradient.terms import CLIP, LEAST_ODDS, policy_terms
 from infgen.tokens.scene_tokens import Presence
 
-HOW = TrainSettings(policy_gradient_rollouts=3, policy_top_p=0.9, conflict_penalty=2.0)
+HOW = TrainSettings(
+    policy_gradient_rollouts=3,
+    policy_top_p=0.9,
+    conflict_penalty=2.0,
+    departure_penalty=2.0,
+)
 ROUNDING = 1e-6
 """Between a network with gradients and its copy without, which sums in another order."""
 
@@ -59,7 +64,8 @@ def worthless(lesson):
     """The same lesson, in which no choice is better than another."""
     names = ("advantage", "type_advantage", "count_advantage")
     nothing = {x: torch.zeros_like(getattr(lesson, x)) for x in names}
-    return replace(lesson, conflicts=lesson.conflicts.only(slice(0, 0)), **nothing)
+    none = lesson.conflicts.only(slice(0, 0))
+    return replace(lesson, conflicts=none, departures=none, **nothing)
 
 
 def after_a_step(network, lesson):
@@ -128,26 +134,56 @@ def test_choices_with_a_positive_advantage_become_likelier(network, lessons):
         assert after < before
 
 
-def test_motion_tokens_in_conflict_become_less_likely(network, lessons):
-    lesson = lessons.lessons[0]
+def avoiding(network, lesson, kind):
+    """A lesson of one motion token alone, of which the first five are to be avoided."""
     at = lesson.moved.nonzero()[10]
-    scene, token, agent = at.tolist()
-    in_conflict = torch.zeros((1, network.motion_vocabulary().num_motion_tokens)).bool()
-    in_conflict[0, :5] = True
-    only = replace(worthless(lesson), conflicts=Conflicts(at[None], in_conflict, 1))
+    avoided = torch.zeros((1, network.motion_vocabulary().num_motion_tokens)).bool()
+    avoided[0, :5] = True
+    return replace(worthless(lesson), **{kind: AvoidedTokens(at[None], avoided, 1)})
+
+
+def logits_of(motion, tokens):
+    scene, token, agent = tokens.at[0].tolist()
+    return motion.motion_logits[motion.rows.number[scene, token - 1, agent]]
+
+
+@pytest.mark.parametrize("kind", ["conflicts", "departures"])
+def test_motion_tokens_to_be_avoided_become_less_likely(network, lessons, kind):
+    lesson = lessons.lessons[0]
+    only = avoiding(network, lesson, kind)
+    tokens = getattr(only, kind)
 
     before, after = (
         each(lesson.batch).motion for each in (network, after_a_step(network, only))
     )
 
-    def safe(motion):
-        row = motion.rows.number[scene, token - 1, agent]
-        return motion.motion_logits[row].softmax(dim=0)[~in_conflict[0]].sum()
+    def others(motion):
+        return logits_of(motion, tokens).softmax(dim=0)[~tokens.avoided[0]].sum()
 
     loss = terms(network, network, only)["policy"].loss
-    odds = safe(before) + LEAST_ODDS * (1 - safe(before))
-    torch.testing.assert_close(loss, -HOW.conflict_penalty * odds.log())
-    assert safe(after) > safe(before)
+    odds = others(before) + LEAST_ODDS * (1 - others(before))
+    expected = -odds.log() + (1 - others(before)) * LEAST_ODDS / odds * math.log(LEAST_ODDS)
+    torch.testing.assert_close(loss, HOW.conflict_penalty * expected)
+    assert others(after) > others(before)
+
+
+def test_all_others_are_to_be_as_likely_beside_each_other_as_they_were(network, lessons):
+    only = avoiding(network, lessons.lessons[0], "conflicts")
+    tokens, outputs = only.conflicts, network(only.batch)
+    logits = logits_of(outputs.motion, tokens)
+    wanted = (logits + tokens.avoided[0] * math.log(LEAST_ODDS)).softmax(dim=0)
+
+    outputs.motion.motion_logits.retain_grad()
+    stationary = torch.from_numpy(network.motion_vocabulary().stationary)
+    with torch.no_grad():
+        pretrained = network(only.batch)
+    policy_terms(outputs, pretrained, only, stationary, HOW)["policy"].loss.backward()
+
+    scene, token, agent = tokens.at[0].tolist()
+    row = outputs.motion.rows.number[scene, token - 1, agent]
+    found = outputs.motion.motion_logits.grad[row]
+    expected = HOW.conflict_penalty * (logits.detach().softmax(dim=0) - wanted.detach())
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-4)
 
 
 def gradient(network, lesson):
