@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from infgen.model.cell_refinement import CellRefinement, lattice_centres_m
 from infgen.model.layers import (
     AttentionSources,
     begin_last_at_zero,
@@ -79,8 +80,11 @@ class CellFeatures(nn.Module):
     lattice: Tensor
     centre_m: Tensor
 
-    def __init__(self, width: int, cell_feature_width: int, grid: Grid) -> None:
+    def __init__(
+        self, width: int, cell_feature_width: int, refinement_width: int, grid: Grid
+    ) -> None:
         super().__init__()
+        self.width = cell_feature_width
         self.step_m = grid.step_m
         self.side = len(grid.cell_at)
         inside = np.flatnonzero(grid.cell_at != NO_CELL)
@@ -98,23 +102,40 @@ class CellFeatures(nn.Module):
         )
         self.key = nn.Linear(cell_feature_width, cell_feature_width)
         self.ask = nn.Linear(width, cell_feature_width)
+        centres_m = lattice_centres_m(self.side, self.step_m)
+        self.refinement = (
+            CellRefinement(width, cell_feature_width, refinement_width, centres_m)
+            if refinement_width
+            else None
+        )
 
     def forward(self, ego_pose: Tensor, roads: CellSources, agents: CellSources) -> Tensor:
-        """Describe the cells around egos [N, 3]: features [N, cell, C]."""
+        """Describe the cells around egos [N, 3]: features [N, cell, C].
+
+        With a refinement, its features follow [N, cell, 2 C].
+        """
         laid = self._cell_sources(ego_pose, roads, self.road) + self._cell_sources(
             ego_pose, agents, self.agent
         )
         square = laid.view(len(ego_pose), self.side, self.side, laid.shape[1])
-        spread = self.beside(square.permute(0, 3, 1, 2))
-        cells = spread.flatten(2)[..., self.lattice].mT
+        square = square.permute(0, 3, 1, 2)
+        cells = self.beside(square).flatten(2)[..., self.lattice].mT
         keys: Tensor = self.key(functional.relu(cells + self.place(self.centre_m)))
-        return keys
+        if self.refinement is None:
+            return keys
+        return torch.cat([keys, self.refinement(square, self.lattice)], dim=-1)
 
     def choose(self, x_NSD: Tensor, cells_NPC: Tensor) -> Tensor:
         """Say how much queries are for each cell: logits [N, S, cell]."""
-        asked = self.ask(x_NSD) * cells_NPC.shape[-1] ** -0.5
-        logits: Tensor = asked @ cells_NPC.mT
+        asked = self.ask(x_NSD) * self.width**-0.5
+        logits: Tensor = asked @ cells_NPC[..., : self.width].mT
         return logits
+
+    def refine(self, x_NSD: Tensor, cells_NPC: Tensor) -> Tensor | None:
+        """Say what a refinement adds to these logits; None without one."""
+        if self.refinement is None:
+            return None
+        return self.refinement.choose(x_NSD, cells_NPC[..., self.width :])
 
     def _cell_sources(
         self, ego_pose: Tensor, lying: CellSources, project: nn.Linear

@@ -80,7 +80,10 @@ class CellStack(nn.Module):
         self.cell = mlp(width, width, grid.num_cells) if by_cell else None
         self.place = None if by_cell else mlp(width, width, 2)
         features = settings.cell_feature_width if by_cell else 0
-        self.cell_features = CellFeatures(width, features, grid) if features else None
+        refined = settings.cell_refinement_width
+        self.cell_features = (
+            CellFeatures(width, features, refined, grid) if features else None
+        )
         self.density = DensityFeatures(width) if settings.density_features else None
 
     def map_reach(self) -> NeighbourSpec:
@@ -130,8 +133,8 @@ class CellStack(nn.Module):
             rows: What the features are of.
             x: The features [N, S, D].
             cell_features: Features of the cells, if they are used [N, cell, C].
-                The more cells somebody might come from, the likelier somebody comes: it
-                adds what they sum up to.
+                The more cells an agent might come from, the likelier one comes: it adds
+                what they sum up to, before they are refined.
         """
         add, cell = self.add(x)[..., 0], None if self.cell is None else self.cell(x)
         if (
@@ -141,6 +144,8 @@ class CellStack(nn.Module):
         ):
             cell = cell + self.cell_features.choose(x, cell_features)
             add = add + cell.float().logsumexp(dim=-1) - math.log(self.num_cells)
+            refined = self.cell_features.refine(x, cell_features)
+            cell = cell if refined is None else cell + refined
         return InsertionOutputs(
             rows,
             add,

@@ -11,6 +11,7 @@ from infgen.model.agents import AgentContext, AgentEmbedding, AgentRows, MotionS
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.cell_features import CellSources, OffsetEmbedding, OffsetFeatures
+from infgen.model.cell_refinement import CellRefinement
 from infgen.model.device.index import BatchIndex
 from infgen.model.device.together import launched_together
 from infgen.model.features.approach import ApproachFeatures
@@ -56,7 +57,7 @@ EGO = 0
 
 
 AgentFeatures = DensityFeatures | StandingFeatures | RemovalFeatures | ApproachFeatures
-AddedPart = AgentFeatures | OffsetEmbedding | OffsetFeatures | LatentRates
+AddedPart = AgentFeatures | OffsetEmbedding | OffsetFeatures | LatentRates | CellRefinement
 """Parts that may be added to trained weights."""
 
 

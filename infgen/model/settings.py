@@ -9,6 +9,8 @@ from infgen.settings import RULES, AtLeastOne, Bool, Count, NonNegative, Share
 
 NUM_COORDINATES = 12
 """Numbers that tell the relative pose of a pair with ``relations=rotary``."""
+REFINEMENT_GROUPS = 4
+"""Groups of the second convolution of ``cell_refinement``."""
 
 
 @dataclass(frozen=True, slots=True, config=RULES)
@@ -87,6 +89,10 @@ class ModelSettings:
     cell_feature_width: Count = 0
     """Width of map features per cell, from which position and heading logits are computed;
     0 to compute them from the query alone, as in the paper."""
+    cell_refinement_width: Count = 0
+    """Width of a closer look at the cells that position logits are of, up to 9 m around
+    each, a multiple of 4; 0 for none. It does not change whether agents are inserted, and
+    needs `cell_feature_width` and `position_token`, without which there is none."""
     motion_feature_width: Count = 0
     """Width of features of where each motion token leads, from which its logit is computed;
     0 for one logit per token, each learned alone, as in the paper."""
@@ -137,6 +143,11 @@ class ModelSettings:
             raise ValueError(
                 "offset_token needs position_token and heading_token; set both to true, or "
                 "offset_token=false"
+            )
+        if self.cell_refinement_width % REFINEMENT_GROUPS:
+            raise ValueError(
+                f"cell_refinement_width is {self.cell_refinement_width}; expected a "
+                f"multiple of {REFINEMENT_GROUPS}"
             )
         if self.signal_ahead_m and not self.signals_each_step:
             raise ValueError(

@@ -25,7 +25,7 @@ def grid(grid_settings):
 @pytest.fixture
 def cell_features(grid):
     torch.manual_seed(0)
-    cell_features = CellFeatures(WIDTH, FEATURES, grid)
+    cell_features = CellFeatures(WIDTH, FEATURES, 0, grid)
     torch.nn.init.normal_(cell_features.place[-1].weight)
     return cell_features.eval()
 

@@ -113,17 +113,19 @@ def test_untrained_features_change_no_logit(tiny, new_network, batch):
         *("density_features", "standing_features"),
         *("removal_features", "approach_features", "latent_rates"),
     )
-    network = new_network(replace(tiny, **dict.fromkeys(features, True))).eval()
+    every = replace(tiny, cell_refinement_width=8, **dict.fromkeys(features, True))
+    network = new_network(every).eval()
     network.load_state_dict(plain.state_dict(), strict=False)
     for part in network.added_parts().values():
         part.begin_at_zero()
 
     one, two = plain(batch), network(batch)
 
-    assert len(network.added_parts()) == 6
+    assert len(network.added_parts()) == 7
     assert torch.equal(one.motion.motion_logits, two.motion.motion_logits)
     assert torch.equal(one.motion.remove_logit, two.motion.remove_logit)
     assert torch.equal(one.entries.add_logit, two.entries.add_logit)
+    assert torch.equal(one.entries.position_logits, two.entries.position_logits)
 
 
 def test_insertion_and_removal_see_density_and_motion_does_not(tiny, new_network, batch):

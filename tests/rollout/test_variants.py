@@ -28,6 +28,7 @@ VARIANTS = {
     "patterns": {"validity_pattern_tokens": True},
     "rotary": {"relations": "rotary"},
     "latent rates": {"latent_rates": True},
+    "cell refinement": {"cell_feature_width": 4, "cell_refinement_width": 4},
 }
 FASTEST_M = 20.0
 """The longest move of the vocabulary of these tests."""

@@ -168,9 +168,11 @@ def same(one: Frame, other: Frame) -> bool:
     return True
 
 
-def rollout(mode: str, rules: str, steps: str = "3") -> Found:
+def rollout(mode: str, rules: str, steps: str = "3", add_bias: str = "") -> Found:
     """Token steps on both devices, and what the last one of them would cost."""
     settings = {"mode": mode, **OPTIONS[rules]}
+    if add_bias:
+        settings["add_bias"] = float(add_bias)
     plain = session(CPU, 3, settings)
     with StandIn():
         ours = session(DEVICE, 3, settings)

@@ -4,7 +4,8 @@ The most kernels and waits of one token step of three rollouts; to be lowered, n
 (Density and standing features, which the package's weights have since 2026-11-24, launch 76
 of them; without these there were 645, 3,008 and 3,150. Offset tokens, which they have since
 2026-11-25, launch 78; without these there were 3,202 and 3,344. Removal features,
-which they have since 2026-11-27, launch 44; without these there were 721, 3,280 and 3,422.)
+which they have since 2026-11-27, launch 44; without these there were 721, 3,280 and 3,422.
+With two passes of insertion, as measured until 2026-11-28, there were 3,324 and 3,466.)
 A pass of insertion launches all its kernels, also for rollouts that are done: it could be
 captured as a graph, and so is one launch and one wait.
 """
@@ -13,15 +14,16 @@ import pytest
 
 MOST = {
     ("motion-only", "mask"): (765, 1),
-    ("long", "mask"): (3324, 3),
-    ("long", "rules"): (3466, 10),
+    ("long", "mask"): (2374, 2),
+    ("long", "rules"): (2472, 7),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("mode", "rules"), MOST)
 def test_rollouts_are_those_of_the_cpu_and_cost_no_more_than_they_did(case, mode, rules):
-    found = case("rollout", mode, rules)
+    # Nobody is inserted, so there is one pass of insertion, whatever the weights.
+    found = case("rollout", mode, rules, "3", "-30")
 
     kernels, waits = MOST[mode, rules]
     assert found["equal"] == [True, True, True]

@@ -120,19 +120,18 @@ def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_i
     assert len(message) < 1000
 
 
-ADDED = dict.fromkeys(
-    (
-        *("density_features", "standing_features", "removal_features"),
-        *("approach_features", "offset_token", "latent_rates"),
-    ),
-    True,
+FEATURES = (
+    *("density_features", "standing_features", "removal_features"),
+    *("approach_features", "offset_token", "latent_rates"),
 )
+ADDED = {**dict.fromkeys(FEATURES, True), "cell_refinement_width": 8}
+NONE_ADDED = {**dict.fromkeys(FEATURES, False), "cell_refinement_width": 0}
 
 
 def test_added_parts_may_be_missing_in_weights_to_begin_with(tmp_path):
     builtin = load_network(builtin_weights())
     vocabularies = builtin.motion_vocabulary(), builtin.map_vocabulary()
-    without = dataclasses.replace(builtin.settings, **dict.fromkeys(ADDED, False))
+    without = dataclasses.replace(builtin.settings, **NONE_ADDED)
     plain = Network(without, *vocabularies, builtin.grid_settings)
     save_network(tmp_path, plain, state_dict_of(plain), step=0)
     every = dataclasses.replace(without, **ADDED)
@@ -142,7 +141,7 @@ def test_added_parts_may_be_missing_in_weights_to_begin_with(tmp_path):
 
     found, own = dict(network.named_parameters()), dict(plain.named_parameters())
     parts = tuple(network.added_parts())
-    assert len(parts) == 8
+    assert len(parts) == 9
     added = found.keys() - own.keys()
     assert added
     assert all(name.startswith(parts) for name in added)

@@ -26,6 +26,7 @@ VARIANTS = {
         {"offset_top_p": 0.5, "heading_top_p": 0.9},
     ),
     "features": ({"cell_feature_width": 8, "ego_embedding": True}, {}),
+    "cell refinement": ({"cell_feature_width": 8, "cell_refinement_width": 8}, {}),
     "rotary": ({"relations": "rotary", "cell_feature_width": 8}, {}),
     "latent rates": ({"latent_rates": True}, {}),
     "latent rates, density control": (
