@@ -22,7 +22,7 @@ MOST = {
 @pytest.mark.slow
 @pytest.mark.parametrize(("mode", "rules"), MOST)
 def test_rollouts_are_those_of_the_cpu_and_cost_no_more_than_they_did(case, mode, rules):
-    # Nobody is inserted, so there is one pass of insertion, whatever the weights.
+    # No agent is inserted, so there is one pass of insertion, whatever the weights.
     found = case("rollout", mode, rules, "3", "-30")
 
     kernels, waits = MOST[mode, rules]
