@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float32
 
 from infgen.geometry import to_world
 from infgen.model.training.policy_gradient.policy_lesson import AvoidedTokens
+from infgen.model.training.policy_gradient.rewards import SeenAgents
 from infgen.model.training.policy_gradient.road import Road
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
 from infgen.scene import AgentType
@@ -32,29 +33,19 @@ def find_departures(
         vocabulary: Of their motion tokens.
         roads: Of every scene.
     """
-    agents = rollouts.batch.agents
-    pose, size_lw_m, agent_type, motion_token, moved = (
-        each.numpy(force=True)
-        for each in (
-            agents.pose,
-            agents.size_lwh_m[..., :2],
-            agents.agent_type,
-            agents.motion_token,
-            rollouts.moved,
-        )
-    )
+    seen = SeenAgents.of(rollouts)
     end = vocabulary.end_pose[int(AgentType.VEHICLE)]
     drives = np.hypot(end[:, 0], end[:, 1]) > np.float32(DRIVES_M)
-    asked = moved & (agent_type == AgentType.VEHICLE)[:, None]
-    asked &= drives[np.maximum(motion_token, 0)]
+    asked = seen.moved & (seen.agent_type == AgentType.VEHICLE)[:, None]
+    asked &= drives[np.maximum(seen.motion_token, 0)]
     found_at, found = [np.zeros((0, 3), dtype=np.int64)], [np.zeros((0, len(end)), bool)]
-    scene = np.arange(len(moved)) % len(roads)
+    scene = np.arange(len(asked)) % len(roads)
     for number, road in enumerate(roads):
         at = np.argwhere(asked & (scene == number)[:, None, None])
         rollout, token, agent = at.T
-        before, size = pose[rollout, token - 1, agent], size_lw_m[rollout, agent]
+        before, size = seen.pose[rollout, token - 1, agent], seen.size_lw_m[rollout, agent]
         before_m = road.off_m(before, size)
-        after_m = road.off_m(pose[rollout, token, agent], size)
+        after_m = road.off_m(seen.pose[rollout, token, agent], size)
         taken = _departs(before_m, after_m)
         found_at.append(at[taken])
         ends_m = _ends_off_m(road, before[taken], size[taken], end)

@@ -93,7 +93,7 @@ def find_costs(
         vocabulary: Of their motion tokens.
         roads: Of every scene.
     """
-    seen, device = _Seen.of(rollouts), rollouts.moved.device
+    seen, device = SeenAgents.of(rollouts), rollouts.moved.device
     return Costs(
         torch.from_numpy(find_overlaps(seen, vocabulary)).to(device),
         torch.from_numpy(find_off_road(seen, roads)).to(device),
@@ -106,7 +106,7 @@ def find_costs(
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
+class SeenAgents:
     """Simulated agents on the host, as ``Agents`` and ``SimulatedRollouts`` have them."""
 
     pose: Float32[np.ndarray, "rollout token agent 3"]
@@ -118,7 +118,8 @@ class _Seen:
     inserted: Bool[np.ndarray, "rollout token agent"]
 
     @classmethod
-    def of(cls, rollouts: SimulatedRollouts) -> "_Seen":
+    def of(cls, rollouts: SimulatedRollouts) -> "SeenAgents":
+        """Bring the agents of rollouts to the host."""
         agents: Agents = rollouts.batch.agents
         return cls(
             *(
@@ -137,7 +138,7 @@ class _Seen:
 
 
 def find_overlaps(
-    seen: _Seen, vocabulary: MotionVocabulary
+    seen: SeenAgents, vocabulary: MotionVocabulary
 ) -> Bool[np.ndarray, "rollout token agent"]:
     """Tell who comes to overlap another agent, at the middle or the end of a token step.
 
@@ -165,14 +166,14 @@ def find_overlaps(
     return pays
 
 
-def _came(seen: _Seen, token: int, rollout: np.ndarray, row: np.ndarray) -> np.ndarray:
+def _came(seen: SeenAgents, token: int, rollout: np.ndarray, row: np.ndarray) -> np.ndarray:
     """Insertion turns at a token step; -1 of agents that were there before."""
     turn = seen.turn[rollout, token, row]
     return np.where(seen.inserted[rollout, token, row], turn, -1)
 
 
 def _near_pairs(
-    seen: _Seen, token: int, there: np.ndarray
+    seen: SeenAgents, token: int, there: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pairs that may overlap, each once: rollout, lower row, higher row."""
     pose, reach_m = seen.pose[:, token], np.hypot(*np.moveaxis(seen.size_lw_m, -1, 0)) / 2
@@ -188,7 +189,7 @@ def _near_pairs(
 
 
 def _begin_to_overlap(
-    seen: _Seen,
+    seen: SeenAgents,
     token: int,
     pairs: tuple[np.ndarray, np.ndarray, np.ndarray],
     vocabulary: MotionVocabulary,
@@ -216,7 +217,7 @@ def _begin_to_overlap(
 
 
 def find_off_road(
-    seen: _Seen, roads: list[Road]
+    seen: SeenAgents, roads: list[Road]
 ) -> Bool[np.ndarray, "rollout token agent"]:
     """Tell which vehicles leave the road, or get farther off it, in a token step."""
     moved = seen.moved & (seen.agent_type == AgentType.VEHICLE)[:, None]
