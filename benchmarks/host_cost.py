@@ -25,7 +25,7 @@ from measuring import in_own_process
 from rollout import LENGTH_S, PLAYED, Case, make_session
 
 from infgen.clock import CLOCK
-from infgen.model.insertion import DetailQuery
+from infgen.model.insertion.detail_query import DetailQuery
 from infgen.model.stepping import Stepper
 from infgen.rollout import insertion, motion_sampler
 from infgen.rollout.session import Session

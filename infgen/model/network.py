@@ -1,7 +1,5 @@
 """The whole network, and one pass over all tokens of a batch at once (training)."""
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -10,22 +8,19 @@ from infgen.clock import CLOCK
 from infgen.model.agents import AgentContext, AgentEmbedding, AgentRows, MotionStack
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import Agents, Batch
-from infgen.model.cell_features import CellSources, OffsetEmbedding, OffsetFeatures
-from infgen.model.cell_refinement import CellRefinement
 from infgen.model.device.index import BatchIndex
 from infgen.model.device.together import launched_together
 from infgen.model.features.approach import ApproachFeatures
 from infgen.model.features.removal import EgoPlace, RemovalFeatures
-from infgen.model.insertion import CellStack, DetailStack
+from infgen.model.insertion.agent_spacing import AgentSpacing
+from infgen.model.insertion.batch_pass import detail_outputs, insertion_outputs
+from infgen.model.insertion.cell_query import CellStack
+from infgen.model.insertion.cell_refinement import CellRefinement
+from infgen.model.insertion.detail_features import OffsetEmbedding, OffsetFeatures
+from infgen.model.insertion.detail_query import DetailStack
 from infgen.model.latent_rates import LatentRates
 from infgen.model.layers import initialise, normed
-from infgen.model.logits import (
-    DetailOutputs,
-    InsertionOutputs,
-    MapOutputs,
-    MotionOutputs,
-    Outputs,
-)
+from infgen.model.logits import MapOutputs, MotionOutputs, Outputs
 from infgen.model.long_memory import (
     Density,
     DensityFeatures,
@@ -37,27 +32,18 @@ from infgen.model.long_memory import (
     standing_at,
 )
 from infgen.model.map import MapEncoder
-from infgen.model.neighbours import (
-    MapFeatures,
-    cell_pose,
-    find_map_neighbours,
-    find_neighbours,
-    find_others,
-)
+from infgen.model.neighbours import MapFeatures, find_map_neighbours, find_others
 from infgen.model.relations import Rows, describe_pairs
 from infgen.model.rotary.turns import turned
 from infgen.model.settings import ModelSettings
 from infgen.tokens.grid import Grid, make_grid
-from infgen.tokens.scene_tokens import Presence
+from infgen.tokens.scene_tokens import EGO, Presence
 from infgen.tokens.settings import TokenSettings
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
-EGO = 0
-"""Row of the ego, in batches as in simulation."""
-
-
 AgentFeatures = DensityFeatures | StandingFeatures | RemovalFeatures | ApproachFeatures
-AddedPart = AgentFeatures | OffsetEmbedding | OffsetFeatures | LatentRates | CellRefinement
+CellParts = OffsetEmbedding | OffsetFeatures | CellRefinement | AgentSpacing
+AddedPart = AgentFeatures | CellParts | LatentRates
 """Parts that may be added to trained weights."""
 
 
@@ -176,10 +162,10 @@ class Network(nn.Module):
             motion=self._motion(agents, rows, given, x, roads, density, as_logged),
             entries=None
             if cells is None or not insertions
-            else _entries(cells, batch, asked, rows, raw, shown, roads, density),
+            else insertion_outputs(cells, batch, asked, rows, raw, shown, roads, density),
             details=None
             if details is None or not insertions
-            else _details(details, batch, told, rows, shown, roads),
+            else detail_outputs(details, batch, told, rows, raw, shown, roads),
             roads=None if hidden is None else MapOutputs(*hidden),
             rates=None if self.rates is None else self.rates(),
         )
@@ -204,7 +190,8 @@ class Network(nn.Module):
         as_logged: bool,
     ) -> MotionOutputs:
         """Run the motion stack over the visible agents of all tokens."""
-        visible, scene = agents.visible, _count(agents.agent_type)
+        visible, agent_type = agents.visible, agents.agent_type
+        scene = torch.arange(len(agent_type), device=agent_type.device)
         by_scene = Rows(rows.at, rows.number.flatten(1))
         by_token = Rows(rows.at, rows.number.flatten(0, 1))
         pose = agents.pose.flatten(0, 1)  # [scene token, agent, 3]
@@ -252,102 +239,6 @@ class Network(nn.Module):
         relation = self.motion.past_relation
         told = describe_pairs(relation, relation.table(), pose, pose[index], ago=ago)
         return index, present, Shared.of(told)
-
-
-def _entries(
-    stack: CellStack,
-    batch: Batch,
-    asked: Rows,
-    rows: Rows,
-    raw: Tensor,
-    shown: Tensor,
-    roads: MapFeatures,
-    density: Density | None,
-) -> InsertionOutputs:
-    """Ask for the inserted agents of every token, each slot seeing those before it.
-
-    Attention sees the features ``shown``: the raw ones, turned if features are.
-    """
-    agents, entries = batch.agents, batch.entries
-    alone = Rows(asked.at, asked.number.flatten()[:, None])
-    ego_pose = agents.pose[:, :, EGO]
-    around = find_neighbours(
-        stack.agents_reach(agents.agent_type.shape[1]),
-        alone,
-        ego_pose.flatten(0, 1)[:, None],
-        agents.pose.flatten(0, 1),
-        rows.number.flatten(0, 1),
-        agents.visible.flatten(0, 1)[:, None],
-    )
-    slot = torch.arange(entries.agent.shape[2], device=raw.device)[:, None]
-    turn = asked.pack(agents.turn).gather(1, around.place)[:, None]  # [N, 1, K]
-    cell = asked.pack(agents.cell).gather(1, around.place)[:, None]
-    seen = around.seen(shown)
-    seen = replace(seen, present=seen.present[:, None] & (turn < slot))
-    occupied = stack.occupied(cell.expand_as(seen.present), seen.present)
-    reach, scene = stack.map_reach(), _count(agents.agent_type)
-    map_seen = find_map_neighbours(reach, asked, ego_pose, roads, scene)
-    cell_features = None
-    if stack.cell_features is not None:
-        # Inserted agents differ by slot: they are left out.
-        there = agents.visible & (agents.turn < 0)
-        lying = CellSources(
-            raw, *(asked.pack(each) for each in (rows.number, agents.pose, there))
-        )
-        map_of = asked.at // agents.pose.shape[1]
-        cell_features = stack.cell_features(
-            asked.pack(ego_pose), CellSources.roads(roads, map_of), lying
-        )
-    average = None if density is None else asked.pack(density.average)
-    x = stack(occupied, map_seen, seen, average)
-    return stack.answer(asked, x, cell_features)
-
-
-def _details(
-    stack: DetailStack,
-    batch: Batch,
-    wanted: Rows,
-    rows: Rows,
-    shown: Tensor,
-    roads: MapFeatures,
-) -> DetailOutputs:
-    """Describe agents where they enter, without seeing them."""
-    agents, details = batch.agents, batch.details
-    scene = wanted.at // details.present.shape[1]
-    token, cell = wanted.pack(details.token), wanted.pack(details.cell)
-    ego_pose = agents.pose[scene, token, EGO]
-    pose = cell_pose(ego_pose, stack.query_pose(cell, wanted.pack(details.offset_m)))
-    each = Rows(_count(pose), _count(pose)[:, None])
-
-    place = torch.arange(agents.agent_type.shape[1], device=shown.device)
-    turn = wanted.pack(details.turn)[:, None]
-    allowed = agents.visible[scene, token] & (agents.turn[scene, token] < turn)
-    allowed &= place != wanted.pack(details.agent)[:, None]
-    around = find_neighbours(
-        stack.agents_reach(),
-        each,
-        pose[:, None],
-        agents.pose[scene, token],
-        rows.number[scene, token],
-        allowed[:, None],
-    )
-    reach = stack.map_reach()
-    map_seen = find_map_neighbours(reach, each, pose[:, None], roads, scene)
-    x = stack(cell, map_seen, around.seen(shown))
-    agent_type, offset = wanted.pack(details.agent_type), wanted.pack(details.offset)
-    near = CellSources.near(roads, map_seen)
-    said = stack.answer(wanted, x, agent_type, pose, near)
-    if stack.offset_bins is None:
-        return said
-    return replace(
-        said,
-        offset_logits=stack.offset_logits(x, agent_type, pose, near),
-        heading_logits=stack.heading_logits(x, agent_type, offset, pose, near),
-    )
-
-
-def _count(like: Tensor) -> Tensor:
-    return torch.arange(len(like), device=like.device)
 
 
 def _standing(agents: Agents) -> Standing:

@@ -135,8 +135,9 @@ class StepMemory:
 class Insertions:
     """One token step as the entry stage sees it.
 
-    ``Stepper.entry_add`` writes into ``raw`` and ``relation``. All but ``rollout`` is of
-    every rollout of the batch: what is large is taken only when it is looked at.
+    ``Stepper.entry_add`` writes into ``raw``, ``relation`` and ``spacing``. All but
+    ``rollout`` is of every rollout of the batch: what is large is taken only when it is
+    looked at.
 
     Attributes:
         token: The token step.
@@ -158,6 +159,8 @@ class Insertions:
         roads: Map tokens around the ego.
         cell_features: Features of the cells around it, if they are used
             [rollout, cell, C].
+        spacing: What the agents so far say of them by the gaps between, if that is used
+            [rollout, cell, C].
         all_active: Whether every rollout of the batch goes on, each once.
     """
 
@@ -175,6 +178,7 @@ class Insertions:
     within: Tensor
     roads: AttentionSources
     cell_features: Tensor | None
+    spacing: Tensor | None
     all_active: bool = True
 
     def take(self, places: Int64[Tensor, " kept"]) -> "Insertions":

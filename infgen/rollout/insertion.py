@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Int64
 from torch import Tensor
 
-from infgen.model.insertion import InsertionDetails
+from infgen.model.insertion.detail_query import InsertionDetails
 from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.token_step import PositionOutputs
 from infgen.rollout.insertion_state import (

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from infgen.model.batching.tensors import in_float32
-from infgen.model.insertion import InsertionDetails
+from infgen.model.insertion.detail_query import InsertionDetails
 from infgen.model.neighbours import MapFeatures
 from infgen.model.network import Network
 from infgen.model.step_memory import Insertions, StepMemory

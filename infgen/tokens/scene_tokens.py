@@ -14,6 +14,8 @@ NO_MOTION_TOKEN = -1
 """Motion token of a token step at which the agent is absent or not observed."""
 FIRST_MOTION_TOKEN = -2
 """Motion token of the token step at which an agent is inserted (the paper's BOS)."""
+EGO = 0
+"""Row of the ego among the agents, in batches as in simulation."""
 NO_CELL = -1
 """Cell of an absent agent, or of one outside the grid."""
 

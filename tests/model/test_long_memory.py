@@ -113,7 +113,8 @@ def test_untrained_features_change_no_logit(tiny, new_network, batch):
         *("density_features", "standing_features"),
         *("removal_features", "approach_features", "latent_rates"),
     )
-    every = replace(tiny, cell_refinement_width=8, **dict.fromkeys(features, True))
+    widths = {"cell_refinement_width": 8, "agent_spacing_width": 4}
+    every = replace(tiny, **widths, **dict.fromkeys(features, True))
     network = new_network(every).eval()
     network.load_state_dict(plain.state_dict(), strict=False)
     for part in network.added_parts().values():
@@ -121,7 +122,7 @@ def test_untrained_features_change_no_logit(tiny, new_network, batch):
 
     one, two = plain(batch), network(batch)
 
-    assert len(network.added_parts()) == 7
+    assert len(network.added_parts()) == 8
     assert torch.equal(one.motion.motion_logits, two.motion.motion_logits)
     assert torch.equal(one.motion.remove_logit, two.motion.remove_logit)
     assert torch.equal(one.entries.add_logit, two.entries.add_logit)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from infgen.model.cell_features import CellSources
-from infgen.model.insertion import DetailQuery, InsertionDetails
+from infgen.model.insertion.cell_features import CellSources
+from infgen.model.insertion.detail_query import DetailQuery, InsertionDetails
 from infgen.rollout.insertion import sample_offset_and_heading
 
 AGENTS = 64

@@ -292,7 +292,12 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {"motion_noise_neighbours": 5, "closed_loop_population": True},
     ),
     "offset-token": (
-        {**FEATURES, "offset_token": True},
+        {
+            **FEATURES,
+            "offset_token": True,
+            "cell_refinement_width": 4,
+            "agent_spacing_width": 4,
+        },
         {"closed_loop_population": True, "trained_parts": "details, motion"},
     ),
     "accumulated": ({}, {"gradient_accumulation": 2}),

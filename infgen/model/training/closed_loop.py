@@ -18,7 +18,7 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Agents, Batch, Details, Insertions
 from infgen.model.batching.insertion_targets import describe
-from infgen.model.network import EGO, Network
+from infgen.model.network import Network
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import TokenStep
 from infgen.model.training.nearest_tokens import (
@@ -29,7 +29,7 @@ from infgen.model.training.nearest_tokens import (
     to_world,
 )
 from infgen.tokens.grid import Grid, encode_cell, to_grid
-from infgen.tokens.scene_tokens import NO_CELL, Presence
+from infgen.tokens.scene_tokens import EGO, NO_CELL, Presence
 
 
 @torch.no_grad()

@@ -29,7 +29,7 @@ from torch import Tensor
 from infgen.model.batching.batch import Batch
 from infgen.model.batching.padding import NO_AGENT
 from infgen.model.long_memory import count_around
-from infgen.model.network import EGO, Network
+from infgen.model.network import Network
 from infgen.model.training.closed_loop import move_near_log
 from infgen.model.training.own_choices import choose_among
 from infgen.model.training.population_targets import targets
@@ -43,7 +43,7 @@ from infgen.model.training.simulation import (
     Simulation,
 )
 from infgen.tokens.insertion import insertion_key
-from infgen.tokens.scene_tokens import NO_CELL
+from infgen.tokens.scene_tokens import EGO, NO_CELL
 
 CORRECTION_TOKENS = 6
 """The excess is corrected in about so many token steps (3 s)."""

@@ -23,11 +23,10 @@ from infgen.model.logits import (
     Outputs,
 )
 from infgen.model.neighbours import grid_place
-from infgen.model.network import EGO
 from infgen.model.relations import Rows, wrap_angle
 from infgen.model.training.rate_likelihood import Decisions, rate_likelihood
 from infgen.model.training_settings import TrainSettings
-from infgen.tokens.scene_tokens import Presence
+from infgen.tokens.scene_tokens import EGO, Presence
 
 
 @dataclass(frozen=True, slots=True)

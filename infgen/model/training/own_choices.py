@@ -6,14 +6,14 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from infgen.model.insertion import InsertionDetails
+from infgen.model.insertion.detail_query import InsertionDetails
 from infgen.model.neighbours import cell_pose
-from infgen.model.network import EGO
 from infgen.model.relations import wrap_angle
 from infgen.model.step_memory import Insertions
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import PositionOutputs
 from infgen.tokens.grid import Grid, encode_cell
+from infgen.tokens.scene_tokens import EGO
 
 INSIDE = 0.999
 """Inserted agents stay within this share of the grid radius, whatever their offsets."""

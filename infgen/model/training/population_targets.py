@@ -9,9 +9,8 @@ from torch import Tensor
 from infgen.model.batching.batch import Agents, Batch, Details, Insertions
 from infgen.model.batching.insertion_targets import describe
 from infgen.model.batching.padding import NO_AGENT
-from infgen.model.network import EGO
 from infgen.tokens.grid import Grid
-from infgen.tokens.scene_tokens import NO_CELL, Presence
+from infgen.tokens.scene_tokens import EGO, NO_CELL, Presence
 
 
 @dataclass(slots=True)

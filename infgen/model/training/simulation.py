@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.batching.tensors import map_tensors
-from infgen.model.network import EGO, Network
+from infgen.model.network import Network
 from infgen.model.relations import Rows
 from infgen.model.step_memory import Insertions as StepInsertions
 from infgen.model.stepping import Stepper
@@ -25,6 +25,7 @@ from infgen.model.training.own_choices import InsertedAgent, UniformNumbers, sam
 from infgen.model.training.population_targets import InsertionTurns
 from infgen.tokens.grid import encode_cell, to_grid
 from infgen.tokens.scene_tokens import (
+    EGO,
     FIRST_MOTION_TOKEN,
     NO_CELL,
     NO_MOTION_TOKEN,

@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from infgen.model.neighbours import cell_pose, grid_place
-from infgen.model.network import EGO
 from infgen.model.relations import Rows
 from infgen.model.step_memory import StepMemory
 from infgen.model.token_step import PositionOutputs, TokenStep
@@ -30,7 +29,7 @@ from infgen.rollout.insertion_state import TURN_PURPOSES, InsertionRequest
 from infgen.rollout.population import InsertedAgents, Population, insertion_pose
 from infgen.rollout.random_streams import WORDS, Purpose
 from infgen.rollout.sampling import choose, sample_event
-from infgen.tokens.scene_tokens import FIRST_MOTION_TOKEN, Presence
+from infgen.tokens.scene_tokens import EGO, FIRST_MOTION_TOKEN, Presence
 
 LOGGED = 8
 """Numbers that are logged of an inserted agent: row, type, box, position and heading."""

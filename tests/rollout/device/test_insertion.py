@@ -27,6 +27,10 @@ VARIANTS = {
     ),
     "features": ({"cell_feature_width": 8, "ego_embedding": True}, {}),
     "cell refinement": ({"cell_feature_width": 8, "cell_refinement_width": 8}, {}),
+    "agent spacing": (
+        {"agent_spacing_width": 8, "offset_token": True, "cell_feature_width": 8},
+        {},
+    ),
     "rotary": ({"relations": "rotary", "cell_feature_width": 8}, {}),
     "latent rates": ({"latent_rates": True}, {}),
     "latent rates, density control": (

@@ -19,11 +19,10 @@ from torch import Tensor
 
 from infgen.geometry import box_radius_m, boxes_overlap, wrap_angle
 from infgen.model.batching.batch import Details
-from infgen.model.network import EGO
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
 from infgen.scene import AgentType
 from infgen.tokens.grid import Grid, to_grid
-from infgen.tokens.scene_tokens import Presence
+from infgen.tokens.scene_tokens import EGO, Presence
 
 AHEAD_RAD = np.float32(np.pi / 2)
 """The ego's own heading in its grid frame."""

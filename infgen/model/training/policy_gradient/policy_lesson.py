@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from infgen.model.batching.batch import Batch
-from infgen.model.network import EGO
 from infgen.model.training.policy_gradient.insertion_overlaps import InsertionOverlaps
+from infgen.tokens.scene_tokens import EGO
 from infgen.tokens.vocabulary import MotionVocabulary
 
 

@@ -26,7 +26,6 @@ from torch import Tensor
 
 from infgen.geometry import boxes_overlap, to_local, to_world
 from infgen.model.batching.batch import Agents
-from infgen.model.network import EGO
 from infgen.model.training.policy_gradient.energy import energy_by_agent
 from infgen.model.training.policy_gradient.placement import placement_costs
 from infgen.model.training.policy_gradient.population import count_costs
@@ -37,6 +36,7 @@ from infgen.model.training.policy_gradient.types import type_costs
 from infgen.model.training_settings import TrainSettings
 from infgen.scene import AgentType
 from infgen.spatial.road_edges import leaves_road
+from infgen.tokens.scene_tokens import EGO
 from infgen.tokens.vocabulary import MotionVocabulary
 
 MIDDLE_STEP = 3

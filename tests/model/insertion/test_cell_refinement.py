@@ -8,8 +8,8 @@ from pydantic import ValidationError
 
 from infgen.config import ModelSettings
 from infgen.model.batching.batch import collate
-from infgen.model.cell_features import CellFeatures, CellSources
-from infgen.model.cell_refinement import lattice_centres_m
+from infgen.model.insertion.cell_features import CellFeatures, CellSources
+from infgen.model.insertion.cell_refinement import lattice_centres_m
 from infgen.model.neighbours import cell_pose
 from infgen.tokens.grid import make_grid
 from infgen.tokens.scene_tokens import NO_CELL

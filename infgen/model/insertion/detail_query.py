@@ -1,6 +1,6 @@
-"""Insertion: whether an agent is inserted, in which cell, and its details.
+"""Detail query: type, size, heading and offset of an inserted agent at a cell.
 
-Shape letters as in ``layers``; S are the turns of inserted agents within one token step.
+Shape letters as in ``layers``.
 """
 
 import math
@@ -11,22 +11,16 @@ from jaxtyping import Float32
 from torch import Tensor, nn
 
 from infgen.model.agents import KINDS
-from infgen.model.cell_features import (
-    CellFeatures,
-    CellSources,
+from infgen.model.insertion.agent_spacing import OffsetSpacing, SpacedAgents
+from infgen.model.insertion.cell_features import CellSources
+from infgen.model.insertion.detail_features import (
     HeadingFeatures,
     OffsetEmbedding,
     OffsetFeatures,
 )
-from infgen.model.layers import (
-    Attention,
-    AttentionSources,
-    embedding_mlp,
-    full_precision,
-    mlp,
-)
-from infgen.model.logits import DetailOutputs, InsertionOutputs
-from infgen.model.long_memory import Density, DensityFeatures
+from infgen.model.insertion.query_block import QueryBlock
+from infgen.model.layers import AttentionSources, embedding_mlp, full_precision, mlp
+from infgen.model.logits import DetailOutputs
 from infgen.model.neighbours import NeighbourSpec
 from infgen.model.relations import Rows, relation_embedding
 from infgen.model.settings import ModelSettings
@@ -34,136 +28,6 @@ from infgen.tokens.grid import Grid
 
 OFFSET_REACH_STEPS = 2 / 3
 """Offsets lie within so many grid steps of a cell's centre (2 m for 3 m cells)."""
-
-
-class QueryBlock(nn.Module):
-    """One look at the roads and at the agents around a query."""
-
-    def __init__(self, settings: ModelSettings) -> None:
-        super().__init__()
-        self.roads = Attention(settings, bipartite=True)
-        self.agents = Attention(settings, bipartite=True)
-
-    def forward(
-        self, x: Tensor, roads: AttentionSources, agents: AttentionSources
-    ) -> Tensor:
-        """Update queries [N, D], or [N, S, D]."""
-        updated: Tensor = self.agents(self.roads(x, roads), agents)
-        return updated
-
-
-class CellStack(nn.Module):
-    """Ask, from the ego's pose, whether one more agent enters and where (SPEC 4.6).
-
-    Slots differ only by which inserted agents they see: as neighbours, and in the
-        occupancy,
-    which is one pooled embedding of all occupied cells (not one token per cell).
-    """
-
-    def __init__(self, settings: ModelSettings, grid: Grid) -> None:
-        super().__init__()
-        width = settings.width
-        self.settings = settings
-        self.num_cells = grid.num_cells
-        self.radius_m = grid.radius_m
-        self.query = nn.Embedding(1, width)
-        self.occupancy = mlp(grid.num_cells, width, width)
-        self.roads_relation = relation_embedding(settings.position_query_radius_m, settings)
-        self.agents_relation = relation_embedding(
-            settings.position_query_radius_m, settings
-        )
-        self.blocks = nn.ModuleList(
-            QueryBlock(settings) for _ in range(settings.scene_blocks)
-        )
-        self.add = mlp(width, width, 1)
-        by_cell = settings.position_token
-        self.cell = mlp(width, width, grid.num_cells) if by_cell else None
-        self.place = None if by_cell else mlp(width, width, 2)
-        features = settings.cell_feature_width if by_cell else 0
-        refined = settings.cell_refinement_width
-        self.cell_features = (
-            CellFeatures(width, features, refined, grid) if features else None
-        )
-        self.density = DensityFeatures(width) if settings.density_features else None
-
-    def map_reach(self) -> NeighbourSpec:
-        """How the query sees roads."""
-        s = self.settings
-        return NeighbourSpec.of(
-            s.position_query_radius_m, s.position_query_map_neighbours, self.roads_relation
-        )
-
-    def agents_reach(self, agents: int) -> NeighbourSpec:
-        """How the query sees agents: all of them within its radius."""
-        return NeighbourSpec.of(
-            self.settings.position_query_radius_m, agents, self.agents_relation
-        )
-
-    def forward(
-        self,
-        occupied: Tensor,
-        roads: AttentionSources,
-        agents: AttentionSources,
-        average: Tensor | None,
-    ) -> Tensor:
-        """Answer queries: features [N, S, D].
-
-        Args:
-            occupied: 1 where a slot sees an agent in a cell, else 0 [N, S, cell].
-            roads: Map tokens around the ego, the same for all slots.
-            agents: Agents around the ego; ``present`` differs by slot [N, S, K].
-            average: Moving averages of their number before this token step
-                [N, constant], if that is used.
-        """
-        x = self.query.weight[0] + self.occupancy(occupied)
-        if self.density is not None and average is not None:
-            count = agents.present.sum(dim=-1).view(len(average), -1).to(average.dtype)
-            before = average[:, None].expand(*count.shape, -1)
-            x = x + self.density(Density(count, before))
-        for block in self.blocks:
-            x = block(x, roads, agents)
-        return x
-
-    def answer(
-        self, rows: Rows, x: Tensor, cell_features: Tensor | None
-    ) -> InsertionOutputs:
-        """Say of every row, by its updated features, whether an agent enters and where.
-
-        Args:
-            rows: What the features are of.
-            x: The features [N, S, D].
-            cell_features: Features of the cells, if they are used [N, cell, C].
-                The more cells an agent might come from, the likelier one comes: it adds
-                what they sum up to, before they are refined.
-        """
-        add, cell = self.add(x)[..., 0], None if self.cell is None else self.cell(x)
-        if (
-            self.cell_features is not None
-            and cell is not None
-            and cell_features is not None
-        ):
-            cell = cell + self.cell_features.choose(x, cell_features)
-            add = add + cell.float().logsumexp(dim=-1) - math.log(self.num_cells)
-            refined = self.cell_features.refine(x, cell_features)
-            cell = cell if refined is None else cell + refined
-        return InsertionOutputs(
-            rows,
-            add,
-            cell,
-            None if self.place is None else self.radius_m * torch.tanh(self.place(x)),
-            self.radius_m,
-        )
-
-    def occupied(self, cell: Tensor, seen: Tensor) -> Tensor:
-        """Mark the cells [..., cell] that hold an agent that is seen.
-
-        Args:
-            cell: Cell of each agent [..., agent]; negative for none.
-            seen: Whether it is seen [..., agent].
-        """
-        held = torch.where(seen & (cell >= 0), cell, self.num_cells)
-        marks = torch.zeros((*held.shape[:-1], self.num_cells + 1), device=cell.device)
-        return marks.scatter(-1, held, 1.0)[..., :-1]
 
 
 class DetailStack(nn.Module):
@@ -203,6 +67,8 @@ class DetailStack(nn.Module):
         features, binned = settings.cell_feature_width, settings.offset_token
         self.offset_bins = OffsetFeatures(width, features, grid) if binned else None
         self.given_offset = OffsetEmbedding(width, grid) if binned else None
+        spaced = settings.agent_spacing_width if binned else 0
+        self.spacing = OffsetSpacing(width, spaced, grid) if spaced else None
 
     def map_reach(self) -> NeighbourSpec:
         """How the query sees roads."""
@@ -233,7 +99,12 @@ class DetailStack(nn.Module):
         return centre_m if self.settings.position_token else centre_m + offset_m
 
     def offset_logits(
-        self, x: Tensor, agent_type: Tensor, pose: Tensor, roads: CellSources
+        self,
+        x: Tensor,
+        agent_type: Tensor,
+        pose: Tensor,
+        roads: CellSources,
+        agents: SpacedAgents | None,
     ) -> Tensor:
         """Return logits of the offset bins [N, offset].
 
@@ -241,10 +112,14 @@ class DetailStack(nn.Module):
             x: Updated features [N, D].
             agent_type: ``AgentType`` of each.
             pose: Pose of the query [N, 3] ...
-            roads: ... and the map tokens seen from there.
+            roads: ... and the map tokens seen from there ...
+            agents: ... and the agents, if gaps to them are used.
         """
         assert self.offset_bins is not None
-        logits: Tensor = self.offset_bins(x + self.given_kind(agent_type), pose, roads)
+        given = x + self.given_kind(agent_type)
+        logits: Tensor = self.offset_bins(given, pose, roads)
+        if self.spacing is not None and agents is not None:
+            logits = logits + self.spacing.choose(given, pose, agents)
         return logits
 
     def heading_logits(
@@ -307,19 +182,23 @@ class DetailQuery:
         features: Features of the query [N, D].
         pose: Its pose [N, 3].
         roads: Map tokens that it sees.
+        agents: Agents that it sees, if gaps to them are used.
     """
 
     stack: DetailStack
     features: Tensor
     pose: Tensor
     roads: CellSources
+    agents: SpacedAgents | None = None
 
     @torch.no_grad()
     def offset_logits(self, agent_type: Tensor) -> Tensor:
         """Return logits of offset bins [N, offset] given agent types [N]."""
         x = self.features.float()
         with full_precision(x):
-            return self.stack.offset_logits(x, agent_type, self.pose, self.roads)
+            return self.stack.offset_logits(
+                x, agent_type, self.pose, self.roads, self.agents
+            )
 
     @torch.no_grad()
     def heading_logits(self, agent_type: Tensor, offset: Tensor) -> Tensor:
@@ -350,27 +229,3 @@ class InsertionDetails:
     turned_rad: Float32[Tensor, "rollout agent_type"] | None
     offset_m: Float32[Tensor, "rollout agent_type 2"] | None
     query: DetailQuery | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class InsertionBlocks:
-    """Query blocks of insertion with their neighbour specifications."""
-
-    cells: CellStack
-    details: DetailStack
-    cell_roads: NeighbourSpec
-    cell_agents: NeighbourSpec
-    detail_roads: NeighbourSpec
-    detail_agents: NeighbourSpec
-
-    @classmethod
-    def of(cls, cells: CellStack, details: DetailStack) -> "InsertionBlocks":
-        """Evaluate the tables of their relations for one pass."""
-        return cls(
-            cells,
-            details,
-            cells.map_reach(),
-            cells.agents_reach(0),
-            details.map_reach(),
-            details.agents_reach(),
-        )

@@ -5,12 +5,8 @@ import math
 import pytest
 import torch
 
-from infgen.model.cell_features import (
-    CellFeatures,
-    CellSources,
-    HeadingFeatures,
-    OffsetFeatures,
-)
+from infgen.model.insertion.cell_features import CellFeatures, CellSources
+from infgen.model.insertion.detail_features import HeadingFeatures, OffsetFeatures
 from infgen.model.neighbours import cell_pose
 from infgen.tokens.grid import make_grid
 

@@ -1,0 +1,1 @@
+"""Insertion: whether an agent is inserted, in which cell, and its details."""

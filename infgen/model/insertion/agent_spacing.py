@@ -1,0 +1,237 @@
+"""How far inserted agents keep from others: gaps to the boxes of agents around.
+
+Features of cells know agents by the lattice points around their centres, and offset bins
+do not know them at all, so a vehicle that joins a row of parked ones is inserted onto its
+neighbour. Here each agent has a say of the points around it by their gaps along and beside
+its own box. What agents say is added up, so that of one inserted a turn before is added to
+what is there already.
+
+Shape letters as in ``layers``; P are pairs of a query and an agent, L points around the
+agent, C the width of these features.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from infgen.model.insertion.cell_features import chosen
+from infgen.model.layers import gather
+from infgen.model.neighbours import grid_place
+from infgen.tokens.grid import Grid
+
+REACH_M = 10.5
+"""Agents have a say of points so far from their centres, less and less."""
+KNOTS = 21
+"""Gaps are told apart at so many knots on either axis, from one side to the other ..."""
+FINE_M = 2.0
+"""... which lie densest within about so much of the box."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpacedAgents:
+    """Agents around queries.
+
+    Attributes:
+        features: Features of all agents [M, D].
+        row: Row of each query's agents among them [N, K].
+        pose: Their poses [N, K, 3].
+        size_lw_m: Their boxes [N, K, 2].
+        present: Which of them there are [N, K].
+    """
+
+    features: Tensor
+    row: Tensor
+    pose: Tensor
+    size_lw_m: Tensor
+    present: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class SpacedCells:
+    """What agents say of the cells around them.
+
+    Attributes:
+        query: Whose cells [P].
+        agent: Which of that query's agents says it [P].
+        cell: The cells; their number for none [P, L].
+        keys: What is said [P, L, C].
+    """
+
+    query: Tensor
+    agent: Tensor
+    cell: Tensor
+    keys: Tensor
+
+
+class AgentSpacing(nn.Module):
+    """What agents say of points around them, and what queries make of it."""
+
+    knot: Tensor
+
+    def __init__(self, width: int, spacing_width: int) -> None:
+        super().__init__()
+        self.agent = nn.Linear(width, spacing_width)
+        self.along = nn.Linear(KNOTS, spacing_width, bias=False)
+        self.beside = nn.Linear(KNOTS, spacing_width, bias=False)
+        self.ask = nn.Linear(width, spacing_width)
+        knot = torch.arange(KNOTS, dtype=torch.float32) - KNOTS // 2
+        self.register_buffer("knot", knot, persistent=False)
+
+    def begin_at_zero(self) -> None:
+        """Change no logit until it is trained.
+
+        Agents begin with one bump a feature: ahead of the box or behind it, in its own lane
+        or, for the second half of the features, in those beside.
+        """
+        channels = len(self.along.weight)
+        half = max(channels // 2, 1)
+        ahead = torch.linspace(-KNOTS // 2 + 2, KNOTS // 2 - 2, half)
+        ahead = ahead.repeat(-(-channels // half))[:channels, None]
+        is_beside = (torch.arange(channels) >= half)[:, None]
+        away = torch.where(is_beside, self.knot.abs() - KNOTS / 4, self.knot)
+        with torch.no_grad():
+            self.along.weight.copy_((-(((self.knot - ahead) / 2) ** 2)).exp())
+            self.beside.weight.copy_((-((away / 2) ** 2)).exp())
+            nn.init.zeros_(self.ask.weight)
+            nn.init.zeros_(self.ask.bias)
+
+    def forward(
+        self, features: Tensor, turned_rad: Tensor, size_lw_m: Tensor, away_m: Tensor
+    ) -> Tensor:
+        """Say what agents think of points around them: [P, L, C].
+
+        Args:
+            features: Features of the agents [P, D].
+            turned_rad: Their headings in the frame of the points [P].
+            size_lw_m: Their boxes [P, 2].
+            away_m: The points, less the agents' centres [P, L, 2].
+        """
+        x_m, y_m = away_m.unbind(-1)
+        cos, sin = turned_rad.cos()[:, None], turned_rad.sin()[:, None]
+        half_m = size_lw_m[:, None] / 2
+        along_m = _gap_m(cos * x_m + sin * y_m, half_m[..., 0])
+        beside_m = _gap_m(cos * y_m - sin * x_m, half_m[..., 1])
+        fades = (1 - (x_m**2 + y_m**2) / REACH_M**2).clamp(min=0)
+        said = self.along(self._shares(along_m)) * self.beside(self._shares(beside_m))
+        told: Tensor = said * fades[..., None] * self.agent(features)[:, None]
+        return told
+
+    def asked(self, x: Tensor) -> Tensor:
+        """Return what queries [..., D] make of the features: [..., C]."""
+        asked: Tensor = self.ask(x) * self.ask.out_features**-0.5
+        return asked
+
+    def _shares(self, gap_m: Tensor) -> Tensor:
+        """Share gaps out between the two nearest knots: [..., knot]."""
+        most = np.log1p(REACH_M / FINE_M)
+        at = gap_m.sign() * (gap_m.abs() / FINE_M).log1p() * ((KNOTS // 2) / most)
+        return (1 - (at[..., None] - self.knot).abs()).clamp(min=0)
+
+
+class CellSpacing(AgentSpacing):
+    """What agents say of the cells around them."""
+
+    cell_at: Tensor
+    around: Tensor
+
+    def __init__(self, width: int, spacing_width: int, grid: Grid) -> None:
+        super().__init__(width, spacing_width)
+        self.num_cells = grid.num_cells
+        self.step_m = grid.step_m
+        self.side = len(grid.cell_at)
+        cell_at = np.where(grid.cell_at < 0, grid.num_cells, grid.cell_at)
+        self.register_buffer("cell_at", torch.from_numpy(cell_at), persistent=False)
+        reach = int(np.ceil(REACH_M / grid.step_m))
+        ticks = torch.arange(-reach, reach + 1)
+        around = torch.cartesian_prod(ticks, ticks)  # column, row
+        self.register_buffer("around", around, persistent=False)
+
+    def cells(self, ego_pose: Tensor, agents: SpacedAgents) -> SpacedCells:
+        """Say what the agents around egos [N, 3] think of the cells around them."""
+        last = self.side - 1
+        place_m = grid_place(agents.pose, ego_pose[:, None])
+        at = place_m / self.step_m + last / 2  # column, row
+        reach = REACH_M / self.step_m
+        near = ((at > -reach) & (at < last + reach)).all(dim=-1)
+        query, agent, counts = chosen(agents.present & near)
+        at = at[query, agent]
+        point = at.round().long()[:, None] + self.around  # [P, L, 2]
+        inside = ((point >= 0) & (point <= last)).all(dim=-1)
+        column, row = point.clamp(0, last).unbind(-1)
+        cell = torch.where(inside, self.cell_at[row, column], self.num_cells)
+        away_m = (point - at[:, None]) * self.step_m
+        turned_rad = agents.pose[query, agent, 2] - ego_pose[query, 2] + np.pi / 2
+        features = gather(agents.features, agents.row[query, agent])
+        keys = self(features, turned_rad, agents.size_lw_m[query, agent], away_m)
+        if counts is not None:
+            keys = keys * counts[..., None]
+        return SpacedCells(query, agent, cell, keys)
+
+    def lay_out(self, said: SpacedCells, grid: Tensor, keys_GPC: Tensor) -> None:
+        """Add what agents say to what is said of the cells of grids, in place.
+
+        Args:
+            said: What they say.
+            grid: Grid of each query [N].
+            keys_GPC: Of all grids.
+        """
+        cells = self.num_cells
+        keys = said.keys * (said.cell < cells)[..., None]
+        at = grid[said.query][:, None] * cells + said.cell.clamp(max=cells - 1)
+        flat = keys_GPC.flatten(0, 1)
+        flat.index_add_(0, at.flatten(), keys.flatten(0, 1).to(flat.dtype))
+
+    def choose(self, x_NSD: Tensor, keys_NPC: Tensor) -> Tensor:
+        """Say how much queries are for each cell: logits [N, S, cell]."""
+        logits: Tensor = self.asked(x_NSD) @ keys_NPC.mT
+        return logits
+
+    def choose_each(self, x_NSD: Tensor, said: SpacedCells, turn_NK: Tensor) -> Tensor:
+        """Do the same where each slot sees those inserted in turns before it.
+
+        Args:
+            x_NSD: Queries.
+            said: What agents say.
+            turn_NK: Turn in which each agent was inserted, negative if it was before.
+        """
+        queries, slots, _ = x_NSD.shape
+        asked = self.asked(x_NSD)[said.query]  # [P, S, C]
+        slot = torch.arange(slots, device=x_NSD.device)
+        seen = turn_NK[said.query, said.agent][:, None] < slot
+        told = (asked @ said.keys.mT) * seen[..., None]  # [P, S, L]
+        at = (said.query[:, None] * slots + slot) * (self.num_cells + 1)
+        at = at[..., None] + said.cell[:, None]
+        logits = told.new_zeros(queries * slots * (self.num_cells + 1))
+        logits = logits.index_add(0, at.flatten(), told.flatten())
+        return logits.view(queries, slots, -1)[..., :-1]
+
+
+class OffsetSpacing(AgentSpacing):
+    """What agents say of the offset bins of a cell beside them."""
+
+    offset_m: Tensor
+
+    def __init__(self, width: int, spacing_width: int, grid: Grid) -> None:
+        super().__init__(width, spacing_width)
+        offset_m = torch.from_numpy(grid.offset_m.copy())
+        self.register_buffer("offset_m", offset_m, persistent=False)
+
+    def choose(self, x_ND: Tensor, pose: Tensor, agents: SpacedAgents) -> Tensor:
+        """Say how much queries at poses [N, 3] are for each bin: logits [N, offset]."""
+        query, agent, counts = chosen(agents.present)
+        place_m = grid_place(agents.pose, pose[:, None])[query, agent]
+        turned_rad = agents.pose[query, agent, 2] - pose[query, 2] + np.pi / 2
+        features = gather(agents.features, agents.row[query, agent])
+        away_m = self.offset_m - place_m[:, None]
+        keys = self(features, turned_rad, agents.size_lw_m[query, agent], away_m)
+        told = (keys @ self.asked(x_ND)[query][..., None])[..., 0]
+        if counts is not None:
+            told = told * counts
+        return told.new_zeros((len(x_ND), told.shape[1])).index_add(0, query, told)
+
+
+def _gap_m(apart_m: Tensor, half_m: Tensor) -> Tensor:
+    """How far points are beyond either end of a box, on one axis; 0 within it."""
+    return apart_m - torch.maximum(torch.minimum(apart_m, half_m), -half_m)
