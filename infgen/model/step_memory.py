@@ -159,8 +159,8 @@ class Insertions:
         roads: Map tokens around the ego.
         cell_features: Features of the cells around it, if they are used
             [rollout, cell, C].
-        spacing: What the agents so far say of them by the gaps between, if that is used
-            [rollout, cell, C].
+        spacing: What the agents so far say of them, and of no cell, by the gaps between, if
+            that is used [rollout, cell + 1, C].
         all_active: Whether every rollout of the batch goes on, each once.
     """
 

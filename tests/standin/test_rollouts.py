@@ -5,7 +5,9 @@ The most kernels and waits of one token step of three rollouts; to be lowered, n
 of them; without these there were 645, 3,008 and 3,150. Offset tokens, which they have since
 2026-11-25, launch 78; without these there were 3,202 and 3,344. Removal features,
 which they have since 2026-11-27, launch 44; without these there were 721, 3,280 and 3,422.
-With two passes of insertion, as measured until 2026-11-28, there were 3,324 and 3,466.)
+With two passes of insertion, as measured until 2026-11-28, there were 3,324 and 3,466.
+Gaps to other agents, which they have since that day, launch 189; without these there were
+2,374 and 2,472.)
 A pass of insertion launches all its kernels, also for rollouts that are done: it could be
 captured as a graph, and so is one launch and one wait.
 """
@@ -14,8 +16,8 @@ import pytest
 
 MOST = {
     ("motion-only", "mask"): (765, 1),
-    ("long", "mask"): (2374, 2),
-    ("long", "rules"): (2472, 7),
+    ("long", "mask"): (2563, 2),
+    ("long", "rules"): (2661, 7),
 }
 
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from infgen.model.insertion.cell_features import chosen
-from infgen.model.layers import gather
+from infgen.model.layers import full_precision, gather
 from infgen.model.neighbours import grid_place
 from infgen.tokens.grid import Grid
 
@@ -108,15 +108,15 @@ class AgentSpacing(nn.Module):
             size_lw_m: Their boxes [P, 2].
             away_m: The points, less the agents' centres [P, L, 2].
         """
-        x_m, y_m = away_m.unbind(-1)
-        cos, sin = turned_rad.cos()[:, None], turned_rad.sin()[:, None]
-        half_m = size_lw_m[:, None] / 2
-        along_m = _gap_m(cos * x_m + sin * y_m, half_m[..., 0])
-        beside_m = _gap_m(cos * y_m - sin * x_m, half_m[..., 1])
-        fades = (1 - (x_m**2 + y_m**2) / REACH_M**2).clamp(min=0)
-        said = self.along(self._shares(along_m)) * self.beside(self._shares(beside_m))
-        told: Tensor = said * fades[..., None] * self.agent(features)[:, None]
-        return told
+        cos, sin = turned_rad.cos(), turned_rad.sin()
+        turn = torch.stack([cos, -sin, sin, cos], dim=-1).view(-1, 2, 2)
+        with full_precision(away_m):
+            apart_m, half_m = away_m @ turn, (size_lw_m / 2)[:, None]
+        gap_m = apart_m - apart_m.clamp(-half_m, half_m)  # 0 within the box.
+        along, beside = self._shares(gap_m).unbind(-2)
+        fades = (1 - away_m.square().sum(dim=-1, keepdim=True) / REACH_M**2).clamp(min=0)
+        told: Tensor = self.along(along) * self.beside(beside)
+        return told * fades * self.agent(features)[:, None]
 
     def asked(self, x: Tensor) -> Tensor:
         """Return what queries [..., D] make of the features: [..., C]."""
@@ -126,7 +126,7 @@ class AgentSpacing(nn.Module):
     def _shares(self, gap_m: Tensor) -> Tensor:
         """Share gaps out between the two nearest knots: [..., knot]."""
         most = np.log1p(REACH_M / FINE_M)
-        at = gap_m.sign() * (gap_m.abs() / FINE_M).log1p() * ((KNOTS // 2) / most)
+        at = (gap_m.abs() / FINE_M).log1p().copysign(gap_m) * ((KNOTS // 2) / most)
         return (1 - (at[..., None] - self.knot).abs()).clamp(min=0)
 
 
@@ -144,49 +144,71 @@ class CellSpacing(AgentSpacing):
         cell_at = np.where(grid.cell_at < 0, grid.num_cells, grid.cell_at)
         self.register_buffer("cell_at", torch.from_numpy(cell_at), persistent=False)
         reach = int(np.ceil(REACH_M / grid.step_m))
-        ticks = torch.arange(-reach, reach + 1)
+        ticks = torch.arange(-reach, reach + 1, dtype=torch.float32)
         around = torch.cartesian_prod(ticks, ticks)  # column, row
         self.register_buffer("around", around, persistent=False)
 
     def cells(self, ego_pose: Tensor, agents: SpacedAgents) -> SpacedCells:
         """Say what the agents around egos [N, 3] think of the cells around them."""
-        last = self.side - 1
+        reach_m = REACH_M + self.step_m * self.side / 2
         place_m = grid_place(agents.pose, ego_pose[:, None])
-        at = place_m / self.step_m + last / 2  # column, row
-        reach = REACH_M / self.step_m
-        near = ((at > -reach) & (at < last + reach)).all(dim=-1)
+        near = (place_m.abs() < reach_m).all(dim=-1)
         query, agent, counts = chosen(agents.present & near)
-        at = at[query, agent]
-        point = at.round().long()[:, None] + self.around  # [P, L, 2]
-        inside = ((point >= 0) & (point <= last)).all(dim=-1)
-        column, row = point.clamp(0, last).unbind(-1)
-        cell = torch.where(inside, self.cell_at[row, column], self.num_cells)
-        away_m = (point - at[:, None]) * self.step_m
-        turned_rad = agents.pose[query, agent, 2] - ego_pose[query, 2] + np.pi / 2
-        features = gather(agents.features, agents.row[query, agent])
-        keys = self(features, turned_rad, agents.size_lw_m[query, agent], away_m)
-        if counts is not None:
-            keys = keys * counts[..., None]
+        cell, keys = self.around_each(
+            ego_pose[query],
+            gather(agents.features, agents.row[query, agent]),
+            agents.pose[query, agent],
+            agents.size_lw_m[query, agent],
+        )
+        keys = keys if counts is None else keys * counts[..., None]
         return SpacedCells(query, agent, cell, keys)
 
-    def lay_out(self, said: SpacedCells, grid: Tensor, keys_GPC: Tensor) -> None:
+    def around_each(
+        self, ego_pose: Tensor, features: Tensor, pose: Tensor, size_lw_m: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Say what each agent thinks of the cells around it.
+
+        Args:
+            ego_pose: Pose of its ego [P, 3].
+            features: Features of the agents [P, D].
+            pose: Their poses [P, 3].
+            size_lw_m: Their boxes [P, 2].
+
+        Returns:
+            The cells, their number for none [P, L], and what is said of them [P, L, C].
+        """
+        last = self.side - 1
+        at = grid_place(pose, ego_pose) / self.step_m + last / 2  # column, row
+        point = at.round()[:, None] + self.around  # [P, L, 2]
+        on_lattice = point.clamp(0, last)
+        inside = (point == on_lattice).all(dim=-1)
+        column, row = on_lattice.long().unbind(-1)
+        cell = torch.where(inside, self.cell_at[row, column], self.num_cells)
+        away_m = (point - at[:, None]) * self.step_m
+        turned_rad = pose[:, 2] - ego_pose[:, 2] + np.pi / 2
+        return cell, self(features, turned_rad, size_lw_m, away_m)
+
+    def lay_out(self, grid: Tensor, cell: Tensor, keys: Tensor, laid: Tensor) -> None:
         """Add what agents say to what is said of the cells of grids, in place.
 
         Args:
-            said: What they say.
-            grid: Grid of each query [N].
-            keys_GPC: Of all grids.
+            grid: Number of each agent's grid [P].
+            cell: Cells [P, L] ...
+            keys: ... and what is said of them [P, L, C].
+            laid: What is said so far, of all grids [grid, cell + 1, C]: none is a cell too.
         """
-        cells = self.num_cells
-        keys = said.keys * (said.cell < cells)[..., None]
-        at = grid[said.query][:, None] * cells + said.cell.clamp(max=cells - 1)
-        flat = keys_GPC.flatten(0, 1)
-        flat.index_add_(0, at.flatten(), keys.flatten(0, 1).to(flat.dtype))
+        at = grid[:, None] * laid.shape[1] + cell
+        laid.flatten(0, 1).index_add_(0, at.flatten(), keys.flatten(0, 1).to(laid.dtype))
 
     def choose(self, x_NSD: Tensor, keys_NPC: Tensor) -> Tensor:
-        """Say how much queries are for each cell: logits [N, S, cell]."""
+        """Say how much queries are for each cell: logits [N, S, cell].
+
+        Args:
+            x_NSD: Queries.
+            keys_NPC: What is laid out for each.
+        """
         logits: Tensor = self.asked(x_NSD) @ keys_NPC.mT
-        return logits
+        return logits[..., : self.num_cells]
 
     def choose_each(self, x_NSD: Tensor, said: SpacedCells, turn_NK: Tensor) -> Tensor:
         """Do the same where each slot sees those inserted in turns before it.
@@ -230,8 +252,3 @@ class OffsetSpacing(AgentSpacing):
         if counts is not None:
             told = told * counts
         return told.new_zeros((len(x_ND), told.shape[1])).index_add(0, query, told)
-
-
-def _gap_m(apart_m: Tensor, half_m: Tensor) -> Tensor:
-    """How far points are beyond either end of a box, on one axis; 0 within it."""
-    return apart_m - torch.maximum(torch.minimum(apart_m, half_m), -half_m)

@@ -150,10 +150,8 @@ class InsertionStepper:
         related = reach.describe(fresh.pack(ego_pose), pose[:, None]).values[:, 0]
         agents = agent_rows(*before, standing, token_step, fresh)
         embedded = normed(self._embed(agents))
-        each = torch.arange(len(pose), device=pose.device)[:, None]
-        size_lw_m = agents.size_lwh_m[:, None, :2]
-        alone = SpacedAgents(embedded, each, pose[:, None], size_lw_m, some[:, None])
-        self._add_spacing(entries, token_step, alone, fresh.at)
+        if entries.spacing is not None:
+            self._add_spacing(entries.spacing, token_step, agents, embedded, fresh.at, real)
         embedded = turned(embedded, reach.relation.turn(pose))
         within = came & within_radius(ego_pose, token_step.pose, reach.radius_m)
         for kept, new in ((entries.raw, embedded), (entries.relation, related)):
@@ -256,21 +254,32 @@ class InsertionStepper:
         return described
 
     def _no_spacing(self, rollouts: int, like: Tensor) -> Tensor | None:
-        """Say nothing of the cells yet [rollout, cell, C], if agents do."""
+        """Say nothing of the cells yet [rollout, cell + 1, C], if agents do."""
         spacing, cells = self._asked().cells.spacing, self._asked().cells.num_cells
         if spacing is None:
             return None
-        return like.new_zeros((rollouts, cells, spacing.agent.out_features))
+        return like.new_zeros((rollouts, cells + 1, spacing.agent.out_features))
 
     def _add_spacing(
-        self, entries: Insertions, token_step: TokenStep, agents: SpacedAgents, at: Tensor
+        self,
+        laid: Tensor,
+        token_step: TokenStep,
+        agents: AgentRows,
+        features: Tensor,
+        at: Tensor,
+        real: Tensor | None,
     ) -> None:
         """Add what agents in the rows ``at`` say of the cells, in place."""
-        spacing = self._asked().cells.spacing
-        if spacing is not None and entries.spacing is not None:
-            rollout = at // token_step.presence.shape[1]
-            said = spacing.cells(token_step.pose[:, EGO][rollout], agents)
-            spacing.lay_out(said, rollout, entries.spacing)
+        spacing, rollout = self._asked().cells.spacing, at // token_step.presence.shape[1]
+        assert spacing is not None
+        cell, keys = spacing.around_each(
+            token_step.pose[:, EGO][rollout],
+            features,
+            agents.pose,
+            agents.size_lwh_m[:, :2],
+        )
+        keys = keys if real is None else keys * real[:, None, None]
+        spacing.lay_out(rollout, cell, keys, laid)
 
     def _raw(self, entries: Insertions) -> Tensor:
         """Embeddings of all rows [row, D], not turned."""

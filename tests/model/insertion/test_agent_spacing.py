@@ -57,10 +57,10 @@ def around(*places_m, heading_rad=0.3, ego_pose=EGO, size_lw_m=(4.8, 2.0)):
 def logits_of(spacing, agents, x=None, ego_pose=EGO):
     """Logits of cells for one query that sees all agents [cell]."""
     x = torch.ones((1, 1, WIDTH)) if x is None else x
-    keys = torch.zeros((1, spacing.num_cells, SPACING))
+    laid = torch.zeros((1, spacing.num_cells + 1, SPACING))
     said = spacing.cells(ego_pose, agents)
-    spacing.lay_out(said, torch.zeros(1, dtype=torch.int64), keys)
-    return spacing.choose(x, keys)[0, 0]
+    spacing.lay_out(said.query, said.cell, said.keys, laid)
+    return spacing.choose(x, laid)[0, 0]
 
 
 def test_a_gap_begins_at_the_end_of_the_box():
