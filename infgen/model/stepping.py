@@ -28,7 +28,7 @@ from infgen.model.agents import AgentContext, AgentRows
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import MapTokens
 from infgen.model.features.removal import EgoPlace
-from infgen.model.insertion.stepper import InsertionStepper, agent_rows
+from infgen.model.insertion_stepping import InsertionStepper, agent_rows
 from infgen.model.layers import AttentionSources, full_precision, normed
 from infgen.model.long_memory import Density, count_around, standing_after
 from infgen.model.map_grid import MapGrid

@@ -14,7 +14,7 @@ from torch import Tensor
 from infgen.model.agents import KINDS
 from infgen.model.batching.batch import Agents, Batch, Details, Insertions, collate_maps
 from infgen.model.batching.insertion_targets import OUTSIDE
-from infgen.model.insertion import InsertionDetails
+from infgen.model.insertion.detail_query import InsertionDetails
 from infgen.model.logits import DetailOutputs, InsertionOutputs, MotionOutputs
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import MotionStep, PositionOutputs, TokenStep

@@ -282,6 +282,7 @@ def test_who_has_to_steer_does_not_stop_for_it(drive, start, simulator):
     assert (plain != kept).any(axis=(1, 2, 3)).sum() > 30
 
 
+@pytest.mark.slow
 def test_who_can_stay_on_the_road_only_by_running_into_others_leaves_it(
     parked, start, simulator
 ):

@@ -160,6 +160,7 @@ def test_a_rollout_counts_until_its_ego_leaves_the_map(inputs, drive, tmp_path, 
     assert report["logged"]["tokens"] == 2 * 4
 
 
+@pytest.mark.slow
 def test_a_higher_bias_lets_more_in(inputs, tmp_path, quiet):
     units = stage.plan(inputs, with_reach(4.0))
     least, most = (

@@ -141,6 +141,7 @@ def test_the_mode_of_the_network_and_the_batch_are_kept(new_network, logged):
     assert all(torch.equal(now, then) for (_, now), then in pairs)
 
 
+@pytest.mark.slow
 def test_networks_of_all_kinds_can_be_simulated(variant, new_network, logged):
     found = simulate_rollouts(new_network(variant), logged, COUNT, TOP_P, 0)
 
