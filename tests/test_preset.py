@@ -200,7 +200,7 @@ def test_a_dry_run_says_what_is_left_to_make(desk, capsys):
 
 
 def test_a_dry_run_plans_policy_gradient_before_the_weights_it_starts_from(desk, capsys):
-    arms = ("--arms", "policy-gradient-3", "--seeds", "1")
+    arms = ("--arms", "infgen", "--seeds", "1")
     capsys.readouterr()
 
     preset = ("--preset", "womd-mini-fine-tuned", *arms)
@@ -208,7 +208,7 @@ def test_a_dry_run_plans_policy_gradient_before_the_weights_it_starts_from(desk,
 
     assert code == 0
     runs = json.loads(capsys.readouterr().out)["runs"]
-    assert {run["note"] for run in runs if "policy-gradient-3" in run["run"]} == {
+    assert {run["note"] for run in runs if "infgen" in run["run"]} == {
         "after policy-gradient-2"
     }
 

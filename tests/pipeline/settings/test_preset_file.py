@@ -301,8 +301,7 @@ def test_the_packaged_presets_compare_all_methods_of_the_paper_and_all_ablations
             assert radius == (arm.published != "InfGen")
         assert preset.arms["catk"].starts_from == "smart"
     tuned = file.preset("womd-mini-fine-tuned")
-    assert tuned.arms["infgen"].starts_from is None
-    assert tuned.arms["policy-gradient-3"].starts_from == "policy-gradient-2"
+    assert tuned.arms["infgen"].starts_from == "policy-gradient-2"
     assert tuned.arms["policy-gradient-2"].starts_from == "policy-gradient"
     assert tuned.arms["policy-gradient"].starts_from == "closed-loop"
     assert file.preset("womd-mini").towns == tuned.towns == {}
