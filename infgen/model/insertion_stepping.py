@@ -56,7 +56,7 @@ class InsertionBlocks:
 
 
 class InsertionStepper:
-    """A network in evaluation mode, asked for the insertions of one token step at a time.
+    """A network in evaluation mode, queried for the insertions of one token step at a time.
 
     Without insertion, its ``entry_`` methods raise ``ValueError``.
     """
@@ -97,7 +97,7 @@ class InsertionStepper:
             memory.scene,
         )
         within = torch.zeros_like(token_step.observed)
-        nobody = replace(
+        empty_step = replace(
             token_step, presence=torch.zeros_like(token_step.presence), observed=within
         )
         before, known = memory.last()
@@ -110,7 +110,7 @@ class InsertionStepper:
             known=known,
             average=memory.average,
             standing=memory.standing,
-            token_step=nobody,
+            token_step=empty_step,
             raw=raw,
             relation=raw.new_zeros(
                 (rollouts, places, self.network.settings.relation_features)

@@ -100,7 +100,7 @@ class AgentSpacing(nn.Module):
     def forward(
         self, features: Tensor, turned_rad: Tensor, size_lw_m: Tensor, away_m: Tensor
     ) -> Tensor:
-        """Say what agents think of points around them: [P, L, C].
+        """Describe points around agents: [P, L, C].
 
         Args:
             features: Features of the agents [P, D].
@@ -149,7 +149,7 @@ class CellSpacing(AgentSpacing):
         self.register_buffer("around", around, persistent=False)
 
     def cells(self, ego_pose: Tensor, agents: SpacedAgents) -> SpacedCells:
-        """Say what the agents around egos [N, 3] think of the cells around them."""
+        """Describe the cells around the agents around egos [N, 3]."""
         reach_m = REACH_M + self.step_m * self.side / 2
         place_m = grid_place(agents.pose, ego_pose[:, None])
         near = (place_m.abs() < reach_m).all(dim=-1)
@@ -166,7 +166,7 @@ class CellSpacing(AgentSpacing):
     def around_each(
         self, ego_pose: Tensor, features: Tensor, pose: Tensor, size_lw_m: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Say what each agent thinks of the cells around it.
+        """Describe the cells around each agent.
 
         Args:
             ego_pose: Pose of its ego [P, 3].
