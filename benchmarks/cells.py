@@ -22,7 +22,7 @@ from jaxtyping import Float32, Float64, Int64
 from logged_scenes import sum_over_logs, whole
 from torch import Tensor
 
-from infgen.model.agents import KINDS
+from infgen.model.agent_embedding import KINDS
 from infgen.model.batching.batch import Batch
 from infgen.model.network import Network
 from infgen.tokens.scene_tokens import SceneTokens

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from infgen.model.agents import AgentRows
+from infgen.model.agent_embedding import AgentRows
 from infgen.model.insertion.agent_spacing import SpacedAgents
 from infgen.model.insertion.cell_features import CellSources
 from infgen.model.insertion.cell_query import CellStack

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from infgen.model.batching.batch import MapTokens
 from infgen.model.device.index import MapIndex
+from infgen.model.features.edge_clearance import EdgeTokens
 from infgen.model.features.signals import StopLines
 from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.map_grid import MapGrid
@@ -54,6 +55,7 @@ class MapEncoder(nn.Module):
         self.radius_m = settings.map_map_radius_m
         self.signals_each_step = settings.signals_each_step
         self.stop_lines = settings.signal_ahead_m > 0
+        self.edges = settings.edge_clearance_width > 0
         self.neighbours = settings.map_map_neighbours
         curve_m = torch.from_numpy(vocabulary.curve_m.copy())
         self.register_buffer("curve_m", curve_m, persistent=False)
@@ -132,6 +134,9 @@ class MapEncoder(nn.Module):
         lines = None
         if self.stop_lines:
             lines = StopLines.of(roads) if index is None else index.lines
+        edges = None
+        if self.edges:
+            edges = EdgeTokens.of(roads) if index is None else index.edges
         return MapFeatures(
             rows,
             features,
@@ -141,6 +146,7 @@ class MapEncoder(nn.Module):
             grid,
             signal_states,
             lines,
+            edges,
         )
 
     def predict_hidden(

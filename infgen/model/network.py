@@ -5,11 +5,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from infgen.clock import CLOCK
-from infgen.model.agents import AgentContext, AgentEmbedding, AgentRows, MotionStack
+from infgen.model.agent_embedding import AgentEmbedding, AgentRows
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.device.index import BatchIndex
 from infgen.model.device.together import launched_together
+from infgen.model.features.anchors import AnchorHead
 from infgen.model.features.approach import ApproachFeatures
 from infgen.model.features.removal import EgoPlace, RemovalFeatures
 from infgen.model.insertion.agent_spacing import AgentSpacing
@@ -32,6 +33,7 @@ from infgen.model.long_memory import (
     standing_at,
 )
 from infgen.model.map import MapEncoder
+from infgen.model.motion_stack import AgentContext, MotionStack
 from infgen.model.neighbours import MapFeatures, find_map_neighbours, find_others
 from infgen.model.relations import Rows, describe_pairs
 from infgen.model.rotary.turns import turned
@@ -42,8 +44,9 @@ from infgen.tokens.settings import TokenSettings
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 AgentFeatures = DensityFeatures | StandingFeatures | RemovalFeatures | ApproachFeatures
+MotionParts = AgentFeatures | AnchorHead
 CellParts = OffsetEmbedding | OffsetFeatures | CellRefinement | AgentSpacing
-AddedPart = AgentFeatures | CellParts | LatentRates
+AddedPart = MotionParts | CellParts | LatentRates
 """Parts that may be added to trained weights."""
 
 
@@ -200,6 +203,7 @@ class Network(nn.Module):
         _, tokens, places = agents.visible.shape
         reach, token = self.motion.map_reach(), rows.at // places % tokens
         around = find_others(self.motion.agents_reach(), by_token, pose, visible)
+        moving = self.motion.moving(given, around)
         of_row = rows.at // agents.visible[0].numel()
         sight = AgentContext(
             past_relation,
@@ -209,7 +213,9 @@ class Network(nn.Module):
                 reach, by_scene, agents.pose.flatten(1, 2), roads, scene, token
             ),
             around,
-            self.motion.added(given, around, roads, of_row, token),
+            moving,
+            self.motion.edges_near(given, roads, of_row),
+            self.motion.added(given.pose, moving, roads, of_row, token),
             None if density is None else density.take(rows.at // visible.shape[1]),
             _ego_place(agents, rows) if self.motion.ego_place is not None else None,
         )

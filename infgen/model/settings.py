@@ -125,6 +125,11 @@ class ModelSettings:
     approach_features: Bool = False
     """Whether agents know how others around them move relative to themselves, pair by pair,
     and when and how near they would meet: attention only adds up places and motions."""
+    clearance_width: Count = 0
+    """Width of what agents make of the clearance of each motion token: the gaps to others
+    that it would leave over 2 s if all went on as they move; 0 for none."""
+    edge_clearance_width: Count = 0
+    """The same for how far each motion token leads over road edges within 1 s."""
     signal_ahead_m: NonNegative = 0.0
     """Every agent sees the signal of its own lane up to so far ahead, and how long it has
     shown that; 0 to see it only among all other map tokens."""

@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from infgen.model.agents import AgentContext, AgentRows
+from infgen.model.agent_embedding import AgentRows
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import MapTokens
 from infgen.model.features.removal import EgoPlace
@@ -32,6 +32,7 @@ from infgen.model.insertion_stepping import InsertionStepper, agent_rows
 from infgen.model.layers import AttentionSources, full_precision, normed
 from infgen.model.long_memory import Density, count_around, standing_after
 from infgen.model.map_grid import MapGrid
+from infgen.model.motion_stack import AgentContext
 from infgen.model.neighbours import (
     MapFeatures,
     find_map_neighbours,
@@ -155,7 +156,9 @@ class Stepper(InsertionStepper):
         around = find_others(self._agents_reach, rows, token_step.pose, visible)
         pose, rollout = agents.pose, rows.at // visible.shape[1]
         scene, token = memory.scene[rollout], memory.columns - memory.begun[rollout]
-        added = self.network.motion.added(agents, around, memory.roads, scene, token)
+        moving = self.network.motion.moving(agents, around)
+        edges = self.network.motion.edges_near(agents, memory.roads, scene)
+        added = self.network.motion.added(pose, moving, memory.roads, scene, token)
         roads = find_map_neighbours(
             self._map_reach, rows, token_step.pose, memory.roads, memory.scene, token
         )
@@ -180,5 +183,14 @@ class Stepper(InsertionStepper):
                 agents.known,
             )
         return AgentContext(
-            Shared.of(related), past, turn, roads, around, added, density, ego_place
+            Shared.of(related),
+            past,
+            turn,
+            roads,
+            around,
+            moving,
+            edges,
+            added,
+            density,
+            ego_place,
         )

@@ -113,7 +113,12 @@ def test_untrained_features_change_no_logit(tiny, new_network, batch):
         *("density_features", "standing_features"),
         *("removal_features", "approach_features", "latent_rates"),
     )
-    widths = {"cell_refinement_width": 8, "agent_spacing_width": 4}
+    widths = {
+        "cell_refinement_width": 8,
+        "agent_spacing_width": 4,
+        "clearance_width": 8,
+        "edge_clearance_width": 8,
+    }
     every = replace(tiny, **widths, **dict.fromkeys(features, True))
     network = new_network(every).eval()
     network.load_state_dict(plain.state_dict(), strict=False)
@@ -122,7 +127,7 @@ def test_untrained_features_change_no_logit(tiny, new_network, batch):
 
     one, two = plain(batch), network(batch)
 
-    assert len(network.added_parts()) == 8
+    assert len(network.added_parts()) == 10
     assert torch.equal(one.motion.motion_logits, two.motion.motion_logits)
     assert torch.equal(one.motion.remove_logit, two.motion.remove_logit)
     assert torch.equal(one.entries.add_logit, two.entries.add_logit)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from infgen.model.agents import KINDS
+from infgen.model.agent_embedding import KINDS
 from infgen.model.batching.batch import Agents, Batch, Details, Insertions, collate_maps
 from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.insertion.detail_query import InsertionDetails

@@ -12,6 +12,7 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from infgen.model.batching.batch import Batch, MapTokens
+from infgen.model.features.edge_clearance import EdgeTokens
 from infgen.model.features.signals import StopLines
 from infgen.model.map_grid import MapGrid
 from infgen.model.relations import Rows
@@ -31,6 +32,7 @@ class MapIndex:
         before: ... and the row of the one before each.
         lit: Rows of the map tokens with a traffic light.
         lines: Stop lines.
+        edges: Road edges.
     """
 
     rows: Rows
@@ -39,12 +41,15 @@ class MapIndex:
     before: Int64[Tensor, " prediction"]
     lit: Int64[Tensor, " lit"]
     lines: StopLines
+    edges: EdgeTokens
 
     @classmethod
     def of(cls, roads: MapTokens) -> "MapIndex":
         """Find the places of some maps."""
         rows, grid = Rows.where(roads.real), MapGrid.of(roads.pose, roads.real)
-        grid.measure(MOST_SQUARES)
+        edges = EdgeTokens.of(roads)
+        for each in (grid, edges.grid):
+            each.measure(MOST_SQUARES)
         wanted = roads.predicted
         before = rows.number.roll(1, dims=1)
         return cls(
@@ -54,6 +59,7 @@ class MapIndex:
             before=before[wanted],
             lit=rows.pack(roads.light).nonzero()[:, 0],
             lines=StopLines.of(roads),
+            edges=edges,
         )
 
 

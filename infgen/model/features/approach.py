@@ -34,7 +34,8 @@ class MovingPairs:
 
     Attributes:
         pose: Poses.
-        step_m: Displacements in the last token step; zero where they are not known.
+        step_m: Displacements in the last token step; zero where they are not known ...
+        known: ... and where they are.
         size_lw_m: Boxes.
         index: Rows of the agents around each ...
         present: ... and which of them there are.
@@ -42,6 +43,7 @@ class MovingPairs:
 
     pose: Float32[Tensor, "row 3"]
     step_m: Float32[Tensor, "row 2"]
+    known: Bool[Tensor, " row"]
     size_lw_m: Float32[Tensor, "row 2"]
     index: Int64[Tensor, "row neighbour"]
     present: Bool[Tensor, "row neighbour"]

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor, nn
 
-from infgen.model.agents import KINDS
+from infgen.model.agent_embedding import KINDS
 from infgen.model.insertion.agent_spacing import OffsetSpacing, SpacedAgents
 from infgen.model.insertion.cell_features import CellSources
 from infgen.model.insertion.detail_features import (

@@ -31,6 +31,7 @@ def pairs(*agents, present=True):
     return MovingPairs(
         pose,
         torch.tensor([each[3:] for each in agents]),
+        torch.ones(count, dtype=torch.bool),
         torch.tensor([4.0, 2.0]).expand(count, 2),
         others,
         (others != torch.arange(count)[:, None]) & present,

@@ -124,7 +124,10 @@ FEATURES = (
     *("density_features", "standing_features", "removal_features"),
     *("approach_features", "offset_token", "latent_rates"),
 )
-WIDTHS = ("cell_refinement_width", "agent_spacing_width")
+WIDTHS = (
+    *("cell_refinement_width", "agent_spacing_width"),
+    *("clearance_width", "edge_clearance_width"),
+)
 ADDED = {**dict.fromkeys(FEATURES, True), **dict.fromkeys(WIDTHS, 8)}
 NONE_ADDED = {**dict.fromkeys(FEATURES, False), **dict.fromkeys(WIDTHS, 0)}
 
@@ -142,7 +145,7 @@ def test_added_parts_may_be_missing_in_weights_to_begin_with(tmp_path):
 
     found, own = dict(network.named_parameters()), dict(plain.named_parameters())
     parts = tuple(network.added_parts())
-    assert len(parts) == 11
+    assert len(parts) == 13
     added = found.keys() - own.keys()
     assert added
     assert all(name.startswith(parts) for name in added)
