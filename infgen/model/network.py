@@ -8,6 +8,7 @@ from infgen.clock import CLOCK
 from infgen.model.agent_embedding import AgentEmbedding, AgentRows
 from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.batching.batch import Agents, Batch
+from infgen.model.batching.steps import poses_before
 from infgen.model.device.index import BatchIndex
 from infgen.model.device.together import launched_together
 from infgen.model.features.anchors import AnchorHead
@@ -249,22 +250,14 @@ class Network(nn.Module):
 
 def _standing(agents: Agents) -> Standing:
     """For how long all agents have stood [scene, token, agent]."""
-    before, known = _before(agents)
+    before, known = poses_before(agents)
     moves = moves_between(before, known, agents.pose, agents.presence)
     return standing_at(agents.presence, moves & agents.visible)
 
 
-def _before(agents: Agents) -> tuple[Tensor, Tensor]:
-    """Poses one token step earlier, and whether agents were seen there."""
-    pose, visible = agents.pose, agents.visible
-    known = torch.zeros_like(visible)
-    known[:, 1:] = visible[:, :-1]
-    return torch.cat([pose[:, :1], pose[:, :-1]], dim=1), known
-
-
 def _ego_place(agents: Agents, rows: Rows) -> EgoPlace:
     """Where all visible agents are to their ego."""
-    before, known = _before(agents)
+    before, known = poses_before(agents)
     known = known & (agents.presence != int(Presence.INSERTED))
     ego = rows.at // agents.visible.shape[2]
     return EgoPlace(
@@ -278,7 +271,7 @@ def _ego_place(agents: Agents, rows: Rows) -> EgoPlace:
 
 def _agent_rows(agents: Agents, rows: Rows, standing: Standing | None) -> AgentRows:
     """All visible agents, with where they were one token step earlier."""
-    before, known = _before(agents)
+    before, known = poses_before(agents)
     pose, visible = agents.pose, agents.visible
     tokens = pose.shape[1]
     return AgentRows(

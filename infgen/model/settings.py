@@ -95,9 +95,10 @@ class ModelSettings:
     needs `cell_feature_width` and `position_token`, without which there is none."""
     agent_spacing_width: Count = 0
     """Width of what agents say of the cells, and the offset bins, around them by the gaps
-    to their boxes: how far inserted agents keep from those there, and from each other; 0
-    for none. It does not change whether agents are inserted, and needs `position_token`
-    for cells and `offset_token` for offset bins."""
+    to their boxes and the ways that they cover within a second: how far inserted agents
+    keep from those there, and from each other; 0 for none. It does not change whether
+    agents are inserted, and needs `position_token` for cells and `offset_token` for offset
+    bins."""
     motion_feature_width: Count = 0
     """Width of features of where each motion token leads, from which its logit is computed;
     0 for one logit per token, each learned alone, as in the paper."""

@@ -14,6 +14,7 @@ from infgen.model.neighbours import MapFeatures
 from infgen.model.rotary.turns import multiples, turn_of, turned
 from infgen.model.settings import ModelSettings
 from infgen.model.token_step import TokenStep
+from infgen.tokens.scene_tokens import Presence
 
 
 @dataclass(slots=True)
@@ -197,6 +198,11 @@ class Insertions:
         rows = self.within.shape[1]
         row = torch.arange(rows, device=self.rollout.device)
         return self.rollout[:, None] * rows + row
+
+    def step_m(self) -> Tensor:
+        """Displacements in the last token step [rollout, row, 2]; zero if not known."""
+        known = self.known & (self.token_step.presence != int(Presence.INSERTED))
+        return (self.token_step.pose - self.before)[..., :2] * known[..., None]
 
     def agents(self) -> AttentionSources:
         """Show every ego that goes on the agents around it."""

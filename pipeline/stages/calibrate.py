@@ -255,7 +255,7 @@ def _rates(counts: "FlowCounts") -> dict[str, float | None]:
 
 STAGE = Stage(
     name="calibrate",
-    version=10,
+    version=11,
     settings={
         "tokenize": TokenSettings,
         "rollout": RolloutSettings,

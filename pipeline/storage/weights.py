@@ -24,6 +24,7 @@ from pipeline.storage.initial_weights import DESCRIPTION, WEIGHTS
 
 SCHEMA = "infgen.model/2"
 MAX_NAMED = 3
+MAX_SETTINGS = 16
 MAX_SAID = 300
 _REQUIRED = ("model", "tokenize", "vocabulary", "weights")
 
@@ -175,6 +176,9 @@ def _differing_settings(about: Mapping[str, Any], network: Network) -> str:
             for name, value in asked.items()
             if had.get(name, value) != value
         ]
+        more = len(other) - MAX_SETTINGS
+        if more > 0:
+            other = [*other[:MAX_SETTINGS], f"and {more} more, all in its {DESCRIPTION}"]
         if other:
             return f"; they were trained with {', '.join(other)}"
     return ""

@@ -287,6 +287,8 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
             "standing_features": True,
             "removal_features": True,
             "approach_features": True,
+            "clearance_width": 4,
+            "edge_clearance_width": 4,
             "latent_rates": True,
         },
         {"motion_noise_neighbours": 5, "closed_loop_population": True},

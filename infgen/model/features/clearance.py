@@ -37,6 +37,7 @@ class Clearance(AnchorHead):
 
     ways: Tensor
     headings: Tensor
+    per_m: Tensor
 
     def __init__(
         self, width: int, clearance_width: int, vocabulary: MotionVocabulary
@@ -44,7 +45,11 @@ class Clearance(AnchorHead):
         anchors = Anchors.of(vocabulary)
         scales = len(AHEAD_M) + len(BEHIND_M)
         super().__init__(width, clearance_width, scales * (len(TIMES_S) + 1), anchors)
-        for name, array in (("ways", _ways(anchors)), ("headings", _headings(anchors))):
+        for name, array in (
+            ("ways", _ways(anchors)),
+            ("headings", _headings(anchors)),
+            ("per_m", _per_m()),
+        ):
             self.register_buffer(name, torch.from_numpy(array), persistent=False)
 
     def forward(
@@ -87,9 +92,12 @@ class Clearance(AnchorHead):
                 counts = on_side[..., :upto] & which[..., None]
                 way_m = torch.where(counts, gap_m[..., :upto], FAR_M)
                 for scale_m, across_m in scales:
-                    units = way_m / scale_m + aside_m[..., :upto] / across_m
-                    found.append(units.amin(dim=1).view(-1, times, self.anchors))
-        return (-torch.cat(found, dim=1)).exp().mT
+                    # A gap beside the way is as good as one along it of so much.
+                    as_way_m = torch.add(
+                        way_m, aside_m[..., :upto], alpha=scale_m / across_m
+                    )
+                    found.append(as_way_m.amin(dim=1).view(-1, times, self.anchors))
+        return (torch.cat(found, dim=1).mT * self.per_m).exp()
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +178,13 @@ def _ways(anchors: Anchors) -> Float32[np.ndarray, "3 2 5 times_anchors"]:
             at_times.append(np.stack(told, axis=1))
         found.append(np.concatenate(at_times, axis=-1))
     return np.stack(found, axis=1).astype(np.float32)
+
+
+def _per_m() -> Float32[np.ndarray, " feature"]:
+    """What the logarithm of each feature changes by in a metre along the way."""
+    scale_m = [scale for scale, _ in (*AHEAD_M, *BEHIND_M)]
+    per_m = -1 / np.array(scale_m, dtype=np.float32)
+    return np.concatenate([per_m.repeat(len(TIMES_S)), per_m])
 
 
 def _headings(anchors: Anchors) -> Float32[np.ndarray, "3 2 2 anchor"]:

@@ -2,9 +2,10 @@
 
 Features of cells know agents by the lattice points around their centres, and offset bins
 do not know them at all, so a vehicle that joins a row of parked ones is inserted onto its
-neighbour. Here each agent has a say of the points around it by their gaps along and beside
-its own box. What agents say is added up, so that of one inserted a turn before is added to
-what is there already.
+neighbour, or close ahead of a moving one. Here each agent has a say of the points around it
+by their gaps along and beside its own box and the way that it covers within a second. What
+agents say is added up, so that of one inserted a turn before is added to what is there
+already.
 
 Shape letters as in ``layers``; P are pairs of a query and an agent, L points around the
 agent, C the width of these features.
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float32
 from torch import Tensor, nn
 
 from infgen.model.insertion.cell_features import chosen
@@ -27,6 +29,10 @@ KNOTS = 21
 """Gaps are told apart at so many knots on either axis, from one side to the other ..."""
 FINE_M = 2.0
 """... which lie densest within about so much of the box."""
+COVERED_TOKENS = 2.0
+"""The way that an agent covers in so many token steps counts as part of its box ..."""
+MOST_COVERED_M = 15.0
+"""... up to so much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +42,8 @@ class SpacedAgents:
     Attributes:
         features: Features of all agents [M, D].
         row: Row of each query's agents among them [N, K].
-        pose: Their poses [N, K, 3].
-        size_lw_m: Their boxes [N, K, 2].
+        pose: Where they are, with the ways they cover (``covered``) [N, K, 3] ...
+        size_lw_m: ... and how large their boxes are with them [N, K, 2].
         present: Which of them there are [N, K].
     """
 
@@ -63,6 +69,32 @@ class SpacedCells:
     agent: Tensor
     cell: Tensor
     keys: Tensor
+
+
+def covered(
+    pose: Float32[Tensor, "*agent 3"],
+    size_lw_m: Float32[Tensor, "*agent 2"],
+    step_m: Float32[Tensor, "*agent 2"],
+    token_steps: float = COVERED_TOKENS,
+) -> tuple[Float32[Tensor, "*agent 3"], Float32[Tensor, "*agent 2"]]:
+    """Add the ways that agents cover ahead, if they move on, to their boxes.
+
+    Args:
+        pose: Poses.
+        size_lw_m: Boxes.
+        step_m: Displacements in the last token step; zero where they are not known.
+        token_steps: Within so many.
+
+    Returns:
+        Poses and sizes of the boxes with the ways.
+    """
+    cos, sin = pose[..., 2].cos(), pose[..., 2].sin()
+    ahead_m = cos * step_m[..., 0] + sin * step_m[..., 1]
+    ahead_m = (token_steps * ahead_m).clamp(0, MOST_COVERED_M)
+    none = torch.zeros_like(ahead_m)
+    half_m = ahead_m / 2
+    moved = torch.stack([half_m * cos, half_m * sin, none], dim=-1)
+    return pose + moved, size_lw_m + torch.stack([ahead_m, none], dim=-1)
 
 
 class AgentSpacing(nn.Module):

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from infgen.model.batching.batch import Batch
-from infgen.model.insertion.agent_spacing import SpacedAgents
+from infgen.model.batching.steps import steps_m
+from infgen.model.insertion.agent_spacing import SpacedAgents, covered
 from infgen.model.insertion.cell_features import CellSources
 from infgen.model.insertion.cell_query import CellStack
 from infgen.model.insertion.detail_query import DetailStack
@@ -71,7 +72,8 @@ def insertion_outputs(
     spaced = None
     if stack.spacing is not None:
         size_lw_m = agents.size_lwh_m[:, None, :, :2].expand(*agents.pose.shape[:3], 2)
-        each = rows.number, agents.pose, size_lw_m, agents.visible
+        boxes = covered(agents.pose, size_lw_m, steps_m(agents))
+        each = rows.number, *boxes, agents.visible
         near = SpacedAgents(raw, *(asked.pack(values) for values in each))
         said = stack.spacing.cells(asked.pack(ego_pose), near)
         spaced = stack.spacing.choose_each(x, said, asked.pack(agents.turn))
@@ -118,13 +120,12 @@ def detail_outputs(
     beside = None
     if stack.spacing is not None:
         of_each = scene[:, None], token[:, None], around.place
-        beside = SpacedAgents(
-            raw,
-            around.index,
+        boxes = covered(
             agents.pose[of_each],
             agents.size_lwh_m[scene[:, None], around.place, :2],
-            around.present,
+            steps_m(agents)[of_each],
         )
+        beside = SpacedAgents(raw, around.index, *boxes, around.present)
     return replace(
         said,
         offset_logits=stack.offset_logits(x, agent_type, pose, near, beside),

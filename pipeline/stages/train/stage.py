@@ -225,7 +225,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=15,
+    version=16,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,

@@ -116,6 +116,7 @@ def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_i
     message = str(told.value)
     assert re.search(r"for \S+, \S+, \S+ and \d+ more tensors; they were", message)
     assert "model.width=48 (not 16)" in message
+    assert re.search(r", and \d+ more, all in its model.json", message)
     assert "--profile pretrained" in message
     assert len(message) < 1000
 
