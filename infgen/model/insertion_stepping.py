@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from infgen.model.agent_embedding import AgentRows
-from infgen.model.insertion.agent_spacing import SpacedAgents, covered
+from infgen.model.insertion.agent_spacing import SpacedAgents, swept
 from infgen.model.insertion.cell_features import CellSources
 from infgen.model.insertion.cell_query import CellStack
 from infgen.model.insertion.detail_query import (
@@ -222,7 +222,7 @@ class InsertionStepper:
         sampled = details.offset_bins is not None
         beside = None
         if details.spacing is not None:
-            pose_of, size_lw_m = covered(
+            pose_of, size_lw_m = swept(
                 token_step.pose, token_step.size_lwh_m[..., :2], entries.step_m()
             )
             of_each = each[:, None], around.place
@@ -278,7 +278,7 @@ class InsertionStepper:
         cell, keys = spacing.around_each(
             token_step.pose[:, EGO][rollout],
             features,
-            *covered(agents.pose, agents.size_lwh_m[:, :2], agents.moved()[0]),
+            *swept(agents.pose, agents.size_lwh_m[:, :2], agents.moved()[0]),
         )
         keys = keys if real is None else keys * real[:, None, None]
         spacing.lay_out(rollout, cell, keys, laid)

@@ -95,8 +95,8 @@ class ModelSettings:
     needs `cell_feature_width` and `position_token`, without which there is none."""
     agent_spacing_width: Count = 0
     """Width of what agents say of the cells, and the offset bins, around them by the gaps
-    to their boxes and the ways that they cover within a second: how far inserted agents
-    keep from those there, and from each other; 0 for none. It does not change whether
+    to their boxes and what these sweep within a second: how far inserted agents keep
+    from those there, and from each other; 0 for none. It does not change whether
     agents are inserted, and needs `position_token` for cells and `offset_token` for offset
     bins."""
     motion_feature_width: Count = 0

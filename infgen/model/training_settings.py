@@ -175,8 +175,8 @@ class TrainSettings:
     departure_penalty: NonNegative = 0.0
     """The same of motion tokens by which vehicles drive off the road or stay off it."""
     insertion_overlap_penalty: NonNegative = 0.0
-    """The same of places at which an agent is inserted onto another one, or onto the way
-    that it covers in the next token step."""
+    """The same of places at which an agent is inserted onto another one, or onto what its
+    box sweeps in the next token step."""
     off_road_penalty: NonNegative = 0.5
     """Cost of each token step in which a vehicle leaves the road or gets farther off it."""
     log_distance_penalty: NonNegative = 0.1

@@ -3,9 +3,8 @@
 Features of cells know agents by the lattice points around their centres, and offset bins
 do not know them at all, so a vehicle that joins a row of parked ones is inserted onto its
 neighbour, or close ahead of a moving one. Here each agent has a say of the points around it
-by their gaps along and beside its own box and the way that it covers within a second. What
-agents say is added up, so that of one inserted a turn before is added to what is there
-already.
+by their gaps along and beside its own box and what that sweeps within a second. What agents
+say is added up, so that of one inserted a turn before is added to what is there already.
 
 Shape letters as in ``layers``; P are pairs of a query and an agent, L points around the
 agent, C the width of these features.
@@ -29,9 +28,9 @@ KNOTS = 21
 """Gaps are told apart at so many knots on either axis, from one side to the other ..."""
 FINE_M = 2.0
 """... which lie densest within about so much of the box."""
-COVERED_TOKENS = 2.0
-"""The way that an agent covers in so many token steps counts as part of its box ..."""
-MOST_COVERED_M = 15.0
+SWEPT_TOKENS = 2.0
+"""What a box sweeps in so many token steps counts as part of it ..."""
+MAX_SWEPT_M = 15.0
 """... up to so much."""
 
 
@@ -42,8 +41,8 @@ class SpacedAgents:
     Attributes:
         features: Features of all agents [M, D].
         row: Row of each query's agents among them [N, K].
-        pose: Where they are, with the ways they cover (``covered``) [N, K, 3] ...
-        size_lw_m: ... and how large their boxes are with them [N, K, 2].
+        pose: Poses of the boxes that they sweep (``swept``) [N, K, 3] ...
+        size_lw_m: ... and their sizes [N, K, 2].
         present: Which of them there are [N, K].
     """
 
@@ -71,13 +70,13 @@ class SpacedCells:
     keys: Tensor
 
 
-def covered(
+def swept(
     pose: Float32[Tensor, "*agent 3"],
     size_lw_m: Float32[Tensor, "*agent 2"],
     step_m: Float32[Tensor, "*agent 2"],
-    token_steps: float = COVERED_TOKENS,
+    token_steps: float = SWEPT_TOKENS,
 ) -> tuple[Float32[Tensor, "*agent 3"], Float32[Tensor, "*agent 2"]]:
-    """Add the ways that agents cover ahead, if they move on, to their boxes.
+    """Return the boxes that agents sweep, if they move on as they did.
 
     Args:
         pose: Poses.
@@ -86,11 +85,11 @@ def covered(
         token_steps: Within so many.
 
     Returns:
-        Poses and sizes of the boxes with the ways.
+        Poses and sizes of the swept boxes.
     """
     cos, sin = pose[..., 2].cos(), pose[..., 2].sin()
     ahead_m = cos * step_m[..., 0] + sin * step_m[..., 1]
-    ahead_m = (token_steps * ahead_m).clamp(0, MOST_COVERED_M)
+    ahead_m = (token_steps * ahead_m).clamp(0, MAX_SWEPT_M)
     none = torch.zeros_like(ahead_m)
     half_m = ahead_m / 2
     moved = torch.stack([half_m * cos, half_m * sin, none], dim=-1)

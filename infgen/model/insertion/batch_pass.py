@@ -7,7 +7,7 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Batch
 from infgen.model.batching.steps import steps_m
-from infgen.model.insertion.agent_spacing import SpacedAgents, covered
+from infgen.model.insertion.agent_spacing import SpacedAgents, swept
 from infgen.model.insertion.cell_features import CellSources
 from infgen.model.insertion.cell_query import CellStack
 from infgen.model.insertion.detail_query import DetailStack
@@ -72,7 +72,7 @@ def insertion_outputs(
     spaced = None
     if stack.spacing is not None:
         size_lw_m = agents.size_lwh_m[:, None, :, :2].expand(*agents.pose.shape[:3], 2)
-        boxes = covered(agents.pose, size_lw_m, steps_m(agents))
+        boxes = swept(agents.pose, size_lw_m, steps_m(agents))
         each = rows.number, *boxes, agents.visible
         near = SpacedAgents(raw, *(asked.pack(values) for values in each))
         said = stack.spacing.cells(asked.pack(ego_pose), near)
@@ -120,7 +120,7 @@ def detail_outputs(
     beside = None
     if stack.spacing is not None:
         of_each = scene[:, None], token[:, None], around.place
-        boxes = covered(
+        boxes = swept(
             agents.pose[of_each],
             agents.size_lwh_m[scene[:, None], around.place, :2],
             steps_m(agents)[of_each],

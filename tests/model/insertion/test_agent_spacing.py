@@ -7,14 +7,14 @@ import torch
 
 from infgen.model.batching.batch import collate
 from infgen.model.insertion.agent_spacing import (
-    COVERED_TOKENS,
-    MOST_COVERED_M,
+    MAX_SWEPT_M,
     REACH_M,
+    SWEPT_TOKENS,
     AgentSpacing,
     CellSpacing,
     OffsetSpacing,
     SpacedAgents,
-    covered,
+    swept,
 )
 from infgen.model.neighbours import cell_pose
 from infgen.tokens.grid import make_grid
@@ -90,15 +90,15 @@ def test_within_a_box_all_points_are_alike_but_for_the_distance():
     torch.testing.assert_close(said[0, 0], said[0, 2], **CLOSE)
 
 
-def test_the_way_that_an_agent_covers_within_a_second_is_part_of_its_box():
+def test_what_a_box_sweeps_within_a_second_is_part_of_it():
     heading_rad = 0.3
     way = torch.tensor([torch.cos(torch.tensor(0.3)), torch.sin(torch.tensor(0.3))])
     pose = torch.tensor([[5.0, -2.0, heading_rad]]).expand(4, 3)
     step_m = torch.stack([0 * way, 3 * way, -3 * way, 100 * way])
 
-    moved, size_lw_m = covered(pose, torch.tensor([[4.0, 2.0]]).expand(4, 2), step_m)
+    moved, size_lw_m = swept(pose, torch.tensor([[4.0, 2.0]]).expand(4, 2), step_m)
 
-    ahead_m = torch.tensor([0.0, COVERED_TOKENS * 3, 0.0, MOST_COVERED_M])
+    ahead_m = torch.tensor([0.0, SWEPT_TOKENS * 3, 0.0, MAX_SWEPT_M])
     torch.testing.assert_close(size_lw_m[:, 0], 4 + ahead_m)
     assert (size_lw_m[:, 1] == 2).all()
     rear_m = moved[:, :2] - size_lw_m[:, :1] / 2 * way

@@ -6,7 +6,7 @@ that might have been sampled for an agent, whether its box would overlap one of 
 else about the agent as it was. The network learns to sample one that does not: the
 log-probability of no overlap, of each of the three choices, at every insertion.
 
-Others are those present, with the way that each covers in the next token step if it moves
+Others are those present, each with what its box sweeps in the next token step if it moves
 on, and those inserted in turns before. Two pedestrians may overlap: groups walk closer than
 their boxes.
 """
@@ -21,7 +21,7 @@ from torch import Tensor
 from infgen.geometry import box_radius_m, boxes_overlap, wrap_angle
 from infgen.model.batching.batch import Details
 from infgen.model.batching.steps import steps_m
-from infgen.model.insertion.agent_spacing import covered
+from infgen.model.insertion.agent_spacing import swept
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
 from infgen.scene import AgentType
 from infgen.tokens.grid import Grid, to_grid
@@ -120,8 +120,8 @@ class _Inserted:
         heading: ... and heading bin of each [inserted].
         size_lw_m: Its box.
         whose: Which of them each pair is of, in order [pair].
-        other: Pose of the other agent, with the way that it covers ...
-        other_size_lw_m: ... and its box with that.
+        other: Pose of the box that the other agent sweeps ...
+        other_size_lw_m: ... and its size.
     """
 
     at: Int64[np.ndarray, "inserted 2"]
@@ -138,16 +138,16 @@ class _Inserted:
         """Find all inserted agents, and the others that each might overlap."""
         agents, details = rollouts.batch.agents, rollouts.batch.details
         size_lw_m = agents.size_lwh_m[:, None, :, :2].expand(*agents.pose.shape[:3], 2)
-        way_pose, way_lw_m = covered(agents.pose, size_lw_m, steps_m(agents), 1.0)
+        swept_pose, swept_lw_m = swept(agents.pose, size_lw_m, steps_m(agents), 1.0)
         at = (details.present & details.inserted).nonzero().numpy(force=True)
         rollout, _ = at.T
         own = _told(details, at)
-        pose, way, way_lw_m, presence, turn, came, agent_type, size_lw_m = (
+        pose, sweeps, swept_lw_m, presence, turn, came, agent_type, size_lw_m = (
             each.numpy(force=True)[where]
             for each, where in (
                 (agents.pose, (rollout, own.token)),
-                (way_pose, (rollout, own.token)),
-                (way_lw_m, (rollout, own.token)),
+                (swept_pose, (rollout, own.token)),
+                (swept_lw_m, (rollout, own.token)),
                 (agents.presence, (rollout, own.token)),
                 (agents.turn, (rollout, own.token)),
                 (rollouts.inserted, (rollout, own.token)),
@@ -160,7 +160,7 @@ class _Inserted:
         own_size_lw_m = size_lw_m[np.arange(len(at)), own.agent]
         there &= ~(walks & walks[np.arange(len(at)), own.agent][:, None])
         whose, row = there.nonzero()
-        ego_pose, other_pose = pose[whose, EGO], way[whose, row]
+        ego_pose, other_pose = pose[whose, EGO], sweeps[whose, row]
         other = np.empty((len(whose), 3), dtype=np.float32)
         other[:, :2] = to_grid(other_pose[:, :2], ego_pose)
         other[:, 2] = wrap_angle(other_pose[:, 2] - ego_pose[:, 2]) + AHEAD_RAD
@@ -172,7 +172,7 @@ class _Inserted:
             own_size_lw_m,
             whose,
             other,
-            way_lw_m[whose, row],
+            swept_lw_m[whose, row],
         )
 
     def overlapping(

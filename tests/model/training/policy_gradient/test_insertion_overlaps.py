@@ -11,7 +11,7 @@ import torch
 from infgen.config import TrainSettings
 from infgen.geometry import boxes_overlap
 from infgen.model.batching.batch import collate
-from infgen.model.insertion.agent_spacing import MOST_COVERED_M
+from infgen.model.insertion.agent_spacing import MAX_SWEPT_M
 from infgen.model.training.policy_gradient.insertion_overlaps import (
     InsertionOverlaps,
     find_insertion_overlaps,
@@ -65,15 +65,15 @@ def rows_of_others(rollouts, rollout, place):
             yield row
 
 
-def with_way(agents, rollout, token, row):
-    """Box of an agent with the way that it covers in a token step, if it moves on."""
+def swept_box(agents, rollout, token, row):
+    """Box that an agent sweeps in a token step, if it moves on."""
     pose = agents.pose[rollout, token, row].numpy().copy()
     size_lw_m = agents.size_lwh_m[rollout, row, :2].numpy().copy()
     fresh = agents.presence[rollout, token, row] == Presence.INSERTED
     if token and agents.visible[rollout, token - 1, row] and not fresh:
         way = np.array([np.cos(pose[2]), np.sin(pose[2])])
         step_m = pose[:2] - agents.pose[rollout, token - 1, row, :2].numpy()
-        ahead_m = min(max(step_m @ way, 0), MOST_COVERED_M)
+        ahead_m = min(max(step_m @ way, 0), MAX_SWEPT_M)
         pose[:2] += ahead_m / 2 * way
         size_lw_m[0] += ahead_m
     return pose, size_lw_m
@@ -88,7 +88,7 @@ def overlaps(rollouts, rollout, place, offset_m, heading_rad):
     xy_m = from_grid(np.asarray(offset_m, np.float32), pose[0])
     box = np.array([*xy_m, pose[0, 2] + heading_rad], dtype=np.float32)
     rows = rows_of_others(rollouts, rollout, place)
-    others = [with_way(agents, rollout, token, row) for row in rows]
+    others = [swept_box(agents, rollout, token, row) for row in rows]
     hits = boxes_overlap(
         box[None], size_lw_m[None, own], *map(np.stack, zip(*others, strict=True))
     )
