@@ -97,7 +97,7 @@ class Clearance(AnchorHead):
                         way_m, aside_m[..., :upto], alpha=scale_m / across_m
                     )
                     found.append(as_way_m.amin(dim=1).view(-1, times, self.anchors))
-        return (torch.cat(found, dim=1).mT * self.per_m).exp()
+        return (torch.cat(found, dim=1) * self.per_m[:, None]).exp().mT
 
 
 @dataclass(frozen=True, slots=True)
