@@ -38,6 +38,7 @@ class Clearance(AnchorHead):
     ways: Tensor
     headings: Tensor
     per_m: Tensor
+    times_s: Tensor
 
     def __init__(
         self, width: int, clearance_width: int, vocabulary: MotionVocabulary
@@ -49,6 +50,7 @@ class Clearance(AnchorHead):
             ("ways", _ways(anchors)),
             ("headings", _headings(anchors)),
             ("per_m", _per_m()),
+            ("times_s", np.array((0.0, *TIMES_S), dtype=np.float32)),
         ):
             self.register_buffer(name, torch.from_numpy(array), persistent=False)
 
@@ -72,7 +74,7 @@ class Clearance(AnchorHead):
             return none.new_zeros((len(agent_type), *none.shape[1:]))
         with full_precision(moving.pose):
             parts = [
-                self._features(agent_type[part], NearOthers.of(moving, part))
+                self._features(agent_type[part], NearOthers.of(moving, part, self.times_s))
                 for part in row_parts(agent_type)
             ]
         return torch.cat([none, *parts])
@@ -121,14 +123,19 @@ class NearOthers:
     unknown: Tensor
 
     @classmethod
-    def of(cls, moving: MovingPairs, rows: slice) -> "NearOthers":
-        """Find those that come nearest to some rows if all move on as they did."""
+    def of(cls, moving: MovingPairs, rows: slice, times_s: Tensor) -> "NearOthers":
+        """Find those that come nearest to some rows if all move on as they did.
+
+        Args:
+            moving: How agents move.
+            rows: Which of them.
+            times_s: When others may be nearest.
+        """
         index, present = moving.index[rows], moving.present[rows]
         pose, other = moving.pose[rows, None], moving.pose[index]
         per_s = 1 / CLOCK.token_s
         own_mps, other_mps = moving.step_m[rows, None] * per_s, moving.step_m[index] * per_s
         away_m, to_mps = (other - pose)[..., :2], other_mps - own_mps
-        times_s = away_m.new_tensor((0.0, *TIMES_S))
         later_m = away_m[..., None, :] + to_mps[..., None, :] * times_s[:, None]
         nearest_m2 = later_m.square().sum(dim=-1).amin(dim=-1)
         nearest_m2 = torch.where(present, nearest_m2, torch.inf)
