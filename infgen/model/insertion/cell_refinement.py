@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from infgen.model.layers import embedding_mlp
+from infgen.model.layers import embedding_mlp, full_precision
 from infgen.model.settings import REFINEMENT_GROUPS
 
 DILATION = 2
@@ -53,13 +53,17 @@ class CellRefinement(nn.Module):
     def forward(self, laid: Tensor, lattice: Tensor) -> Tensor:
         """Describe cells: features [N, cell, C].
 
+        Convolutions are in float32 also under autocast: on CPUs the gradient of ``far`` in
+        bf16 was now and then not finite (torch 2.13).
+
         Args:
             laid: What lies on the lattice [N, C, side, side].
             lattice: The lattice point of each cell [cell].
         """
         place = self.place(self.centre_m).mT.view(1, -1, *laid.shape[2:])
-        near = functional.relu(self.near(laid) + place)
-        seen = functional.relu(near + self.far(near))
+        with full_precision(laid):
+            near = functional.relu(self.near(laid) + place.to(laid.dtype))
+            seen = functional.relu(near + self.far(near))
         keys: Tensor = self.key(seen.flatten(2)[..., lattice].mT)
         return keys
 

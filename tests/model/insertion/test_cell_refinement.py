@@ -86,3 +86,15 @@ def test_without_cells_or_their_features_there_is_none(tiny, new_network):
 def test_a_width_that_does_not_make_four_groups_is_refused():
     with pytest.raises(ValidationError, match="is 6; expected a multiple of 4"):
         ModelSettings(cell_refinement_width=6)
+
+
+def test_under_autocast_its_convolutions_are_in_float32(cell_features, grid):
+    near = lying(grid.centre_m[grid.ego_cell])
+    found = []
+    for convolution in (cell_features.refinement.near, cell_features.refinement.far):
+        convolution.register_forward_hook(lambda _, __, out: found.append(out.dtype))
+
+    with torch.autocast("cpu", torch.bfloat16):
+        cell_features(EGO, near, near)
+
+    assert found == [torch.float32] * 2
