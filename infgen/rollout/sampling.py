@@ -3,6 +3,9 @@
 import torch
 from torch import Tensor
 
+LIKELY = (64, 256)
+"""Rows are sorted together by how many choices may be in their nuclei, up to so many."""
+
 
 def choose(
     logits: Tensor,
@@ -28,32 +31,86 @@ def choose(
     Returns:
         Indices [...], int64.
     """
+    if nucleus < 1 and not top and apart is not None and logits.device.type == "cpu":
+        return _choose_likely(logits, uniform, nucleus, temperature, apart)
     count = logits.shape[-1]
     keep = min(top, count) if top else count
     best, index = logits.topk(keep, dim=-1)
     share = (best.double() / temperature).softmax(dim=-1)
-    if nucleus < 1:
-        share = _within(share, nucleus, None if apart is None else apart.gather(-1, index))
-    reached = share.cumsum(dim=-1)
-    # Beyond the last likely one nothing is reached any more, whatever rounding does.
-    last = _last(share > 0)
-    sought = uniform * reached[..., -1] if nucleus < 1 else uniform
-    rank = (sought[..., None] >= reached).sum(dim=-1).minimum(last)
+    if nucleus < 1 and apart is None:
+        share = share * (share.cumsum(dim=-1) - share < nucleus)
+    elif nucleus < 1 and apart is not None:
+        share = _within(share, nucleus, apart.gather(-1, index))
+    rank = _rank(share, uniform, of_all=nucleus == 1)
     return index.gather(-1, rank[..., None])[..., 0]
 
 
-def _within(share: Tensor, nucleus: float, apart: Tensor | None) -> Tensor:
-    """Keep the nucleus of descending shares, or those of two groups of them."""
-    if apart is None:
-        return share * (share.cumsum(dim=-1) - share < nucleus)
+def _choose_likely(
+    logits: Tensor, uniform: Tensor, nucleus: float, temperature: float, apart: Tensor
+) -> Tensor:
+    """Sample from two nuclei as ``choose`` does, and sort only what may be in one.
+
+    Of n choices those that have less than ``(1 - nucleus) / n`` of the probability of their
+    group each have less than ``1 - nucleus`` of it together: none is in its nucleus.
+
+    Args:
+        logits: [row, choice].
+        uniform: [row].
+        nucleus: As for ``choose`` ...
+        temperature: ... this too ...
+        apart: ... and this [row, choice].
+    """
+    share = (logits.double() / temperature).softmax(dim=-1)
+    one = torch.where(apart, share, 0.0).sum(dim=-1, keepdim=True)
+    other = torch.where(apart, 0.0, share).sum(dim=-1, keepdim=True)
+    outside = (1 - nucleus) / logits.shape[-1]
+    likely = share > torch.where(apart, outside * one, outside * other)
+    logits = torch.where(likely, logits, -torch.inf)
+    number = likely.sum(dim=-1)
+    found = torch.zeros_like(number)
+    for least, most in zip((-1, *LIKELY), (*LIKELY, logits.shape[-1]), strict=True):
+        rows = ((number > least) & (number <= most)).nonzero()[:, 0]
+        if not len(rows):
+            continue
+        index = logits[rows].topk(int(number[rows].max()), dim=-1).indices
+        own, group, some = (x[rows].gather(1, index) for x in (share, apart, likely))
+        own = _within(own * some, nucleus, group, (one[rows], other[rows]))
+        rank = _rank(own, uniform[rows], of_all=False)
+        found[rows] = index.gather(1, rank[:, None])[:, 0]
+    return found
+
+
+def _within(
+    share: Tensor,
+    nucleus: float,
+    apart: Tensor,
+    wholes: tuple[Tensor | None, Tensor | None] = (None, None),
+) -> Tensor:
+    """Keep the nuclei of descending shares of two groups, each as likely as its whole.
+
+    Args:
+        share: [..., choice].
+        nucleus: Share of the probability of each group.
+        apart: Which choices are of the first one [..., choice].
+        wholes: Their probabilities [..., 1]; None if all of them are among the shares.
+    """
     kept = torch.zeros_like(share)
-    for group in (apart, ~apart):
+    for group, whole in zip((apart, ~apart), wholes, strict=True):
         own = share * group
         reached = own.cumsum(dim=-1)
-        whole = reached[..., -1:]
+        whole = reached[..., -1:] if whole is None else whole
         some = own * (reached - own < nucleus * whole)
         kept += some * (whole / some.sum(dim=-1, keepdim=True).clamp(min=1e-300))
     return kept
+
+
+def _rank(share: Tensor, uniform: Tensor, *, of_all: bool) -> Tensor:
+    """Find by which of shares [..., choice] a number [...] is reached, of them or of 1."""
+    reached = share.cumsum(dim=-1)
+    sought = uniform if of_all else uniform * reached[..., -1]
+    rank = (sought[..., None] >= reached).sum(dim=-1)
+    # Beyond the last likely one nothing is reached any more, whatever rounding does.
+    return rank.minimum(_last(share > 0))
 
 
 def _last(likely: Tensor) -> Tensor:

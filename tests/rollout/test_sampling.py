@@ -146,3 +146,24 @@ def test_a_nucleus_takes_no_probability_from_either_group(choices, nucleus):
 
     expected = logits.softmax(dim=0)[apart].sum()
     assert abs(apart[picks].double().mean() - expected) < 2e-3
+
+
+@given(
+    st.integers(0, 10**6),
+    st.sampled_from([0.5, 3.0, 9.0]),
+    st.floats(0.3, 0.99),
+    st.floats(0.5, 2.0),
+)
+def test_what_may_be_in_a_nucleus_is_sorted_alone_and_chosen_as_from_all(
+    seed, spread, nucleus, temperature
+):
+    random = torch.Generator().manual_seed(seed)
+    logits = spread * torch.randn(40, 700, generator=random)
+    logits[:10, 3:] = -torch.inf
+    apart = torch.rand(40, 700, generator=random) < 0.02
+    uniform = torch.rand(40, generator=random, dtype=torch.float64)
+    how = {"nucleus": nucleus, "temperature": temperature, "apart": apart}
+
+    found, expected = (choose(logits, uniform, top=top, **how) for top in (0, 700))
+
+    assert torch.equal(found, expected)
