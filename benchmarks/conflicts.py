@@ -1,7 +1,7 @@
 """How often do agents take motion tokens after which braking no longer averts an overlap?
 
 Logs, and rollouts of some weights without rules but the insertion mask, as policy gradient
-simulates them (``infgen/model/training/policy_gradient/conflicts.py``)::
+simulates them (``infgen/model/training/policy_gradient/avoided/conflicts.py``)::
 
     python benchmarks/conflicts.py ROOT [--weights ROOT/latest/train]
         [--split validation] [--scenes 20]
@@ -21,8 +21,8 @@ from logged_scenes import asked, whole
 
 from infgen.model.batching.batch import Batch
 from infgen.model.network import Network
-from infgen.model.training.policy_gradient.braking import LOOK_AHEAD_TOKENS
-from infgen.model.training.policy_gradient.conflicts import conflicts_taken
+from infgen.model.training.policy_gradient.avoided.braking import LOOK_AHEAD_TOKENS
+from infgen.model.training.policy_gradient.avoided.conflicts import conflicts_taken
 from infgen.model.training.policy_gradient.rewards import find_costs
 from infgen.model.training.policy_gradient.road import read_roads
 from infgen.model.training.policy_gradient.rollouts import (

@@ -5,7 +5,7 @@ of relations, H heads, C width of one head, F scalars, P nodes of a table.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
@@ -63,6 +63,29 @@ def full_precision(x: Tensor) -> AbstractContextManager[object]:
     in float32 it is one in 25 (``tests/rollout/test_precision``).
     """
     return torch.autocast(x.device.type, enabled=False)
+
+
+def by_agent_type(
+    rows: Tensor, agent_type: Tensor, products: Sequence[Callable[[Tensor], Tensor]]
+) -> Tensor:
+    """Compute of rows [N, ...] what is to be computed of those of their agent types.
+
+    A CPU computes it of each row alone. Elsewhere, to know how many rows each type has, the
+    host would wait; so there it is computed of all rows for every type.
+
+    Args:
+        rows: Of agents.
+        agent_type: ``AgentType`` of each [N].
+        products: One for each type.
+    """
+    if rows.device.type != "cpu":
+        found = torch.zeros((), dtype=rows.dtype, device=rows.device)
+        for each, product in enumerate(products):
+            found = torch.where((agent_type == each)[:, None], product(rows), found)
+        return found
+    places = [(agent_type == each).nonzero()[:, 0] for each in range(len(products))]
+    parts = [product(rows[at]) for at, product in zip(places, products, strict=True)]
+    return torch.cat(parts)[torch.cat(places).argsort()]
 
 
 def gather(features_ND: Tensor, index: Tensor) -> Tensor:

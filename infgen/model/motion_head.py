@@ -8,13 +8,14 @@ them.
 """
 
 import math
+from functools import partial
 
 import numpy as np
 import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor, nn
 
-from infgen.model.layers import mlp
+from infgen.model.layers import by_agent_type, mlp
 from infgen.tokens.vocabulary import MotionVocabulary
 
 LONGEST_WAVE_M = 64.0
@@ -58,23 +59,15 @@ class MotionHead(nn.Module):
         self, x_ND: Tensor, agent_type: Int64[Tensor, " row"], shapes: Tensor
     ) -> Tensor:
         """Logits [N, motion_token] of agents, by their features and those of ``table``."""
-        wanted = self.wanted(x_ND)
-        if wanted.device.type != "cpu":
-            return self._of_all_types(wanted, agent_type, shapes)
-        rows = [(agent_type == each).nonzero()[:, 0] for each in range(len(shapes))]
-        parts = [
-            torch.addmm(usual.to(wanted.dtype), wanted[row], shape.T)
-            for row, shape, usual in zip(rows, shapes, self.usual, strict=True)
-        ]
-        return torch.cat(parts)[torch.cat(rows).argsort()]
 
-    def _of_all_types(self, wanted: Tensor, agent_type: Tensor, shapes: Tensor) -> Tensor:
-        """The same with three times the work, but without counting each type's agents."""
-        logits = torch.zeros((), dtype=wanted.dtype, device=wanted.device)
-        for each, (shape, usual) in enumerate(zip(shapes, self.usual, strict=True)):
-            own = torch.addmm(usual.to(wanted.dtype), wanted, shape.to(wanted.dtype).T)
-            logits = torch.where((agent_type == each)[:, None], own, logits)
-        return logits
+        def product(shape: Tensor, usual: Tensor, wanted: Tensor) -> Tensor:
+            kind = wanted.dtype
+            return torch.addmm(usual.to(kind), wanted, shape.to(kind).T)
+
+        products = [
+            partial(product, *each) for each in zip(shapes, self.usual, strict=True)
+        ]
+        return by_agent_type(self.wanted(x_ND), agent_type, products)
 
 
 def _waves(

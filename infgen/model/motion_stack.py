@@ -4,7 +4,9 @@ Shape letters as in ``layers``; rows are the visible agents of all tokens and sc
 """
 
 from dataclasses import dataclass
+from functools import reduce
 
+import torch
 from torch import Tensor, nn
 
 from infgen.clock import CLOCK
@@ -218,23 +220,30 @@ class MotionStack(nn.Module):
             leaving = leaving + self.density(sight.density)
         if self.ego_place is not None and sight.ego_place is not None:
             leaving = leaving + self.ego_place(sight.ego_place)
-        moves = self._moves(x_ND, agent_type, shapes)
-        if self.clearance is not None and sight.moving is not None:
-            moves = moves + self.clearance(x_ND, agent_type, sight.moving)
-        if self.edges is not None and sight.edges is not None:
-            moves = moves + self.edges(x_ND, agent_type, sight.edges)
         return MotionOutputs(
             rows,
-            moves,
+            self._moves(x_ND, agent_type, shapes, sight),
             None if self.leave is None else self.leave(leaving)[:, 0],
             None if self.pattern is None else self.pattern(x_ND),
         )
 
-    def _moves(self, x_ND: Tensor, agent_type: Tensor, shapes: Tensor | None) -> Tensor:
+    def _moves(
+        self, x_ND: Tensor, agent_type: Tensor, shapes: Tensor | None, sight: AgentContext
+    ) -> Tensor:
+        """Logits of motion tokens [N, V]."""
         if self.shaped is not None and shapes is not None:
-            shaped: Tensor = self.shaped(x_ND, agent_type, shapes)
-            return shaped
-        if self.move is None:
+            moves: Tensor = self.shaped(x_ND, agent_type, shapes)
+        elif self.move is not None:
+            moves = self.move(x_ND)
+        else:
             raise ValueError("the motion head needs features; pass motion_features()")
-        alone: Tensor = self.move(x_ND)
-        return alone
+        heads = (self.clearance, sight.moving), (self.edges, sight.edges)
+        judged = [
+            head(x_ND, agent_type, seen)
+            for head, seen in heads
+            if head is not None and seen is not None
+        ]
+        head = self.edges if self.clearance is None else self.clearance
+        if head is None or not judged:
+            return moves
+        return moves + head.spread(reduce(torch.add, judged), agent_type)

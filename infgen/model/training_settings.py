@@ -174,6 +174,8 @@ class TrainSettings:
     network would have sampled of all others."""
     departure_penalty: NonNegative = 0.0
     """The same of motion tokens by which vehicles drive off the road or stay off it."""
+    creeping_penalty: NonNegative = 0.0
+    """The same of motion tokens by which vehicles creep on, with no other agent ahead."""
     insertion_overlap_penalty: NonNegative = 0.0
     """The same of places at which an agent is inserted onto another one, or onto what its
     box sweeps in the next token step."""

@@ -11,6 +11,7 @@ learned of them, V are the motion tokens.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from infgen.clock import CLOCK
-from infgen.model.layers import begin_last_at_zero, mlp
+from infgen.model.layers import begin_last_at_zero, by_agent_type, mlp
 from infgen.scene import AgentType
 from infgen.tokens.vocabulary import MotionVocabulary
 
@@ -110,23 +111,23 @@ class AnchorHead(nn.Module):
     def judge(
         self,
         x_ND: Tensor,
-        agent_type: Int64[Tensor, " row"],
         features: Float32[Tensor, "N R F"],
     ) -> Tensor:
-        """Return what is added to the logits of agents [N, V].
+        """Return what is added to the logits of anchors [N, R].
 
         Args:
             x_ND: Features of the agents.
-            agent_type: ``AgentType`` of each.
             features: Features of the anchors of each.
         """
         told = self.gaps(features.to(x_ND.dtype)) + self.agent(x_ND)[:, None]  # [N, R, C]
-        judged = (functional.relu(told) @ self.ask(x_ND)[..., None])[..., 0]
-        added = torch.zeros((), dtype=judged.dtype, device=judged.device)
-        for each, share in enumerate(self.share):
-            own = judged @ share.to(judged.dtype)
-            added = torch.where((agent_type == each)[:, None], own, added)
-        return added
+        judged: Tensor = (functional.relu(told) @ self.ask(x_ND)[..., None])[..., 0]
+        return judged
+
+    def spread(self, judged: Tensor, agent_type: Int64[Tensor, " row"]) -> Tensor:
+        """From anchors [N, R], of this head or others, to motion tokens [N, V]."""
+        shares = self.share.to(judged.dtype)
+        products = [partial(torch.matmul, other=share) for share in shares]
+        return by_agent_type(judged, agent_type, products)
 
 
 def row_parts(agent_type: Int64[Tensor, " row"]) -> list[slice]:

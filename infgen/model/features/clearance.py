@@ -57,14 +57,14 @@ class Clearance(AnchorHead):
     def forward(
         self, x_ND: Tensor, agent_type: Int64[Tensor, " row"], moving: MovingPairs
     ) -> Tensor:
-        """Judge the motion tokens of agents: what is added to their logits [N, V].
+        """Judge the anchors of agents: what is added to their logits [N, R].
 
         Args:
             x_ND: Features of the agents.
             agent_type: ``AgentType`` of each.
             moving: How they move, and the others around each.
         """
-        return self.judge(x_ND, agent_type, self.features(agent_type, moving))
+        return self.judge(x_ND, self.features(agent_type, moving))
 
     @torch.no_grad()
     def features(self, agent_type: Tensor, moving: MovingPairs) -> Float32[Tensor, "N R F"]:

@@ -159,10 +159,11 @@ class EdgesNear:
         rank = torch.where(
             self.present[..., None], away_m2 - ALONG_ITS_SIDE * side_m2, torch.inf
         )
-        nearest = rank.argmin(dim=1, keepdim=True)
-        away_m = away_m2.gather(1, nearest)[:, 0].sqrt()
-        away_m = away_m.copysign(-aside_m.gather(1, nearest)[:, 0])
-        over_m = away_m + self.half_width_m[:, None]
+        # Where an edge is the nearest one, else nothing: faster than to look for its place.
+        is_nearest = rank <= rank.amin(dim=1, keepdim=True)
+        over_m2 = away_m2.copysign(-aside_m)
+        over_m2 = torch.where(is_nearest, over_m2, -torch.inf).amax(dim=1)
+        over_m = over_m2.abs().sqrt().copysign(over_m2) + self.half_width_m[:, None]
         return torch.where(self.present.any(dim=1, keepdim=True), over_m, -torch.inf)
 
 
@@ -188,14 +189,14 @@ class EdgeClearance(AnchorHead):
     def forward(
         self, x_ND: Tensor, agent_type: Int64[Tensor, " row"], edges: EdgesNear
     ) -> Tensor:
-        """Judge the motion tokens of agents: what is added to their logits [N, V].
+        """Judge the anchors of agents: what is added to their logits [N, R].
 
         Args:
             x_ND: Features of the agents.
             agent_type: ``AgentType`` of each.
             edges: Edges near each.
         """
-        return self.judge(x_ND, agent_type, self.features(agent_type, edges))
+        return self.judge(x_ND, self.features(agent_type, edges))
 
     @torch.no_grad()
     def features(

@@ -169,3 +169,14 @@ def test_before_training_no_logit_changes_and_afterwards_tokens_are_told_apart(c
     assert judged[0].std() > 0
     alone = clearance(x, vehicles(2), pairs(EAST, STANDS_AHEAD, present=False))
     assert not torch.allclose(judged[0], alone[0])
+
+
+def test_what_anchors_are_worth_goes_to_the_tokens_of_each_agents_own_type(clearance):
+    agent_type = torch.tensor([2, 0, 1, 0])
+    judged = torch.randn(4, clearance.anchors)
+
+    found = clearance.spread(judged, agent_type)
+
+    each = zip(judged, clearance.share[agent_type], strict=True)
+    expected = torch.stack([own @ share for own, share in each])
+    torch.testing.assert_close(found, expected)

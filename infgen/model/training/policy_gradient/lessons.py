@@ -8,13 +8,15 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Batch
 from infgen.model.network import Network
-from infgen.model.training.policy_gradient.conflicts import find_conflicts
-from infgen.model.training.policy_gradient.departures import find_departures
-from infgen.model.training.policy_gradient.insertion_overlaps import (
+from infgen.model.training.policy_gradient.avoided.conflicts import find_conflicts
+from infgen.model.training.policy_gradient.avoided.creeping import find_creeping
+from infgen.model.training.policy_gradient.avoided.departures import find_departures
+from infgen.model.training.policy_gradient.avoided.insertion_overlaps import (
     InsertionOverlaps,
     find_insertion_overlaps,
 )
-from infgen.model.training.policy_gradient.policy_lesson import AvoidedTokens, PolicyLesson
+from infgen.model.training.policy_gradient.avoided.tokens import AvoidedTokens
+from infgen.model.training.policy_gradient.policy_lesson import PolicyLesson
 from infgen.model.training.policy_gradient.returns import (
     advantages,
     discounted_returns,
@@ -22,7 +24,7 @@ from infgen.model.training.policy_gradient.returns import (
     of_rollouts,
 )
 from infgen.model.training.policy_gradient.rewards import Costs, find_costs
-from infgen.model.training.policy_gradient.road import read_roads
+from infgen.model.training.policy_gradient.road import Road, read_roads
 from infgen.model.training.policy_gradient.rollouts import (
     HISTORY_TOKENS,
     SimulatedRollouts,
@@ -30,12 +32,13 @@ from infgen.model.training.policy_gradient.rollouts import (
 )
 from infgen.model.training.simulation import REMOVED
 from infgen.model.training_settings import TrainSettings
+from infgen.tokens.vocabulary import MotionVocabulary
 
 SUMS = (
     *("choices", "agents", "token_steps"),
     *("reward", "overlap", "off_road", "conflict", "energy_score", "compared"),
     *("overlapping_agents", "departing_agents", "present", "logged", "entries", "exits"),
-    *("insertion_overlap", "departure"),
+    *("insertion_overlap", "departure", "creeping"),
 )
 """Sums over the rollouts of a batch, in this order."""
 
@@ -70,11 +73,7 @@ def simulate_lessons(
     roads = read_roads(batch.roads, network.map_vocabulary())
     vocabulary = network.motion_vocabulary()
     costs = find_costs(rollouts, vocabulary, roads)
-    conflicts = departures = AvoidedTokens.none(vocabulary, rollouts.moved.device)
-    if settings.conflict_penalty:
-        conflicts = find_conflicts(rollouts, vocabulary)
-    if settings.departure_penalty:
-        departures = find_departures(rollouts, vocabulary, roads)
+    conflicts, departures, creeping = _find_avoided(rollouts, vocabulary, roads, settings)
     overlaps = InsertionOverlaps.none(network.grid, rollouts.moved.device)
     if settings.insertion_overlap_penalty:
         overlaps = find_insertion_overlaps(rollouts, network.grid)
@@ -103,6 +102,7 @@ def simulate_lessons(
             of_count[number],
             conflicts.only(rollouts.rows(number)),
             departures.only(rollouts.rows(number)),
+            creeping.only(rollouts.rows(number)),
             overlaps.only(rollouts.rows(number)),
         )
         for number in range(group)
@@ -110,9 +110,28 @@ def simulate_lessons(
     taken = {
         "conflict": conflicts.taken,
         "departure": departures.taken,
+        "creeping": creeping.taken,
         "insertion_overlap": overlaps.taken,
     }
     return PolicyLessons(lessons, _sums(rollouts, costs, taken, reward))
+
+
+def _find_avoided(
+    rollouts: SimulatedRollouts,
+    vocabulary: MotionVocabulary,
+    roads: list[Road],
+    settings: TrainSettings,
+) -> tuple[AvoidedTokens, AvoidedTokens, AvoidedTokens]:
+    """Find motion tokens to be avoided: conflicts, departures, creeping."""
+    none = AvoidedTokens.none(vocabulary, rollouts.moved.device)
+    conflicts = departures = creeping = none
+    if settings.conflict_penalty:
+        conflicts = find_conflicts(rollouts, vocabulary)
+    if settings.departure_penalty:
+        departures = find_departures(rollouts, vocabulary, roads)
+    if settings.creeping_penalty:
+        creeping = find_creeping(rollouts, vocabulary)
+    return conflicts, departures, creeping
 
 
 def figures(sums: Tensor) -> dict[str, float]:
@@ -122,7 +141,7 @@ def figures(sums: Tensor) -> dict[str, float]:
         max(1.0, found[name])
         for name in ("choices", "agents", "token_steps", "compared", "entries")
     )
-    costs = ("reward", "overlap", "off_road", "conflict", "departure")
+    costs = ("reward", "overlap", "off_road", "conflict", "departure", "creeping")
     return {
         **{f"rollout_{name}": found[name] / choices for name in costs},
         "rollout_energy_score": found["energy_score"] / compared,

@@ -5,14 +5,14 @@ choices of the rollout (``choices``); the divergence is that from the network to
 pretrained one, summed over the same choices (``divergence``). Both terms are divided by the
 number of motion tokens, so ``divergence_weight`` is in rewards per nat.
 
-The policy term has what is to be avoided beside it: motion tokens in conflict
-(``conflicts``) and off the road (``departures``), and places onto other agents
-(``insertion_overlaps``). There the network learns what the pretrained one would sample of
-all other choices: minus the divergence of its own from the pretrained distribution without
-what is to be avoided. Of what is avoided nothing else is learned than to take another, and
-the odds of all others beside each other stay as they were. At first that is the
-log-probability of all others; their expected number would not do, as mostly all the likely
-choices are to be avoided, and it hardly changes with their odds.
+The policy term has what is to be avoided beside it (``avoided``): motion tokens in
+conflict, off the road and slowly on, and places onto other agents. There the network learns
+what the pretrained one would sample of all other choices: minus the divergence of its own
+from the pretrained distribution without what is to be avoided. Of what is avoided nothing
+else is learned than to take another, and the odds of all others beside each other stay as
+they were. At first that is the log-probability of all others; their expected number would
+not do, as mostly all the likely choices are to be avoided, and it hardly changes with their
+odds.
 
 Where the network has been trained since the rollouts were simulated, a choice counts by the
 ratio of its probability to what it was then, and no further than ``CLIP`` from one in the
@@ -26,11 +26,13 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from infgen.model.attention.neighbour_attention import HIDDEN_SCORE
 from infgen.model.logits import Outputs
 from infgen.model.training.losses import Term, Terms
+from infgen.model.training.policy_gradient.avoided.tokens import AvoidedTokens
 from infgen.model.training.policy_gradient.choices import choices_made
 from infgen.model.training.policy_gradient.divergence import divergence
-from infgen.model.training.policy_gradient.policy_lesson import AvoidedTokens, PolicyLesson
+from infgen.model.training.policy_gradient.policy_lesson import PolicyLesson
 from infgen.model.training_settings import TrainSettings
 
 LEAST_ODDS = 1e-3
@@ -62,6 +64,7 @@ def policy_terms(
     for penalty, tokens in (
         (settings.conflict_penalty, lesson.conflicts),
         (settings.departure_penalty, lesson.departures),
+        (settings.creeping_penalty, lesson.creeping),
     ):
         gained = gained - penalty * _from_other_tokens(*both, tokens)
     overlap = _from_other_places(*both, lesson)
@@ -111,14 +114,17 @@ def _from_other_places(
         token, turn = details.token[scene, place], details.turn[scene, place]
         at = one.rows.number[scene, token], turn
         if one.position_logits is not None and other.position_logits is not None:
-            logits = one.position_logits[at], other.position_logits[at]
-            found = found + _from_others(*logits, overlaps.cell)
+            own, theirs = (
+                logits[at].masked_fill(~overlaps.near, HIDDEN_SCORE)
+                for logits in (one.position_logits, other.position_logits)
+            )
+            found = found + _from_others(own, theirs, overlaps.cell)
     if outputs.details is not None and pretrained.details is not None:
-        own, theirs = outputs.details, pretrained.details
-        row = own.rows.number[scene, place]
+        detail, their_detail = outputs.details, pretrained.details
+        row = detail.rows.number[scene, place]
         for choice, others, avoided in (
-            (own.offset_logits, theirs.offset_logits, overlaps.offset),
-            (own.heading_logits, theirs.heading_logits, overlaps.heading),
+            (detail.offset_logits, their_detail.offset_logits, overlaps.offset),
+            (detail.heading_logits, their_detail.heading_logits, overlaps.heading),
         ):
             if choice is not None and others is not None:
                 found = found + _from_others(choice[row], others[row], avoided)

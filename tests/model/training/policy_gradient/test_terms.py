@@ -10,6 +10,7 @@ from torch.nn.functional import logsigmoid
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
+from infgen.model.training.policy_gradient.avoided.tokens import AvoidedTokens
 from infgen.model.training.policy_gradient.choices import choices_made
 from infgen.model.training.policy_gradient.divergence import divergence
 from infgen.model.training.policy_gradient.lessons import (
@@ -17,7 +18,6 @@ from infgen.model.training.policy_gradient.lessons import (
     figures,
     simulate_lessons,
 )
-from infgen.model.training.policy_gradient.policy_lesson import AvoidedTokens
 from infgen.model.training.policy_gradient.rollouts import HISTORY_TOKENS
 from infgen.model.training.policy_gradient.terms import CLIP, LEAST_ODDS, policy_terms
 from infgen.tokens.scene_tokens import Presence
@@ -27,6 +27,7 @@ HOW = TrainSettings(
     policy_top_p=0.9,
     conflict_penalty=2.0,
     departure_penalty=2.0,
+    creeping_penalty=2.0,
 )
 ROUNDING = 1e-6
 """Between a network with gradients and its copy without, which sums in another order."""
@@ -65,7 +66,7 @@ def worthless(lesson):
     names = ("advantage", "type_advantage", "count_advantage")
     nothing = {x: torch.zeros_like(getattr(lesson, x)) for x in names}
     none = lesson.conflicts.only(slice(0, 0))
-    return replace(lesson, conflicts=none, departures=none, **nothing)
+    return replace(lesson, conflicts=none, departures=none, creeping=none, **nothing)
 
 
 def after_a_step(network, lesson):
@@ -147,7 +148,7 @@ def logits_of(motion, tokens):
     return motion.motion_logits[motion.rows.number[scene, token - 1, agent]]
 
 
-@pytest.mark.parametrize("kind", ["conflicts", "departures"])
+@pytest.mark.parametrize("kind", ["conflicts", "departures", "creeping"])
 def test_motion_tokens_to_be_avoided_become_less_likely(network, lessons, kind):
     lesson = lessons.lessons[0]
     only = avoiding(network, lesson, kind)

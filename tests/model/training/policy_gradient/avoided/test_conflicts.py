@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from infgen.geometry import to_world
-from infgen.model.training.policy_gradient.braking import BRAKES_MPS2
-from infgen.model.training.policy_gradient.conflicts import (
+from infgen.model.training.policy_gradient.avoided.braking import BRAKES_MPS2
+from infgen.model.training.policy_gradient.avoided.conflicts import (
     are_in_conflict,
     conflicts_taken,
     find_conflicts,
@@ -21,6 +21,9 @@ TOKENS, METRES = 7, 24
 def still(x_m, y_m=0.0):
     """An agent that stands."""
     return [[x_m, y_m, 0.0]] * TOKENS
+
+
+EGO_FAR_AWAY = still(-500)
 
 
 def conflicts(drawn, metres, *ways, **changed):
@@ -128,11 +131,11 @@ def test_conflicts_do_not_depend_on_where_the_scene_lies(drawn, metres):
 
 def test_who_comes_into_conflict_is_told_which_token_would_have_averted_it(drawn, metres):
     runs = [[5 * at, 0, 0] for at in range(TOKENS)]
-    rollouts = drawn(np.stack([runs, still(13)], axis=1)[None])
+    rollouts = drawn(np.stack([EGO_FAR_AWAY, runs, still(13)], axis=1)[None])
 
     found = find_conflicts(rollouts, metres)
 
-    assert found.at.tolist() == [[0, 1, 0]]
+    assert found.at.tolist() == [[0, 1, 1]]
     assert found.avoided[0].tolist() == conflicts(drawn, metres, runs, still(13))
     assert not found.avoided[0].all()
     assert found.avoided[0, 5]
@@ -144,22 +147,32 @@ def test_who_comes_into_conflict_is_told_which_token_would_have_averted_it(drawn
 def test_who_comes_into_conflict_again_is_told_again(drawn, metres):
     """It drives through one that stands, and later into another one."""
     runs = [[5 * at, 0, 0] for at in range(TOKENS)]
-    rollouts = drawn(np.stack([runs, still(8), still(28)], axis=1)[None])
+    rollouts = drawn(np.stack([EGO_FAR_AWAY, runs, still(8), still(28)], axis=1)[None])
 
-    taken = conflicts_taken(rollouts, metres)[0, :, 0].nonzero()[0].tolist()
+    taken = conflicts_taken(rollouts, metres)[0, :, 1].nonzero()[0].tolist()
     found = find_conflicts(rollouts, metres)
 
     begins = [at for at in taken if at - 1 not in taken]
     assert len(begins) == 2
-    assert found.at.tolist() == [[0, at, 0] for at in begins]
+    assert found.at.tolist() == [[0, at, 1] for at in begins]
+
+
+def test_the_ego_is_told_of_none(drawn, metres):
+    runs = [[5 * at, 0, 0] for at in range(TOKENS)]
+    rollouts = drawn(np.stack([runs, still(13)], axis=1)[None])
+
+    found = find_conflicts(rollouts, metres)
+
+    assert not len(found.at)
+    assert found.taken == 2
 
 
 def test_what_nothing_averts_is_told_as_taken_only(drawn, metres):
     """It stands, and the other one runs into it whatever it does."""
     meets = [[6 - 2 * at, 0, np.pi] for at in range(TOKENS)]
     short = replace(metres, path=metres.path[:, :1], real=metres.real[:, :1])
-    rollouts = drawn(np.stack([still(0), meets], axis=1)[None])
-    rollouts.moved[..., 1] = False
+    rollouts = drawn(np.stack([EGO_FAR_AWAY, still(0), meets], axis=1)[None])
+    rollouts.moved[..., 2] = False
 
     found = find_conflicts(rollouts, short)
 
@@ -179,10 +192,11 @@ def test_without_moves_nothing_is_taken(drawn, metres):
 
 def test_rollouts_are_taken_by_their_rows(drawn, metres):
     runs = [[5 * at, 0, 0] for at in range(TOKENS)]
-    rollouts = drawn(np.array([np.stack([runs, still(x)], axis=1) for x in (13, 13, 90)]))
+    ways = [[EGO_FAR_AWAY, runs, still(x)] for x in (13, 13, 90)]
+    rollouts = drawn(np.array([np.stack(each, axis=1) for each in ways]))
 
     found = find_conflicts(rollouts, metres)
 
     assert found.at[:, 0].tolist() == [0, 1]
-    assert found.only(slice(1, 3)).at.tolist() == [[0, 1, 0]]
+    assert found.only(slice(1, 3)).at.tolist() == [[0, 1, 1]]
     assert not len(found.only(slice(2, 3)).at)

@@ -10,7 +10,8 @@ end of token steps.
 
 Where an agent comes into conflict, all motion tokens are looked at, and it learns to take
 one that is not (``terms``). Nothing is learned of the tokens that follow while it is in
-conflict: two in three are such, and hardly a likely token averts it any more.
+conflict: two in three are such, and hardly a likely token averts it any more. The ego is
+told of none, as it drove more slowly with them.
 """
 
 from dataclasses import dataclass
@@ -19,21 +20,22 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from infgen.geometry import box_radius_m, boxes_overlap, to_local, to_world, wrap_angle
-from infgen.model.training.policy_gradient.braking import (
+from infgen.model.training.policy_gradient.avoided.braking import (
     LOOK_AHEAD_TOKENS,
     AgentPath,
     braking_arc_m,
 )
-from infgen.model.training.policy_gradient.policy_lesson import AvoidedTokens
+from infgen.model.training.policy_gradient.avoided.tokens import AvoidedTokens
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
 from infgen.scene import AgentType
+from infgen.tokens.scene_tokens import EGO
 from infgen.tokens.vocabulary import MotionVocabulary
 
 
 def find_conflicts(
     rollouts: SimulatedRollouts, vocabulary: MotionVocabulary
 ) -> AvoidedTokens:
-    """Find who came into conflict.
+    """Find who came into conflict, the ego aside.
 
     Args:
         rollouts: Simulated agents.
@@ -42,6 +44,7 @@ def find_conflicts(
     taken = conflicts_taken(rollouts, vocabulary)
     begins = taken.copy()
     begins[:, 1:] &= ~taken[:, :-1]
+    begins[..., EGO] = False
     at = np.argwhere(begins)
     every = np.arange(vocabulary.num_motion_tokens)
     choices = np.column_stack([at.repeat(len(every), axis=0), np.tile(every, len(at))])

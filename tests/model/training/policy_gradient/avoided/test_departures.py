@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from infgen.model.training.policy_gradient.departures import DRIVES_M, find_departures
+from infgen.model.training.policy_gradient.avoided.departures import (
+    DRIVES_M,
+    find_departures,
+)
 from infgen.model.training.policy_gradient.road import Road
 from infgen.scene import AgentType
 from infgen.spatial.road_edges import build_road_edges

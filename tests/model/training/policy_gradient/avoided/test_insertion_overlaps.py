@@ -12,7 +12,7 @@ from infgen.config import TrainSettings
 from infgen.geometry import boxes_overlap
 from infgen.model.batching.batch import collate
 from infgen.model.insertion.agent_spacing import MAX_SWEPT_M
-from infgen.model.training.policy_gradient.insertion_overlaps import (
+from infgen.model.training.policy_gradient.avoided.insertion_overlaps import (
     InsertionOverlaps,
     find_insertion_overlaps,
 )
@@ -44,6 +44,16 @@ def rollouts(network, logged):
     agents = found.batch.agents
     agents = replace(agents, size_lwh_m=5 * agents.size_lwh_m)
     return replace(found, batch=replace(found.batch, agents=agents))
+
+
+def overlaps_alone(network, logged, rollouts):
+    """The first rollout, in which nothing else is to be learned."""
+    lesson = simulate_lessons(network, logged, HOW, 5).lessons[0]
+    overlaps = find_insertion_overlaps(rollouts, network.grid).only(rollouts.rows(0))
+    assert torch.equal(overlaps.at, lesson.insertion_overlaps.at)
+    names = ("advantage", "type_advantage", "count_advantage")
+    nothing = {x: torch.zeros_like(getattr(lesson, x)) for x in names}
+    return replace(lesson, insertion_overlaps=overlaps, **nothing)
 
 
 def insertions(rollouts):
@@ -149,6 +159,32 @@ def test_those_of_some_rollouts_are_numbered_from_the_first(network, rollouts):
     assert int(found.at[:, 0].max()) > 1
 
 
+def test_cells_near_to_the_sampled_one_are_those_within_twelve_metres(network, rollouts):
+    centre_m = torch.from_numpy(network.grid.centre_m)
+
+    found = find_insertion_overlaps(rollouts, network.grid)
+
+    rollout, place = found.at.T
+    sampled_m = centre_m[rollouts.batch.details.cell[rollout, place]]
+    assert torch.equal(found.near, torch.cdist(sampled_m, centre_m) <= 12.0)
+
+
+def test_cells_far_from_the_sampled_one_are_left_as_they_are(network, logged, rollouts):
+    lesson = overlaps_alone(network, logged, rollouts)
+    overlaps, details = lesson.insertion_overlaps, lesson.batch.details
+    stationary = torch.from_numpy(network.motion_vocabulary().stationary)
+    outputs, pretrained = network(lesson.batch), network(lesson.batch)
+    outputs.entries.position_logits.retain_grad()
+
+    policy_terms(outputs, pretrained, lesson, stationary, HOW)["policy"].loss.backward()
+
+    scene, place = overlaps.at.T
+    row = outputs.entries.rows.number[scene, details.token[scene, place]]
+    found = outputs.entries.position_logits.grad[row, details.turn[scene, place]]
+    assert found[overlaps.near].any()
+    assert not found[~overlaps.near].any()
+
+
 def test_there_may_be_no_insertion(network, rollouts):
     details = rollouts.batch.details
     nothing = replace(details, present=torch.zeros_like(details.present))
@@ -175,12 +211,8 @@ def test_lessons_look_at_them_where_they_cost(network, logged):
 
 
 def test_places_on_others_become_less_likely(network, logged, rollouts):
-    lesson = simulate_lessons(network, logged, HOW, 5).lessons[0]
-    names = ("advantage", "type_advantage", "count_advantage")
-    nothing = {x: torch.zeros_like(getattr(lesson, x)) for x in names}
-    overlaps = find_insertion_overlaps(rollouts, network.grid).only(rollouts.rows(0))
-    assert torch.equal(overlaps.at, lesson.insertion_overlaps.at)
-    lesson = replace(lesson, insertion_overlaps=overlaps, **nothing)
+    lesson = overlaps_alone(network, logged, rollouts)
+    overlaps = lesson.insertion_overlaps
     stationary = torch.from_numpy(network.motion_vocabulary().stationary)
 
     def loss(asked):
@@ -197,10 +229,11 @@ def test_places_on_others_become_less_likely(network, logged, rollouts):
             lesson.batch.details.turn[scene, place],
         )
         row = outputs.entries.rows.number[scene, at[0]]
+        cells = outputs.entries.position_logits[row, at[1]]
         return [
             (logits.softmax(dim=-1) * marked).sum(dim=-1)
             for logits, marked in (
-                (outputs.entries.position_logits[row, at[1]], overlaps.cell),
+                (cells.masked_fill(~overlaps.near, -torch.inf), overlaps.cell),
                 (outputs.details.offset_logits[details], overlaps.offset),
                 (outputs.details.heading_logits[details], overlaps.heading),
             )

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from infgen.geometry import to_world
-from infgen.model.training.policy_gradient.policy_lesson import AvoidedTokens
+from infgen.model.training.policy_gradient.avoided.tokens import AvoidedTokens
 from infgen.model.training.policy_gradient.rewards import SeenAgents
 from infgen.model.training.policy_gradient.road import Road
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts

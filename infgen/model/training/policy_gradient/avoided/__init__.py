@@ -1,0 +1,1 @@
+"""What is to be avoided in rollouts, of all choices of the vocabulary."""
