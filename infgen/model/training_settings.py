@@ -175,7 +175,8 @@ class TrainSettings:
     departure_penalty: NonNegative = 0.0
     """The same of motion tokens by which vehicles drive off the road or stay off it."""
     creeping_penalty: NonNegative = 0.0
-    """The same of motion tokens by which vehicles creep on, with no other agent ahead."""
+    """The same of motion tokens by which vehicles creep on, with no other agent ahead, as
+    far as there are more of them than in the logs."""
     insertion_overlap_penalty: NonNegative = 0.0
     """The same of places at which an agent is inserted onto another one, or onto what its
     box sweeps in the next token step."""

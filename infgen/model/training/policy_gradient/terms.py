@@ -66,7 +66,7 @@ def policy_terms(
         (settings.departure_penalty, lesson.departures),
         (settings.creeping_penalty, lesson.creeping),
     ):
-        gained = gained - penalty * _from_other_tokens(*both, tokens)
+        gained = gained - penalty * tokens.excess * _from_other_tokens(*both, tokens)
     overlap = _from_other_places(*both, lesson)
     gained = gained - settings.insertion_overlap_penalty * overlap
     nothing = gained.new_zeros(())

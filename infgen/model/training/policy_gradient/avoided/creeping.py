@@ -4,16 +4,24 @@ A vehicle that sets off without need is where hardly a log has one, neither stan
 its way, and creeps on for seconds. So do logged ones, but mostly behind another one. A
 token creeps on if it is as slow as those of the two seconds before it, and no other agent
 is just ahead. Where one was taken, the vehicle learns to take another (``terms``), to stop
-or to speed up: the pretrained network tells how likely either is.
+or to speed up: the pretrained network tells how likely either is. Only what is more of it
+than in the logs of the batch counts.
 """
+
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Int64
+from torch import Tensor
 
 from infgen.geometry import to_local
+from infgen.model.batching.batch import Agents
+from infgen.model.batching.supervision import preceding
 from infgen.model.training.policy_gradient.avoided.tokens import AvoidedTokens
-from infgen.model.training.policy_gradient.rewards import SeenAgents
-from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
+from infgen.model.training.policy_gradient.rollouts import (
+    HISTORY_TOKENS,
+    SimulatedRollouts,
+)
 from infgen.scene import AgentType
 from infgen.tokens.vocabulary import MotionVocabulary
 
@@ -34,29 +42,42 @@ def find_creeping(
         rollouts: Simulated agents.
         vocabulary: Of their motion tokens.
     """
-    seen = SeenAgents.of(rollouts)
     way_m = np.linalg.norm(vocabulary.end_pose[int(AgentType.VEHICLE), :, :2], axis=-1)
     least_m, most_m = CREEPS_M
     creeps = (way_m > least_m) & (way_m <= most_m)
-    taken = seen.moved & (seen.agent_type == AgentType.VEHICLE)[:, None]
-    taken &= creeps[np.maximum(seen.motion_token, 0)]
+    at, tokens = _creeping_on(rollouts.batch.agents, rollouts.moved, creeps)
+    logged = rollouts.logged
+    moved = logged.observed & preceding(logged.visible) & (logged.motion_token >= 0)
+    moved[:, :HISTORY_TOKENS] = False
+    in_logs, log_tokens = _creeping_on(logged, moved, creeps)
+    expected = len(in_logs) / max(log_tokens, 1) * tokens
+    avoided = np.broadcast_to(creeps, (len(at), len(creeps)))
+    found = AvoidedTokens.where_some(at, avoided, len(at), rollouts.moved.device)
+    return replace(found, excess=max(0.0, 1 - expected / max(len(at), 1)))
+
+
+def _creeping_on(
+    agents: Agents, moved: Bool[Tensor, "rollout token agent"], creeps: np.ndarray
+) -> tuple[Int64[np.ndarray, "row 3"], int]:
+    """Find who creeps on: rollout, token, agent; and count the tokens of vehicles."""
+    token = agents.motion_token.numpy(force=True)
+    vehicle = (agents.agent_type == int(AgentType.VEHICLE))[:, None] & moved
+    asked = vehicle.numpy(force=True)
+    taken = asked & creeps[token.clip(0, len(creeps) - 1)] & (token < len(creeps))
     on = taken.copy()
     on[:, :CREPT_TOKENS] = False
     for back in range(1, CREPT_TOKENS + 1):
         on[:, back:] &= taken[:, :-back]
     at = np.argwhere(on)
-    at = at[~_is_behind(rollouts, seen, at)]
-    avoided = np.broadcast_to(creeps, (len(at), len(creeps)))
-    return AvoidedTokens.where_some(at, avoided, len(at), rollouts.moved.device)
+    return at[~_is_behind(agents, at)], int(asked.sum())
 
 
-def _is_behind(
-    rollouts: SimulatedRollouts, seen: SeenAgents, at: Int64[np.ndarray, "row 3"]
-) -> Bool[np.ndarray, " row"]:
+def _is_behind(agents: Agents, at: Int64[np.ndarray, "row 3"]) -> Bool[np.ndarray, " row"]:
     """Tell who has another agent ahead before a token step."""
     rollout, token, agent = at.T
-    others, own = seen.pose[rollout, token - 1], seen.pose[rollout, token - 1, agent]
-    there = rollouts.batch.agents.visible.numpy(force=True)[rollout, token - 1]
+    pose, visible = (x.numpy(force=True) for x in (agents.pose, agents.visible))
+    others, there = pose[rollout, token - 1], visible[rollout, token - 1]
+    own = others[np.arange(len(at)), agent]
     there[np.arange(len(at)), agent] = False
     place_m = to_local(others, np.broadcast_to(own[:, None], others.shape))
     ahead_m, aside_m = place_m[..., 0], np.abs(place_m[..., 1])

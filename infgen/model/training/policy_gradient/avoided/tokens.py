@@ -1,6 +1,6 @@
 """Motion tokens that are to be avoided, where agents took one of them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,11 +18,13 @@ class AvoidedTokens:
         at: Rollout, token step at whose end the motion token ends, agent.
         avoided: Which motion tokens are to be avoided there, some but not all.
         taken: How many of those that were taken are, also where nothing is learned.
+        excess: Share of them that are more than in the logs; 1 if logs have none.
     """
 
     at: Int64[Tensor, "row 3"]
     avoided: Bool[Tensor, "row motion_token"]
     taken: int
+    excess: float = 1.0
 
     @classmethod
     def none(cls, vocabulary: MotionVocabulary, device: torch.device) -> "AvoidedTokens":
@@ -50,4 +52,4 @@ class AvoidedTokens:
         some = (rollout >= rows.start) & (rollout < rows.stop)
         at = self.at[some]
         at[:, 0] -= rows.start
-        return AvoidedTokens(at, self.avoided[some], self.taken)
+        return replace(self, at=at, avoided=self.avoided[some])

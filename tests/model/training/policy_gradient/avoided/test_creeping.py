@@ -1,5 +1,7 @@
 """Motion tokens that creep on: token k goes k metres, so of them the first alone creeps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from infgen.model.training.policy_gradient.avoided.creeping import (
     CREPT_TOKENS,
     find_creeping,
 )
+from infgen.model.training.policy_gradient.rollouts import HISTORY_TOKENS
 from infgen.scene import AgentType
 
 METRES = 24
@@ -81,3 +84,22 @@ def test_only_vehicles_whose_tokens_were_sampled_creep(drawn, metres):
     rollouts.batch.agents.agent_type.fill_(int(AgentType.CYCLIST))
 
     assert not find_creeping(rollouts, metres).taken
+
+
+def test_only_what_is_more_than_in_the_logs_counts(drawn, metres):
+    slow, fast = way(*[1] * (CREPT_TOKENS + 4)), way(*[3] * (CREPT_TOKENS + 4))
+    rollouts = drawn(np.stack([slow, slow, slow], axis=0)[:, :, None])
+    rollouts.moved[:, :HISTORY_TOKENS] = False  # As in rollouts.
+    half, none = (
+        drawn(np.stack(x, axis=0)[:, :, None])
+        for x in ([slow, fast, fast], [fast, fast, fast])
+    )
+
+    excess = [
+        find_creeping(replace(rollouts, logged=logged.batch.agents), metres).excess
+        for logged in (rollouts, half, none)
+    ]
+
+    assert excess[0] == 0
+    assert 0.5 < excess[1] < 1
+    assert excess[2] == 1
