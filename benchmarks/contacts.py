@@ -171,7 +171,9 @@ def measure(root: Path, count: int) -> tuple[Side, Side]:
     """
     scenes = open_scene_lookup([str((root / "latest" / "ingest").resolve())])
     logs, played = Side(), Side()
-    for scenario_id, some in groupby(_rollouts(root), key=lambda one: one.scenario_id):
+    for scenario_id, some in groupby(
+        stored_rollouts(root), key=lambda one: one.scenario_id
+    ):
         scene = scenes.find(scenario_id)
         lanes = lane_segments(scene)
         take(logs, observe_log(scene), lanes)
@@ -183,7 +185,8 @@ def measure(root: Path, count: int) -> tuple[Side, Side]:
     return logs, played
 
 
-def _rollouts(root: Path) -> Iterator[Traffic]:
+def stored_rollouts(root: Path) -> Iterator[Traffic]:
+    """Read all rollouts of a root, one after the other."""
     for unit in unit_folders(root / "latest" / "rollout") or []:
         yield from map(from_rollout, read_rollouts(unit))
 

@@ -1,4 +1,4 @@
-"""Creeping: motion tokens by which a vehicle creeps on, with nobody ahead of it.
+"""Creeping: motion tokens by which a vehicle creeps on, with no other agent ahead.
 
 A vehicle that sets off without need is where hardly a log has one, neither standing nor on
 its way, and creeps on for seconds. So do logged ones, but mostly behind another one. A

@@ -1,0 +1,159 @@
+"""How long vehicles creep, and what for.
+
+Reads the logs and the rollouts of a root::
+
+    python benchmarks/creeping.py ROOT [--count 4]
+
+The first table has vehicles every half second after now: the shares that stand, creep (0.5
+to 2.5 m/s) and drive, and how fast all that move are. The second has those that creep for
+four seconds or more without a break, of each log and rollout: how many had another agent
+within 12 m ahead halfway, and what they did before and afterwards. The last line is one
+JSON object.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from contacts import stored_rollouts
+
+from infgen.geometry import to_local
+from infgen.metrics.kinematics import speed
+from infgen.metrics.traffic import Traffic, observe_log
+from infgen.model.training.policy_gradient.avoided.creeping import AHEAD_M, ASIDE_M
+from infgen.scene import AgentType
+from pipeline.commands.screen import show_table
+from pipeline.storage.scene_lookup import open_scene_lookup
+
+CREEPS_MPS = (0.5, 2.5)
+FASTEST_MPS = 40.0
+"""Faster ones have not been there a tenth of a second before."""
+LONG_STEPS = 40
+EVERY_STEPS = 5
+HOW = ("stand", "creep", "drive")
+RUNS = (
+    "of each",
+    "behind another",
+    "stood before",
+    "drove before",
+    "stand then",
+    "drive then",
+)
+
+
+@dataclass(slots=True)
+class Side:
+    """Logs, or rollouts.
+
+    Attributes:
+        count: How many.
+        speed_mps: Of vehicles, every half second.
+        runs: What is told of each long one that creeps, as ``RUNS`` but for the first.
+    """
+
+    count: int = 0
+    speed_mps: list[np.ndarray] = field(default_factory=list)
+    runs: list[tuple[bool, ...]] = field(default_factory=list)
+
+
+def take(side: Side, traffic: Traffic) -> None:
+    """Measure one log or rollout."""
+    motion, now = traffic.motion, traffic.now
+    side.count += 1
+    vehicle = motion.agent_type == AgentType.VEHICLE
+    speed_mps = speed(motion.x_m, motion.y_m)[0]
+    there = motion.valid[0] & vehicle[:, None] & (speed_mps < FASTEST_MPS)
+    there[:, : now + 1] = False
+    some = there[:, now + 1 :: EVERY_STEPS]
+    side.speed_mps.append(speed_mps[:, now + 1 :: EVERY_STEPS][some])
+    slow, fast = CREEPS_MPS
+    creeps = there & (speed_mps >= slow) & (speed_mps <= fast)
+    edges = np.diff(np.pad(creeps, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    begins, ends = np.argwhere(edges == 1), np.argwhere(edges == -1)
+    for (agent, begin), (_, end) in zip(begins, ends, strict=True):
+        if end - begin >= LONG_STEPS:
+            around = [
+                speed_mps[agent, at] for at in (begin - 1, min(end, there.shape[1] - 1))
+            ]
+            before, then = (x if x < FASTEST_MPS else np.nan for x in around)
+            behind = is_behind(traffic, agent, (begin + end) // 2)
+            told = behind, before < slow, before > fast, then < slow, then > fast
+            side.runs.append(tuple(map(bool, told)))
+
+
+def is_behind(traffic: Traffic, agent: int, step: int) -> bool:
+    """Tell whether an agent has another one just ahead at a step."""
+    motion = traffic.motion
+    parts = (motion.x_m, motion.y_m, motion.heading_rad)
+    pose = np.stack([part[0, :, step] for part in parts], axis=-1)
+    place_m = to_local(pose, np.broadcast_to(pose[agent], pose.shape))
+    near = (place_m[:, 0] > 0) & (place_m[:, 0] <= AHEAD_M)
+    near &= (np.abs(place_m[:, 1]) <= ASIDE_M) & motion.valid[0, :, step]
+    near[agent] = False
+    return bool(near.any())
+
+
+def measure(root: Path, count: int) -> tuple[Side, Side]:
+    """Measure the logs that have rollouts in a root, and some rollouts of each.
+
+    Raises:
+        FileNotFoundError: if there are none.
+    """
+    scenes = open_scene_lookup([str((root / "latest" / "ingest").resolve())])
+    logs, played = Side(), Side()
+    for scenario_id, some in groupby(stored_rollouts(root), key=lambda x: x.scenario_id):
+        take(logs, observe_log(scenes.find(scenario_id)))
+        for traffic in some:
+            if traffic.index < count:
+                take(played, traffic)
+    if not played.count:
+        raise FileNotFoundError(f"{root} has no rollouts")
+    return logs, played
+
+
+def report(logs: Side, played: Side) -> dict[str, Any]:
+    """Print the tables; return their numbers."""
+    found: dict[str, Any] = {}
+    for who, side in (("logs", logs), ("rollouts", played)):
+        speed_mps = np.concatenate(side.speed_mps)
+        group = np.searchsorted(CREEPS_MPS, speed_mps)
+        shares = np.bincount(group, minlength=len(HOW)) / max(len(group), 1)
+        moving_mps = float(speed_mps[group > 0].mean()) if group.any() else 0.0
+        told = np.array(side.runs, dtype=float).reshape(-1, len(RUNS) - 1)
+        runs = [
+            len(told) / side.count,
+            *(told.mean(axis=0) if len(told) else told.sum(axis=0)),
+        ]
+        found[who] = {
+            **dict(zip(HOW, shares.tolist(), strict=True)),
+            "moving_mps": moving_mps,
+            "runs": dict(zip(RUNS, map(float, runs), strict=True)),
+        }
+    rows = [
+        (who, *(f"{100 * one[how]:.1f} %" for how in HOW), f"{one['moving_mps']:.2f}")
+        for who, one in found.items()
+    ]
+    show_table("vehicles every half second", ("", *HOW, "those that move, m/s"), rows)
+    rows = [
+        (who, *(f"{x:.2f}" for x in one["runs"].values())) for who, one in found.items()
+    ]
+    show_table("vehicles that creep for 4 s or more", ("", *RUNS), rows)
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the tables of a root."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("root", type=Path, help="root with stages ingest and rollout")
+    parser.add_argument("--count", type=int, default=4, help="rollouts of each scene")
+    asked = parser.parse_args(arguments)
+    print(json.dumps(report(*measure(asked.root, asked.count))))
+
+
+if __name__ == "__main__":
+    main()
