@@ -255,7 +255,7 @@ def _rates(counts: "FlowCounts") -> dict[str, float | None]:
 
 STAGE = Stage(
     name="calibrate",
-    version=11,
+    version=12,
     settings={
         "tokenize": TokenSettings,
         "rollout": RolloutSettings,

@@ -189,7 +189,7 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=13,
+    version=14,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=simulate,
