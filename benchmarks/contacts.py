@@ -30,7 +30,7 @@ from infgen.geometry import boxes_overlap, wrap_angle
 from infgen.metrics.kinematics import speed
 from infgen.metrics.traffic import Traffic, from_rollout, observe_log
 from infgen.rollout.rules.off_road import Lanes, lane_segments
-from infgen.scene import AgentType
+from infgen.scene import AgentType, Scene
 from infgen.spatial.road_edges import project
 from pipeline.commands.screen import show_table
 from pipeline.storage.rollouts import read_rollouts
@@ -169,26 +169,46 @@ def measure(root: Path, count: int) -> tuple[Side, Side]:
     Raises:
         FileNotFoundError: if there are none.
     """
-    scenes = open_scene_lookup([str((root / "latest" / "ingest").resolve())])
     logs, played = Side(), Side()
-    for scenario_id, some in groupby(
-        stored_rollouts(root), key=lambda one: one.scenario_id
-    ):
-        scene = scenes.find(scenario_id)
+    for scene, log, rollouts in logs_and_rollouts(root, count):
         lanes = lane_segments(scene)
-        take(logs, observe_log(scene), lanes)
-        for traffic in some:
-            if traffic.index < count:
-                take(played, traffic, lanes)
-    if not played.count:
-        raise FileNotFoundError(f"{root} has no rollouts")
+        take(logs, log, lanes)
+        for traffic in rollouts:
+            take(played, traffic, lanes)
     return logs, played
 
 
-def stored_rollouts(root: Path) -> Iterator[Traffic]:
-    """Read all rollouts of a root, one after the other."""
+def logs_and_rollouts(
+    root: Path, count: int
+) -> Iterator[tuple[Scene, Traffic, list[Traffic]]]:
+    """Read each scene that has rollouts in a root, its log, and its first rollouts.
+
+    Raises:
+        FileNotFoundError: if there are none.
+    """
+    scenes = open_scene_lookup([str((root / "latest" / "ingest").resolve())])
+    found = False
+    for scenario_id, some in groupby(_rollouts(root), key=lambda one: one.scenario_id):
+        rollouts = [traffic for traffic in some if traffic.index < count]
+        found |= bool(rollouts)
+        scene = scenes.find(scenario_id)
+        yield scene, observe_log(scene), rollouts
+    if not found:
+        raise FileNotFoundError(f"{root} has no rollouts")
+
+
+def _rollouts(root: Path) -> Iterator[Traffic]:
     for unit in unit_folders(root / "latest" / "rollout") or []:
         yield from map(from_rollout, read_rollouts(unit))
+
+
+def asked_root(about: str | None, arguments: Sequence[str] | None) -> tuple[Path, int]:
+    """Parse a root, and how many rollouts of each scene are looked at."""
+    parser = argparse.ArgumentParser(description=(about or "").splitlines()[0])
+    parser.add_argument("root", type=Path, help="root with stages ingest and rollout")
+    parser.add_argument("--count", type=int, default=4, help="rollouts of each scene")
+    asked = parser.parse_args(arguments)
+    return asked.root, asked.count
 
 
 def report(logs: Side, played: Side) -> dict[str, Any]:
@@ -232,11 +252,7 @@ def _spread(values: np.ndarray) -> dict[str, float]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables of a root."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("root", type=Path, help="root with stages ingest and rollout")
-    parser.add_argument("--count", type=int, default=4, help="rollouts of each scene")
-    asked = parser.parse_args(arguments)
-    print(json.dumps(report(*measure(asked.root, asked.count))))
+    print(json.dumps(report(*measure(*asked_root(__doc__, arguments)))))
 
 
 if __name__ == "__main__":

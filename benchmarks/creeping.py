@@ -11,24 +11,21 @@ within 12 m ahead halfway, and what they did before and afterwards. The last lin
 JSON object.
 """
 
-import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from contacts import stored_rollouts
+from contacts import asked_root, logs_and_rollouts
 
 from infgen.geometry import to_local
 from infgen.metrics.kinematics import speed
-from infgen.metrics.traffic import Traffic, observe_log
+from infgen.metrics.traffic import Traffic
 from infgen.model.training.policy_gradient.avoided.creeping import AHEAD_M, ASIDE_M
 from infgen.scene import AgentType
 from pipeline.commands.screen import show_table
-from pipeline.storage.scene_lookup import open_scene_lookup
 
 CREEPS_MPS = (0.5, 2.5)
 FASTEST_MPS = 40.0
@@ -104,15 +101,11 @@ def measure(root: Path, count: int) -> tuple[Side, Side]:
     Raises:
         FileNotFoundError: if there are none.
     """
-    scenes = open_scene_lookup([str((root / "latest" / "ingest").resolve())])
     logs, played = Side(), Side()
-    for scenario_id, some in groupby(stored_rollouts(root), key=lambda x: x.scenario_id):
-        take(logs, observe_log(scenes.find(scenario_id)))
-        for traffic in some:
-            if traffic.index < count:
-                take(played, traffic)
-    if not played.count:
-        raise FileNotFoundError(f"{root} has no rollouts")
+    for _, log, rollouts in logs_and_rollouts(root, count):
+        take(logs, log)
+        for traffic in rollouts:
+            take(played, traffic)
     return logs, played
 
 
@@ -148,11 +141,7 @@ def report(logs: Side, played: Side) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables of a root."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("root", type=Path, help="root with stages ingest and rollout")
-    parser.add_argument("--count", type=int, default=4, help="rollouts of each scene")
-    asked = parser.parse_args(arguments)
-    print(json.dumps(report(*measure(asked.root, asked.count))))
+    print(json.dumps(report(*measure(*asked_root(__doc__, arguments)))))
 
 
 if __name__ == "__main__":
