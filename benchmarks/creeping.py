@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 from contacts import asked_root, logs_and_rollouts
 
-from infgen.geometry import to_local
+from infgen.clock import CLOCK
 from infgen.metrics.kinematics import speed
 from infgen.metrics.traffic import Traffic
-from infgen.model.training.policy_gradient.avoided.creeping import AHEAD_M, ASIDE_M
+from infgen.model.training.policy_gradient.avoided.creeping import CREEPS_M, is_behind
 from infgen.scene import AgentType
 from pipeline.commands.screen import show_table
 
-CREEPS_MPS = (0.5, 2.5)
+CREEPS_MPS = tuple(each_m / CLOCK.token_s for each_m in CREEPS_M)
 FASTEST_MPS = 40.0
 """Faster ones have not been there a tenth of a second before."""
 LONG_STEPS = 40
@@ -68,6 +68,7 @@ def take(side: Side, traffic: Traffic) -> None:
     there[:, : now + 1] = False
     some = there[:, now + 1 :: EVERY_STEPS]
     side.speed_mps.append(speed_mps[:, now + 1 :: EVERY_STEPS][some])
+    parts = motion.x_m, motion.y_m, motion.heading_rad
     slow, fast = CREEPS_MPS
     creeps = there & (speed_mps >= slow) & (speed_mps <= fast)
     edges = np.diff(np.pad(creeps, ((0, 0), (1, 1))).astype(np.int8), axis=1)
@@ -78,21 +79,12 @@ def take(side: Side, traffic: Traffic) -> None:
                 speed_mps[agent, at] for at in (begin - 1, min(end, there.shape[1] - 1))
             ]
             before, then = (x if x < FASTEST_MPS else np.nan for x in around)
-            behind = is_behind(traffic, agent, (begin + end) // 2)
+            step = (begin + end) // 2
+            pose = np.stack([part[0, :, step] for part in parts], axis=-1)
+            there_then = motion.valid[:1, :, step]
+            behind = is_behind(pose[None], there_then, np.array([agent]))[0]
             told = behind, before < slow, before > fast, then < slow, then > fast
             side.runs.append(tuple(map(bool, told)))
-
-
-def is_behind(traffic: Traffic, agent: int, step: int) -> bool:
-    """Tell whether an agent has another one just ahead at a step."""
-    motion = traffic.motion
-    parts = (motion.x_m, motion.y_m, motion.heading_rad)
-    pose = np.stack([part[0, :, step] for part in parts], axis=-1)
-    place_m = to_local(pose, np.broadcast_to(pose[agent], pose.shape))
-    near = (place_m[:, 0] > 0) & (place_m[:, 0] <= AHEAD_M)
-    near &= (np.abs(place_m[:, 1]) <= ASIDE_M) & motion.valid[0, :, step]
-    near[agent] = False
-    return bool(near.any())
 
 
 def measure(root: Path, count: int) -> tuple[Side, Side]:

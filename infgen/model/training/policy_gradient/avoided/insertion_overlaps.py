@@ -4,9 +4,8 @@ That an inserted agent overlaps another is rare, and its reward tells only of th
 was sampled. Where the others are tells more: for every other cell, offset token and heading
 that might have been sampled for an agent, whether its box would overlap one of them, all
 else about the agent as it was. The network learns to sample one that does not, of each of
-the three choices, at every insertion; of cells, one near to the sampled one: if the odds of
-all others rose, vehicles that would have parked in a row would be inserted on lanes, and
-more of them would drive than in the logs.
+the three choices, at every insertion; of cells, one near to the sampled one, so that who
+would have parked in a row is put beside it, not on a lane far away.
 
 Others are those present, each with what its box sweeps in the next token step if it moves
 on, and those inserted in turns before. Two pedestrians may overlap: groups walk closer than
