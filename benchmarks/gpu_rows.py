@@ -29,13 +29,13 @@ from infgen.model.batching.batch import Limits, MapTokens, collate, to_device
 from infgen.model.neighbours import MapFeatures
 from infgen.model.network import Network
 from infgen.model.relations import Rows
+from infgen.model.sampling import choose
 from infgen.model.step_memory import StepMemory
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import MotionStep, TokenStep
 from infgen.pretrained import builtin_weights
 from infgen.rollout.precision import Precision, describe_precision, make_stepper
 from infgen.rollout.recording import Frame, RolloutStart
-from infgen.rollout.sampling import choose
 from infgen.rollout.session import Session
 from infgen.rollout.simulator import Simulator
 from infgen.scene import Scene

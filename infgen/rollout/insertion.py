@@ -9,6 +9,7 @@ from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from infgen.model.insertion.detail_query import InsertionDetails
+from infgen.model.sampling import choose, sample_event
 from infgen.model.step_memory import Insertions, StepMemory
 from infgen.model.token_step import PositionOutputs
 from infgen.rollout.insertion_state import (
@@ -20,7 +21,6 @@ from infgen.rollout.insertion_state import (
 )
 from infgen.rollout.population import InsertedAgents, Population
 from infgen.rollout.random_streams import WORDS, Purpose
-from infgen.rollout.sampling import choose, sample_event
 from infgen.rollout.simulator import Simulator
 from infgen.tokens.grid import Grid, decode_heading, encode_cell
 

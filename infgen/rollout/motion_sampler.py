@@ -8,12 +8,12 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from infgen.clock import CLOCK
+from infgen.model.sampling import choose, sample_event
 from infgen.model.token_step import MotionStep
 from infgen.rollout.population import EGO_ROW, Population
 from infgen.rollout.random_streams import Purpose, Streams
 from infgen.rollout.rules.rejection import MotionCheck
 from infgen.rollout.rules.stalls import StallRule
-from infgen.rollout.sampling import choose, sample_event
 from infgen.rollout.simulator import Simulator
 from infgen.tokens.scene_tokens import Presence
 

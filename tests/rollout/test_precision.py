@@ -11,11 +11,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import infgen
 from infgen.config import RolloutSettings
+from infgen.model.sampling import choose
 from infgen.model.stepping import Stepper
 from infgen.pretrained import builtin_weights
 from infgen.rollout.precision import PrecisionStepper, describe_precision, make_stepper
 from infgen.rollout.recording import RolloutStart
-from infgen.rollout.sampling import choose
 from infgen.rollout.session import Session
 from infgen.rollout.simulator import Simulator
 from infgen.sources.towns import builtin_records

@@ -30,8 +30,8 @@ from infgen.model.batching.batch import Batch
 from infgen.model.batching.padding import NO_AGENT
 from infgen.model.long_memory import count_around
 from infgen.model.network import Network
+from infgen.model.sampling import choose
 from infgen.model.training.closed_loop import move_near_log
-from infgen.model.training.own_choices import choose_among
 from infgen.model.training.population_targets import targets
 from infgen.model.training.simulation import (
     ABSENT,
@@ -171,7 +171,7 @@ class _PopulationLoop(Simulation):
         uniform = self.uniforms.draw(*who.shape)
         scene, row = who.nonzero(as_tuple=True)
         top = self.top or SURPLUS_TOP_K
-        chosen = choose_among(logits[scene, row], uniform[scene, row], top)
+        chosen = choose(logits[scene, row], uniform[scene, row], top)
         self.move_by(token, (scene, row), chosen)
         self.off[scene, token, row] = True
 

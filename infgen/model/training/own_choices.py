@@ -9,6 +9,7 @@ from torch import Tensor
 from infgen.model.insertion.detail_query import InsertionDetails
 from infgen.model.neighbours import cell_pose
 from infgen.model.relations import wrap_angle
+from infgen.model.sampling import choose
 from infgen.model.step_memory import Insertions
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import PositionOutputs
@@ -38,21 +39,6 @@ class UniformNumbers:
             self.generator = torch.Generator().manual_seed(self.seed)
         drawn = torch.rand(shape, generator=self.generator, dtype=torch.float64)
         return drawn.to(self.device)
-
-
-def choose_among(logits: Tensor, uniform: Tensor, top: int = 0) -> Tensor:
-    """Sample the last dimension of logits [..., choice] by uniform numbers [...].
-
-    Args:
-        logits: Unnormalised log-probabilities.
-        uniform: Numbers in [0, 1).
-        top: Sample from so many most likely choices only; 0 for all of them.
-    """
-    best, index = logits.double().topk(min(top, logits.shape[-1]) or logits.shape[-1])
-    reached = best.softmax(dim=-1).cumsum(dim=-1)
-    rank = (uniform[..., None] * reached[..., -1:] >= reached).sum(dim=-1)
-    rank = rank.clamp(max=reached.shape[-1] - 1)
-    return index.gather(-1, rank[..., None])[..., 0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,21 +72,21 @@ def sample_agent(
     """Sample where an agent is inserted and what it is, of every rollout that goes on."""
     count = len(query.add_logit)
     if query.position_logits is not None:
-        cell, regressed_m = choose_among(query.position_logits, uniforms.draw(count)), None
+        cell, regressed_m = choose(query.position_logits, uniforms.draw(count)), None
     else:
         assert query.position_m is not None
         regressed_m = _within(query.position_m, grid)
         found = torch.from_numpy(encode_cell(regressed_m.numpy(force=True), grid))
         cell = found.to(regressed_m.device).long()
     details = stepper.entry_details(entries, cell, regressed_m)
-    agent_type = choose_among(details.agent_type_logits, uniforms.draw(count))
+    agent_type = choose(details.agent_type_logits, uniforms.draw(count))
     each = torch.arange(count, device=cell.device)
     if details.query is None:
         offset_m = None if details.offset_m is None else details.offset_m[each, agent_type]
         turned_rad = _turned(details, each, agent_type, uniforms, grid)
     else:
         logits = details.query.offset_logits(agent_type)
-        offset = choose_among(logits, uniforms.draw(count))
+        offset = choose(logits, uniforms.draw(count))
         offset_m = torch.from_numpy(grid.offset_m).to(cell.device)[offset]
         logits = details.query.heading_logits(agent_type, offset)
         turned_rad = _heading_rad(logits, uniforms, grid)
@@ -131,7 +117,7 @@ def _turned(
 
 def _heading_rad(logits: Tensor, uniforms: UniformNumbers, grid: Grid) -> Tensor:
     """Sample headings relative to the ego."""
-    bins = choose_among(logits, uniforms.draw(len(logits)))
+    bins = choose(logits, uniforms.draw(len(logits)))
     return (bins + 0.5) * (2 * math.pi / grid.num_headings) - math.pi
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from infgen.model.neighbours import cell_pose, grid_place
 from infgen.model.relations import Rows
+from infgen.model.sampling import choose, sample_event
 from infgen.model.step_memory import StepMemory
 from infgen.model.token_step import PositionOutputs, TokenStep
 from infgen.rollout.device.geometry import DeviceGrid, wrap_angle
@@ -28,7 +29,6 @@ from infgen.rollout.insertion import INSIDE, of_type, sample_offset_and_heading
 from infgen.rollout.insertion_state import TURN_PURPOSES, InsertionRequest
 from infgen.rollout.population import InsertedAgents, Population, insertion_pose
 from infgen.rollout.random_streams import WORDS, Purpose
-from infgen.rollout.sampling import choose, sample_event
 from infgen.tokens.scene_tokens import EGO, FIRST_MOTION_TOKEN, Presence
 
 LOGGED = 8

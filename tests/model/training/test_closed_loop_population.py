@@ -14,7 +14,6 @@ from infgen.model.training.closed_loop_population import (
     close_population_loop,
 )
 from infgen.model.training.losses import losses, total
-from infgen.model.training.own_choices import UniformNumbers, choose_among
 from infgen.model.training.simulation import FREE_ROWS
 from infgen.tokens.grid import from_grid, make_grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence
@@ -284,18 +283,6 @@ def test_agents_of_the_log_move_as_the_batch_has_it_if_nothing_is_chosen(restles
         one, two = getattr(played.agents, name)[:, :, :rows], getattr(logged.agents, name)
         moved = same & (played.agents.label[..., :rows] >= 0)
         assert torch.equal(one[moved], two[moved]), name
-
-
-def test_choices_have_their_probabilities():
-    logits = torch.tensor([0.5, 0.3, 0.2]).log().expand(20_000, 3)
-    uniform = UniformNumbers(0, torch.device("cpu")).draw(20_000)
-
-    chosen = choose_among(logits, uniform)
-    best = choose_among(logits, uniform, top=1)
-
-    share = torch.bincount(chosen) / len(chosen)
-    torch.testing.assert_close(share.double(), logits[0].exp().double(), atol=0.015, rtol=0)
-    assert (best == 0).all()
 
 
 def test_the_log_and_targets_of_a_batch_as_logged_agree(logged):

@@ -15,7 +15,7 @@ from torch.nn.functional import logsigmoid
 from infgen.model.batching.batch import Insertions
 from infgen.model.batching.supervision import following
 from infgen.model.logits import DetailOutputs, InsertionOutputs, Outputs
-from infgen.model.training.policy_gradient.nucleus import log_probabilities
+from infgen.model.training.policy_gradient.nucleus import log_probability
 from infgen.model.training.policy_gradient.policy_lesson import PolicyLesson
 from infgen.tokens.scene_tokens import Presence
 
@@ -75,8 +75,7 @@ def _motion_tokens(
     agent_type = agents.agent_type[:, None].expand(agents.presence.shape)
     apart = stationary[rows.pack(agent_type)[moves]]
     logits = outputs.motion.motion_logits[moves]
-    likely = log_probabilities(logits, apart, top_p, chosen)
-    return advantage, likely.gather(1, chosen[:, None])[:, 0]
+    return advantage, log_probability(logits, apart, top_p, chosen)
 
 
 def _inserted(outputs: Outputs, lesson: PolicyLesson) -> Iterator[_Part]:

@@ -1,67 +1,51 @@
-"""Motion tokens as rollouts sample them: from the nucleus, with their log-probabilities.
+"""Log-probabilities of motion tokens that were sampled from a nucleus.
 
-As in ``rollout.sampling``: tokens that stand still and tokens that move have a nucleus each
-and keep the probability that they have together. Here the log-probabilities of what was
-sampled have a gradient; the nucleus itself has none.
+As in ``sampling.choose``: tokens that stand still and tokens that move have a nucleus each
+and keep the probability that they have together. Log-probabilities have a gradient; the
+nucleus itself has none.
 """
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from infgen.model.sampling import sort_likely
 
-def log_probabilities(
+
+def log_probability(
     logits: Float[Tensor, "row choice"],
     stationary: Bool[Tensor, "row choice"],
     top_p: float,
-    chosen: Int64[Tensor, " row"] | None = None,
-) -> Float[Tensor, "row choice"]:
-    """Log-probability of every choice; minus infinity outside the nuclei.
+    chosen: Int64[Tensor, " row"],
+) -> Float[Tensor, " row"]:
+    """Log-probability of the choice that was made.
 
     Args:
         logits: Of the choices.
         stationary: Which of them have a nucleus of their own.
         top_p: Share of the probability of its group that a nucleus has; 1 for all choices.
-        chosen: Choices that belong to the nucleus whatever it is: rounding may put the
-            last one of a nucleus outside in another pass.
+        chosen: Belongs to the nucleus whatever it is: rounding may put the last one of a
+            nucleus outside in another pass.
     """
-    whole = logits.log_softmax(dim=-1)
+    at = chosen[:, None]
+    likely = logits.gather(1, at)[:, 0] - logits.logsumexp(dim=-1)
     if top_p >= 1:
-        return whole
-    kept = _nuclei(whole.detach(), stationary, top_p)
-    if chosen is not None:
-        kept = kept.scatter(1, chosen[:, None], value=True)
-    found = torch.full_like(whole, -torch.inf)
-    for group in (stationary, ~stationary):
-        lost = _together(whole, group) - _together(whole, group & kept)
-        found = torch.where(group & kept, whole + lost, found)
-    return found
+        return likely
+    group = stationary == stationary.gather(1, at)
+    own = logits.masked_fill(~group, -torch.inf)
+    kept = _nucleus(own.detach(), top_p).scatter(1, at, value=True)
+    nucleus = logits.masked_fill(~kept, -torch.inf)
+    return likely + own.logsumexp(dim=-1) - nucleus.logsumexp(dim=-1)
 
 
-def sample(
-    log_probability: Float[Tensor, "row choice"], uniform: Float64[Tensor, " row"]
-) -> Int64[Tensor, " row"]:
-    """Sample choices by uniform numbers in [0, 1)."""
-    reached = log_probability.double().exp().cumsum(dim=-1)
-    rank = (uniform[:, None] * reached[:, -1:] >= reached).sum(dim=-1)
-    return rank.clamp(max=reached.shape[-1] - 1)
-
-
-def _nuclei(whole: Tensor, stationary: Tensor, top_p: float) -> Tensor:
-    """Mark the likeliest choices of each group that have a share of its probability."""
-    share, order = whole.exp().sort(dim=-1, descending=True, stable=True)
-    apart = stationary.gather(1, order)
-    kept = torch.zeros_like(stationary)
-    for group in (apart, ~apart):
-        own = share * group
-        reached = own.cumsum(dim=-1)
-        kept |= group & (reached - own < top_p * reached[:, -1:])
-    return torch.zeros_like(kept).scatter(1, order, kept)
-
-
-def _together(whole: Tensor, group: Tensor) -> Tensor:
-    """Logarithm of the probability of a group [row, 1]; 0 of an empty one."""
-    some = group.any(dim=-1, keepdim=True)
-    # An empty group keeps all: its value is not used, and its gradient is a number.
-    masked = whole.masked_fill(~group & some, -torch.inf)
-    return masked.logsumexp(dim=-1, keepdim=True)
+def _nucleus(logits: Tensor, top_p: float) -> Tensor:
+    """Mark the fewest likeliest choices [row, choice] that have a share of all."""
+    share = logits.softmax(dim=-1)
+    # All that are less likely than this have less than ``1 - top_p`` together.
+    likely = share > (1 - top_p) / logits.shape[-1]
+    kept = torch.zeros_like(likely)
+    for rows, index in sort_likely(logits, likely):
+        own, some = (x[rows].gather(1, index) for x in (share, likely))
+        before = own.cumsum(dim=-1) - own
+        kept[rows] = kept[rows].scatter(1, index, some & (before < top_p))
+    return kept

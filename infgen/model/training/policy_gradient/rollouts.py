@@ -15,6 +15,7 @@ from torch import Tensor
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.batching.tensors import map_tensors
 from infgen.model.network import Network
+from infgen.model.sampling import choose
 from infgen.model.step_memory import Insertions
 from infgen.model.token_step import MotionStep, PositionOutputs
 from infgen.model.training.own_choices import InsertedAgent
@@ -22,7 +23,6 @@ from infgen.model.training.policy_gradient.insertion_mask import (
     find_free,
     sample_free_agent,
 )
-from infgen.model.training.policy_gradient.nucleus import log_probabilities, sample
 from infgen.model.training.population_targets import (
     describe_details,
     inserted_details,
@@ -229,9 +229,9 @@ class _FreeSimulation(Simulation):
         at = scene, row
         agent_type = self.played.agent_type[at]
         logits = said.packed.motion_logits[said.packed.rows.number[at]]
-        likely = log_probabilities(logits, self.stationary[agent_type], self.top_p)
         uniform = self.uniforms.draw(*who.shape)[at]
-        self.move_by(token, at, sample(likely, uniform))
+        apart = self.stationary[agent_type]
+        self.move_by(token, at, choose(logits, uniform, nucleus=self.top_p, apart=apart))
         self.moved[:, token] = who
 
 

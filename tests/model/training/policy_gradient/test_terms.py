@@ -76,7 +76,7 @@ def after_a_step(network, lesson):
     with torch.no_grad():
         for each in student.parameters():
             if each.grad is not None:
-                each -= 1e-3 * each.grad
+                each -= 1e-4 * each.grad
     return student
 
 

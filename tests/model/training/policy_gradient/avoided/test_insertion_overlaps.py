@@ -231,7 +231,7 @@ def test_places_on_others_become_less_likely(network, logged, rollouts):
         row = outputs.entries.rows.number[scene, at[0]]
         cells = outputs.entries.position_logits[row, at[1]]
         return [
-            (logits.softmax(dim=-1) * marked).sum(dim=-1)
+            (logits.double().softmax(dim=-1) * marked).sum(dim=-1)
             for logits, marked in (
                 (cells.masked_fill(~overlaps.near, -torch.inf), overlaps.cell),
                 (outputs.details.offset_logits[details], overlaps.offset),

@@ -3,7 +3,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infgen.rollout.sampling import choose, sample_event
+from infgen.model.sampling import choose, sample_event
 
 
 def test_a_uniform_number_picks_the_choice_whose_share_it_falls_in():

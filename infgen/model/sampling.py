@@ -1,5 +1,7 @@
 """From logits and given uniform numbers to choices."""
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
@@ -65,19 +67,33 @@ def _choose_likely(
     other = torch.where(apart, 0.0, share).sum(dim=-1, keepdim=True)
     outside = (1 - nucleus) / logits.shape[-1]
     likely = share > torch.where(apart, outside * one, outside * other)
-    logits = torch.where(likely, logits, -torch.inf)
-    number = likely.sum(dim=-1)
-    found = torch.zeros_like(number)
-    for least, most in zip((-1, *LIKELY), (*LIKELY, logits.shape[-1]), strict=True):
-        rows = ((number > least) & (number <= most)).nonzero()[:, 0]
-        if not len(rows):
-            continue
-        index = logits[rows].topk(int(number[rows].max()), dim=-1).indices
+    found = torch.zeros_like(likely[:, 0], dtype=torch.int64)
+    for rows, index in sort_likely(logits, likely):
         own, group, some = (x[rows].gather(1, index) for x in (share, apart, likely))
         own = _within(own * some, nucleus, group, (one[rows], other[rows]))
         rank = _rank(own, uniform[rows], of_all=False)
         found[rows] = index.gather(1, rank[:, None])[:, 0]
     return found
+
+
+def sort_likely(logits: Tensor, likely: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Sort what is likely of every row, the likeliest first.
+
+    Args:
+        logits: [row, choice].
+        likely: What has to be sorted [row, choice]: at least one choice of a row.
+
+    Yields:
+        Some of the rows [n], and their choices [n, rank]: as many as are likely in one of
+        these rows; ranks that others have besides are choices that are not likely.
+    """
+    logits = torch.where(likely, logits, -torch.inf)
+    number = likely.sum(dim=-1)
+    for least, most in zip((-1, *LIKELY), (*LIKELY, logits.shape[-1]), strict=True):
+        rows = ((number > least) & (number <= most)).nonzero()[:, 0]
+        if len(rows):
+            index = logits[rows].topk(int(number[rows].max()), dim=-1).indices
+            yield rows, index
 
 
 def _within(
