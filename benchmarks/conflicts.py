@@ -20,6 +20,7 @@ import torch
 from logged_scenes import asked, whole
 
 from infgen.model.batching.batch import Batch
+from infgen.model.latent_rates import Rate
 from infgen.model.network import Network
 from infgen.model.training.policy_gradient.avoided.braking import LOOK_AHEAD_TOKENS
 from infgen.model.training.policy_gradient.avoided.conflicts import conflicts_taken
@@ -30,6 +31,7 @@ from infgen.model.training.policy_gradient.rollouts import (
     SimulatedRollouts,
     simulate_rollouts,
 )
+from infgen.rollout.settings import RolloutSettings
 from infgen.tokens.scene_tokens import Presence
 from pipeline.commands.screen import show_table
 
@@ -48,7 +50,8 @@ def logged_moves(network: Network, batch: Batch) -> SimulatedRollouts:
     moved[:, :HISTORY_TOKENS] = False
     inserted = agents.presence == int(Presence.INSERTED)
     inserted[:, :HISTORY_TOKENS] = False
-    return SimulatedRollouts(batch, agents, 1, moved, inserted, visible[:, 1])
+    none = torch.zeros((*visible.shape[:2], len(Rate)))
+    return SimulatedRollouts(batch, agents, 1, moved, inserted, visible[:, 1], none)
 
 
 def count(network: Network, rollouts: SimulatedRollouts) -> Counter[str]:
@@ -105,7 +108,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for seed, scene in enumerate(scenes):
         batch = whole(network, scene)
         simulated = simulate_rollouts(
-            network, batch, ROLLOUTS, TOP_P, seed, insertion_mask=True
+            network,
+            batch,
+            ROLLOUTS,
+            TOP_P,
+            seed,
+            insertion_mask=True,
+            latent_rate_scale=RolloutSettings().latent_rate_scale,
         )
         for name, each in zip(
             found, (logged_moves(network, batch), simulated), strict=True

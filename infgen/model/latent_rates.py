@@ -15,7 +15,9 @@ process of variance one,
 
 one for insertions and one for removals. The three numbers of each are learned by the
 likelihood of logs (``infgen.model.training.rate_likelihood``); rollouts sample z
-(``infgen.rollout.rate_states``). Elsewhere logits are those at z = 0 and without the mean.
+(``infgen.rollout.rate_states``), those to learn from too
+(``infgen.model.training.rate_samples``). Elsewhere logits are those at z = 0 and without
+the mean.
 """
 
 import math
@@ -57,6 +59,20 @@ class RateProcess:
     mean: Float32[Tensor, "2"]
     scale: Float32[Tensor, "2"]
     persistence: Float32[Tensor, "2"]
+
+    def scaled(self, share: float) -> "RateProcess":
+        """Return latent rates that vary less: ``share`` times as much.
+
+        Means go with the square, as odds are multiplied by ``exp(scale**2 / 2)`` in the
+        mean of all z.
+        """
+        return RateProcess(share**2 * self.mean, share * self.scale, self.persistence)
+
+    def detached(self) -> "RateProcess":
+        """Return the same numbers, which no gradient reaches."""
+        return RateProcess(
+            self.mean.detach(), self.scale.detach(), self.persistence.detach()
+        )
 
     def nodes(self) -> Float32[Tensor, " node"]:
         """Return the grid of values of z."""

@@ -148,6 +148,10 @@ class TrainSettings:
     """Scenes are simulated with the insertions and removals of the network before they are
     learned from, and it learns to correct their number. Agents that the log has too move as
     `closed_loop_top_k` says, or as logged."""
+    latent_rate_scale: NonNegative = 1.0
+    """Latent rates (`model.latent_rates`) vary so much beside what has been learned, in the
+    loss and in what the network simulates to learn from: where weights are to be simulated
+    with `rollout.latent_rate_scale`, the same. What they are is learned at 1 alone."""
     policy_gradient_rollouts: Count = 0
     """Rollouts of each scene that the network simulates and learns from by policy gradient,
     3 or more; 0 for none. The penalties below are its rewards, the initial weights the
@@ -272,5 +276,7 @@ class TrainSettings:
 
     @property
     def of_the_log(self) -> "TrainSettings":
-        """Return them without policy gradient: the loss of held-out logs."""
-        return replace(self, policy_gradient_rollouts=0, policy_minibatches=1)
+        """Return them without simulation: the loss of held-out logs."""
+        return replace(
+            self, policy_gradient_rollouts=0, policy_minibatches=1, latent_rate_scale=1.0
+        )

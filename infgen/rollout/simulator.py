@@ -59,8 +59,7 @@ class Simulator:
         rates, share = self.stepper.network.rates, self.settings.latent_rate_scale
         if rates is None or not share:
             return None
-        mean, scale, persistence = rates().on_host().numpy()
-        return np.stack([share**2 * mean, share * scale, persistence])
+        return rates().scaled(share).on_host().numpy()
 
     @property
     def simulates(self) -> str:

@@ -55,7 +55,9 @@ where agents come into view."""
 
 
 @torch.no_grad()
-def close_population_loop(network: Network, batch: Batch, top: int, seed: int) -> Batch:
+def close_population_loop(
+    network: Network, batch: Batch, top: int, seed: int, latent_rate_scale: float = 1.0
+) -> Batch:
     """Simulate a batch with the insertions and removals of the network itself.
 
     Args:
@@ -64,6 +66,7 @@ def close_population_loop(network: Network, batch: Batch, top: int, seed: int) -
         top: Most likely motion tokens that those of agents with a logged counterpart are
             chosen from; 0 to move these as the batch has it.
         seed: Of everything that is sampled.
+        latent_rate_scale: Latent rates vary so much, beside what the network has learned.
 
     Returns:
         The batch to learn from; it has more rows of agents.
@@ -78,8 +81,9 @@ def close_population_loop(network: Network, batch: Batch, top: int, seed: int) -
         )
     learning = network.training
     try:
-        simulation = _PopulationLoop(network, batch, top, seed)
+        simulation = _PopulationLoop(network, batch, top, seed, latent_rate_scale)
         for token in range(1, simulation.logged.pose.shape[1]):
+            simulation.rates.advance(token)
             simulation.move(token)
             simulation.insert(token)
     finally:
@@ -104,9 +108,16 @@ class _PopulationLoop(Simulation):
     missing: Tensor
     number: Tensor
 
-    def __init__(self, network: Network, batch: Batch, top: int, seed: int) -> None:
+    def __init__(
+        self,
+        network: Network,
+        batch: Batch,
+        top: int,
+        seed: int,
+        latent_rate_scale: float,
+    ) -> None:
         """Begin with the first token step as logged."""
-        super().__init__(network, batch, seed)
+        super().__init__(network, batch, seed, latent_rate_scale)
         visible = self.logged.visible
         born = visible.long().argmax(dim=1)  # The first one that is true.
         fresh_until = torch.where(born > 0, born + FRESH_TOKENS, -1)

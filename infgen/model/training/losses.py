@@ -90,22 +90,23 @@ def losses(
     Args:
         outputs: Of the network.
         batch: What they should have been.
-        settings: Weights of first motion tokens and smoothing of labels.
+        settings: Weights of first motion tokens, smoothing of labels, latent rates.
         masks: Those of the batch's agents, if they are known already.
     """
     smoothing, motion = settings.label_smoothing, outputs.motion
     masks = masks or AgentMasks.of(batch.agents)
+    rates = _rates(outputs, settings)
     terms = {"motion": _motion(motion, batch.agents, settings, masks.motion)}
     if motion.remove_logit is not None:
         logit = motion.remove_logit
-        terms["keep"] = _stay(motion.rows, logit, batch.agents, masks.stay, outputs.rates)
+        terms["keep"] = _stay(motion.rows, logit, batch.agents, masks.stay, rates)
     if motion.pattern_logits is not None:
         logits = motion.pattern_logits
         terms["validity_pattern"] = _pattern(
             motion.rows, logits, batch.agents, masks.pattern
         )
     if outputs.entries is not None:
-        terms |= _entries(outputs.entries, batch, smoothing, outputs.rates)
+        terms |= _entries(outputs.entries, batch, smoothing, rates)
     if outputs.details is not None:
         terms |= _details(outputs.details, batch)
     if outputs.roads is not None:
@@ -153,6 +154,13 @@ def _motion(
         settings.label_smoothing,
         chosen.take(rows.pack(weight)),
     )
+
+
+def _rates(outputs: Outputs, settings: TrainSettings) -> RateProcess | None:
+    """Latent rates; what they are is learned where they are not scaled."""
+    if outputs.rates is None or settings.latent_rate_scale == 1:
+        return outputs.rates
+    return outputs.rates.scaled(settings.latent_rate_scale).detached()
 
 
 def _stay(

@@ -14,8 +14,10 @@ from torch.nn.functional import pad
 
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.batching.tensors import map_tensors
+from infgen.model.latent_rates import Rate
 from infgen.model.network import Network
 from infgen.model.relations import Rows
+from infgen.model.sampling import sample_event
 from infgen.model.step_memory import Insertions as StepInsertions
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import PositionOutputs, TokenStep
@@ -23,6 +25,7 @@ from infgen.model.training.closed_loop import token_step_at
 from infgen.model.training.nearest_tokens import MotionTokenEnds, to_world
 from infgen.model.training.own_choices import InsertedAgent, UniformNumbers, sample_agent
 from infgen.model.training.population_targets import InsertionTurns
+from infgen.model.training.rate_samples import RateSamples
 from infgen.tokens.grid import encode_cell, to_grid
 from infgen.tokens.scene_tokens import (
     EGO,
@@ -68,13 +71,21 @@ class Simulation(ABC):
         memory: Its past.
         ends: Where motion tokens end.
         uniforms: Random numbers.
+        rates: Latent rates.
         logged: Agents of the log, followed by free rows; copy after copy.
         asked: Token steps with insertion queries [scene, token].
         played: The same agents as simulated so far.
         turns: Insertions so far.
     """
 
-    def __init__(self, network: Network, batch: Batch, seed: int, copies: int = 1) -> None:
+    def __init__(
+        self,
+        network: Network,
+        batch: Batch,
+        seed: int,
+        latent_rate_scale: float,
+        copies: int = 1,
+    ) -> None:
         """Begin with the first token step as logged."""
         agents = map_tensors(batch.agents, lambda x: x.repeat(copies, *[1] * (x.dim() - 1)))
         device, scenes = agents.pose.device, len(batch.agents.pose)
@@ -85,6 +96,10 @@ class Simulation(ABC):
         self.memory = self.stepper.begin(batch.roads, scene, rows)
         self.ends = MotionTokenEnds.of(network.motion_vocabulary(), device)
         self.uniforms = UniformNumbers(seed, device)
+        process = None
+        if network.rates is not None and latent_rate_scale:
+            process = network.rates().scaled(latent_rate_scale)
+        self.rates = RateSamples(process, self.logged.presence, self.uniforms)
         self.asked = batch.entries.asked.repeat(copies, 1)
         self.played = map_tensors(self.logged, Tensor.clone)
         slots = network.settings.max_insertions + 1
@@ -109,7 +124,8 @@ class Simulation(ABC):
         for turn in range(last + 1):
             query = self.stepper.entry_query(entries)
             following = self.next_insertions(token, turn, active)
-            add = self.uniforms.draw(len(active)) < torch.sigmoid(query.add_logit.double())
+            added = self.rates.of(Rate.INSERTION, token)[active]
+            add = sample_event(query.add_logit, self.uniforms.draw(len(active)), added)
             places = (add & following.room).nonzero()[:, 0]
             if turn == last or not len(places):
                 return
@@ -172,7 +188,8 @@ class Simulation(ABC):
         uniform = self.uniforms.draw(*who.shape)
         if logit is None:
             return
-        leaves = uniform < torch.sigmoid(logit.double())
+        added = self.rates.of(Rate.REMOVAL, token)[:, None]
+        leaves = sample_event(logit, uniform, added)
         leaves[:, EGO] = False
         stays = torch.where(leaves, REMOVED, PRESENT)
         presence = self.played.presence

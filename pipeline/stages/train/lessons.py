@@ -111,7 +111,8 @@ def _near_log(
     """Simulate a batch near to its log for closed-loop fine-tuning."""
     top = settings.closed_loop_top_k
     if settings.closed_loop_population:
-        simulated = close_population_loop(network, here.batch, top, seed)
+        scale = settings.latent_rate_scale
+        simulated = close_population_loop(network, here.batch, top, seed, scale)
         return IndexedBatch(simulated, None, None)  # Others are there than in the log.
     if not top:
         return here

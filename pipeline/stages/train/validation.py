@@ -41,7 +41,7 @@ def validate(setup: TrainingSetup, training: TrainingState, forward: Pass) -> Fo
     ):
         here = to_device(batch, device)
         outputs = forward.averaged(here, training.average)
-        for name, term in losses(outputs, here, settings).items():
+        for name, term in losses(outputs, here, settings.of_the_log).items():
             terms[name] = terms[name] + term if name in terms else term
         for name, (probability, happened) in decisions(outputs, here).items():
             found = reliability(probability, happened)

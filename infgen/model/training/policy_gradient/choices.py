@@ -14,6 +14,7 @@ from torch.nn.functional import logsigmoid
 
 from infgen.model.batching.batch import Insertions
 from infgen.model.batching.supervision import following
+from infgen.model.latent_rates import Rate
 from infgen.model.logits import DetailOutputs, InsertionOutputs, Outputs
 from infgen.model.training.policy_gradient.nucleus import log_probability
 from infgen.model.training.policy_gradient.policy_lesson import PolicyLesson
@@ -63,6 +64,19 @@ def decided(outputs: InsertionOutputs, entries: Insertions) -> Bool[Tensor, "row
     """Turns in which an insertion was decided on: all that there were, and one more."""
     slot = torch.arange(entries.agent.shape[2], device=entries.agent.device)
     return slot <= outputs.rows.pack(entries.count)[:, None]
+
+
+def removal_rate(outputs: Outputs, lesson: PolicyLesson) -> Float32[Tensor, " row"]:
+    """What the latent rate added to the log-odds of every removal."""
+    added = following(lesson.rate_log_odds[..., Rate.REMOVAL], 0)[..., None]
+    return outputs.motion.rows.pack(added.expand(lesson.moved.shape))
+
+
+def insertion_rate(
+    outputs: InsertionOutputs, lesson: PolicyLesson
+) -> Float32[Tensor, "row 1"]:
+    """What the latent rate added to the log-odds of every insertion, at all turns."""
+    return outputs.rows.pack(lesson.rate_log_odds[..., Rate.INSERTION])[:, None]
 
 
 def _motion_tokens(
@@ -119,12 +133,14 @@ def _counts(outputs: Outputs, lesson: PolicyLesson) -> Iterator[_Part]:
         )
         after = following(following(lesson.count_advantage, 0), 0)[..., None]
         advantage = motion.rows.pack(after.expand(agents.presence.shape))
-        yield advantage[asked], _log_event(motion.remove_logit, leaves)[asked]
+        logit = motion.remove_logit + removal_rate(outputs, lesson)
+        yield advantage[asked], _log_event(logit, leaves)[asked]
     if outputs.entries is not None:
         rows, entries = outputs.entries.rows, lesson.batch.entries
         turns = decided(outputs.entries, entries)
         advantage = rows.pack(lesson.count_advantage)[:, None].expand(turns.shape)
-        likely = _log_event(outputs.entries.add_logit, rows.pack(entries.add))
+        logit = outputs.entries.add_logit + insertion_rate(outputs.entries, lesson)
+        likely = _log_event(logit, rows.pack(entries.add))
         yield advantage[turns], likely[turns]
 
 

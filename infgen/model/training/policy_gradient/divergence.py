@@ -10,7 +10,11 @@ from torch.nn.functional import logsigmoid
 
 from infgen.model.batching.supervision import following
 from infgen.model.logits import InsertionOutputs, Outputs
-from infgen.model.training.policy_gradient.choices import decided
+from infgen.model.training.policy_gradient.choices import (
+    decided,
+    insertion_rate,
+    removal_rate,
+)
 from infgen.model.training.policy_gradient.policy_lesson import PolicyLesson
 
 
@@ -22,16 +26,21 @@ def divergence(outputs: Outputs, pretrained: Outputs, lesson: PolicyLesson) -> T
     found = _of_choice(one.motion_logits[moves], other.motion_logits[moves])
     if one.remove_logit is not None and other.remove_logit is not None:
         asked = rows.pack(following(lesson.removable, False))
-        found = found + _of_event(one.remove_logit[asked], other.remove_logit[asked])
+        added = removal_rate(outputs, lesson)[asked]
+        own, theirs = one.remove_logit[asked], other.remove_logit[asked]
+        found = found + _of_event(own + added, theirs + added)
     if outputs.entries is not None and pretrained.entries is not None:
         turns = decided(outputs.entries, entries)
-        found = found + _of_insertions(outputs.entries, pretrained.entries, turns)
+        added = insertion_rate(outputs.entries, lesson).expand(turns.shape)[turns]
+        found = found + _of_insertions(outputs.entries, pretrained.entries, turns, added)
     return found + _of_details(outputs, pretrained)
 
 
-def _of_insertions(one: InsertionOutputs, other: InsertionOutputs, turns: Tensor) -> Tensor:
+def _of_insertions(
+    one: InsertionOutputs, other: InsertionOutputs, turns: Tensor, added: Tensor
+) -> Tensor:
     """Divergence of insertions, and of the cells of those that there were."""
-    found = _of_event(one.add_logit[turns], other.add_logit[turns])
+    found = _of_event(one.add_logit[turns] + added, other.add_logit[turns] + added)
     came = turns[:, 1:]  # Where a turn follows, the one before it inserted an agent.
     if one.position_logits is not None and other.position_logits is not None:
         logits = one.position_logits[:, :-1], other.position_logits[:, :-1]

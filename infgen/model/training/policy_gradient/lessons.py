@@ -69,7 +69,8 @@ def simulate_lessons(
     """
     group, top_p = settings.policy_gradient_rollouts, settings.policy_top_p
     mask = settings.policy_insertion_mask
-    rollouts = simulate_rollouts(network, batch, group, top_p, seed, mask)
+    scale = settings.latent_rate_scale
+    rollouts = simulate_rollouts(network, batch, group, top_p, seed, mask, scale)
     roads = read_roads(batch.roads, network.map_vocabulary())
     vocabulary = network.motion_vocabulary()
     costs = find_costs(rollouts, vocabulary, roads)
@@ -104,6 +105,7 @@ def simulate_lessons(
             departures.only(rollouts.rows(number)),
             creeping.only(rollouts.rows(number)),
             overlaps.only(rollouts.rows(number)),
+            rollouts.rate_log_odds[rollouts.rows(number)],
         )
         for number in range(group)
     ]

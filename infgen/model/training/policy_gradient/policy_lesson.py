@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from infgen.model.batching.batch import Batch
@@ -29,6 +29,8 @@ class PolicyLesson:
         departures: ... those by which vehicles left the road or stayed off it ...
         creeping: ... and those by which they crept on.
         insertion_overlaps: Places onto other agents, of all insertions.
+        rate_log_odds: What latent rates added to the log-odds of insertions and removals,
+            by ``Rate``.
         log_probability: Of all choices, in the order of ``choices_made``, by the network
             that the rollouts are of; None where it has not been trained since.
     """
@@ -42,6 +44,7 @@ class PolicyLesson:
     departures: AvoidedTokens
     creeping: AvoidedTokens
     insertion_overlaps: InsertionOverlaps
+    rate_log_odds: Float[Tensor, "scene token 2"]
     log_probability: Float32[Tensor, " choice"] | None = None
 
     @property

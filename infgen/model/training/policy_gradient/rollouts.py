@@ -9,7 +9,7 @@ of its log can be compared.
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from infgen.model.batching.batch import Agents, Batch
@@ -51,6 +51,7 @@ class SimulatedRollouts:
         inserted: Agents that the network inserted.
         known: Rows whose agent was there at the end of the history: it is the same one in
             the log, and in all rollouts of the scene.
+        rate_log_odds: What latent rates added to log-odds, by ``Rate``.
     """
 
     batch: Batch
@@ -59,6 +60,7 @@ class SimulatedRollouts:
     moved: Bool[Tensor, "rollout token agent"]
     inserted: Bool[Tensor, "rollout token agent"]
     known: Bool[Tensor, "rollout agent"]
+    rate_log_odds: Float[Tensor, "rollout token 2"]
 
     @property
     def scenes(self) -> int:
@@ -88,6 +90,7 @@ def simulate_rollouts(
     top_p: float,
     seed: int,
     insertion_mask: bool = False,
+    latent_rate_scale: float = 1.0,
 ) -> SimulatedRollouts:
     """Simulate rollouts of every scene of a batch.
 
@@ -98,11 +101,15 @@ def simulate_rollouts(
         top_p: Share of the probability that motion tokens are sampled from.
         seed: Of everything that is sampled.
         insertion_mask: Whether agents are inserted at free positions only.
+        latent_rate_scale: Latent rates vary so much, beside what the network has learned.
     """
     learning = network.training
     try:
-        simulation = _FreeSimulation(network, batch, count, top_p, seed, insertion_mask)
+        simulation = _FreeSimulation(
+            network, batch, count, top_p, seed, insertion_mask, latent_rate_scale
+        )
         for token in range(1, simulation.logged.pose.shape[1]):
+            simulation.rates.advance(token)
             simulation.move(token)
             simulation.insert(token)
     finally:
@@ -133,9 +140,10 @@ class _FreeSimulation(Simulation):
         top_p: float,
         seed: int,
         insertion_mask: bool,
+        latent_rate_scale: float,
     ) -> None:
         """Begin with the history as logged."""
-        super().__init__(network, batch, seed, count)
+        super().__init__(network, batch, seed, latent_rate_scale, count)
         logged, last = self.logged, min(HISTORY_TOKENS, self.logged.pose.shape[1]) - 1
         presence = logged.presence[:, last]
         stays = (presence == PRESENT) | (presence == INSERTED)
@@ -221,6 +229,7 @@ class _FreeSimulation(Simulation):
             moved=self.moved,
             inserted=inserted,
             known=self.known,
+            rate_log_odds=self.rates.log_odds.float(),
         )
 
     def _sample_motion(self, token: int, who: Tensor, said: MotionStep) -> None:

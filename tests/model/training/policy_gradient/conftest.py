@@ -8,6 +8,7 @@ import torch
 
 from infgen.model.batching.batch import collate
 from infgen.model.batching.tensors import map_tensors
+from infgen.model.latent_rates import Rate
 from infgen.model.training.policy_gradient.rollouts import SimulatedRollouts
 from infgen.tokens.scene_tokens import Presence
 from infgen.tokens.vocabulary import BOX_LW_M, MotionVocabulary
@@ -59,6 +60,7 @@ def drawn(record, limits):
             moved=moved,
             inserted=torch.zeros_like(moved),
             known=torch.ones_like(moved[:, 0]),
+            rate_log_odds=torch.zeros((*moved.shape[:2], len(Rate))),
         )
 
     return draw
