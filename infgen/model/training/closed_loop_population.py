@@ -9,9 +9,11 @@ removes agents while the scene is simulated, and learns from the state that it g
   no longer, in the log is *surplus*. The *excess* is the number of the ones less the other.
 - As many insertions and removals are to be learned as the log has in this token step,
   corrected by a share of the excess: half of the correction by insertions, half by
-  removals, so that in the mean the flow is that of the log. To be inserted are missing
-  agents, those first that came into view last; to be removed are those whom the log
-  removes, and of the surplus those whom the network is most ready to remove.
+  removals, so that in the mean the flow is that of the log. What cannot be corrected yet,
+  fewer insertions where the log has none, say, is corrected later: else excess would be
+  corrected mostly by more removals, and its lack by more insertions. To be inserted are
+  missing agents, those first that came into view last; to be removed are those whom the
+  log removes, and of the surplus those whom the network is most ready to remove.
 - An insertion that the network makes is that of the next agent to be inserted, at its
   logged pose; or of one that it samples, and then nothing is learned of later turns.
 
@@ -28,6 +30,7 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Batch
 from infgen.model.batching.padding import NO_AGENT
+from infgen.model.latent_rates import Rate
 from infgen.model.long_memory import count_around
 from infgen.model.network import Network
 from infgen.model.sampling import choose
@@ -101,6 +104,8 @@ class _PopulationLoop(Simulation):
         off: Whether agents are not as logged [scene, token, agent].
         fresh_until: Last token step at which each agent is fresh [scene, agent].
         used: Rows in use [scene].
+        owed: By how much insertions and removals are still to be corrected, by ``Rate``:
+            fewer insertions, more removals [scene, 2].
         missing: Who is missing at this token step, in the order of insertion ...
         number: ... and how many of them are to be inserted [scene].
     """
@@ -126,6 +131,8 @@ class _PopulationLoop(Simulation):
         self.off = torch.zeros_like(visible)
         self.fresh_until = torch.where(visible.any(dim=1), fresh_until, -1)
         self.used = torch.full((len(visible),), rows - FREE_ROWS, device=visible.device)
+        # Begun anywhere, or all scenes would be corrected at the same token steps.
+        self.owed = self.uniforms.draw(len(visible), len(Rate)) - 0.5
 
     def move(self, token: int) -> None:
         """Move everybody, and remove whom the network removes."""
@@ -209,10 +216,22 @@ class _PopulationLoop(Simulation):
             counts.append(count_around(pose[:, EGO], pose, stays, radius_m))
         return counts[0] - counts[1]
 
-    def _correction(self, excess: Tensor) -> Tensor:
-        """How many fewer insertions, and more removals, to learn [scene]."""
-        wanted = excess / (2 * CORRECTION_TOKENS)
-        return (wanted + self.uniforms.draw(len(excess)).to(wanted)).floor().long()
+    def _correction(
+        self, rate: Rate, of: Tensor, excess: Tensor, least: Tensor, most: Tensor
+    ) -> Tensor:
+        """How many fewer insertions, or more removals, to learn [scene]; note the rest.
+
+        Args:
+            rate: What is corrected ...
+            of: ... and in which scenes.
+            excess: Simulated agents, less those of the log [scene].
+            least: The least that can be corrected [scene], not above zero ...
+            most: ... and the most, not below zero.
+        """
+        self.owed[:, rate] += of * excess / (2 * CORRECTION_TOKENS)
+        done = of * self.owed[:, rate].round().long().clamp(least, most)
+        self.owed[:, rate] -= done
+        return done
 
     def _label_removals(
         self, token: int, matched: Tensor, surplus: Tensor, logit: Tensor | None
@@ -223,12 +242,18 @@ class _PopulationLoop(Simulation):
         self.played.told[:, token] = told & ~surplus
         if logit is None:
             return
-        more = self._correction(self._excess(token - 1, inserted=True))
+        leaving = matched & removal
+        more = self._correction(
+            Rate.REMOVAL,
+            known[:, 0],
+            self._excess(token - 1, inserted=True),
+            -leaving.sum(dim=1),
+            surplus.sum(dim=1),
+        )
         readiness = logit.masked_fill(~surplus, -torch.inf)
         ready = _first(readiness, more) & surplus
         removal |= ready
         self.played.told[:, token] |= known & ready
-        leaving = matched & removal
         reluctance = (-logit).masked_fill(~leaving, -torch.inf)
         removal &= ~(_first(reluctance, -more) & leaving)
 
@@ -242,9 +267,15 @@ class _PopulationLoop(Simulation):
         cell = self.cells(pose, token)
         missing &= cell != NO_CELL
         played.cell[:, token] = torch.where(missing, cell, played.cell[:, token])
-        fewer = self._correction(self._excess(token, inserted=False))
-        number = (missing & (presence == INSERTED)).sum(dim=1) - fewer
-        number = number.clamp(min=0).minimum(missing.sum(dim=1))
+        new = (missing & (presence == INSERTED)).sum(dim=1)
+        fewer = self._correction(
+            Rate.INSERTION,
+            self.asked[:, token],
+            self._excess(token, inserted=False),
+            new - missing.sum(dim=1),
+            new,
+        )
+        number = new - fewer
         latest = self.fresh_until.float().masked_fill(~missing, -torch.inf)
         missing &= _first(latest, number)
         flat, ego_pose = pose.flatten(0, 1), played.pose[:, token, EGO, None]

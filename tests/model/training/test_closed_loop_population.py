@@ -209,6 +209,21 @@ def test_a_share_of_the_excess_is_corrected_by_insertions(new_network, record, l
     assert wanted.float().mean() == pytest.approx(share, abs=0.17)
 
 
+def test_what_cannot_be_corrected_yet_is_corrected_later(new_network, record, limits):
+    """Two too many for seven token steps without an insertion, and two too few."""
+    keeps = biased(new_network().eval(), add=NEVER, remove=NEVER)
+    many = record(3, tokens=12, lives=[(0, 11), (0, 1), (0, 1), (9, 11)], spread_m=15.0)
+    few = record(3, tokens=12, lives=[(0, 11), (2, 11), (2, 11), (0, 9)], spread_m=15.0)
+    logged = collate([many, few] * 20, limits, 7)  # Each begins to correct anywhere.
+    assert logged.entries.add[::2, 9, 0].all()
+    assert logged.agents.removal[1::2, 9].any(dim=1).all()
+
+    played = close_population_loop(keeps, logged, 3, 0)
+
+    assert not played.entries.add[::2, 9, 0].any()
+    assert not played.agents.removal[1::2, 9].any()
+
+
 def test_surplus_agents_teach_no_motion(logged, played):
     rows = logged.agents.presence.shape[2]
     surplus = played.agents.observed.clone()
