@@ -199,8 +199,8 @@ def test_a_dry_run_says_what_is_left_to_make(desk, capsys):
     assert "train" not in out
 
 
-def test_a_dry_run_plans_policy_gradient_before_the_weights_it_starts_from(desk, capsys):
-    arms = ("--arms", "infgen", "--seeds", "1")
+def test_a_dry_run_plans_policy_gradient_from_the_weights_of_the_package(desk, capsys):
+    arms = ("--arms", "infgen,catk", "--seeds", "1")
     capsys.readouterr()
 
     preset = ("--preset", "womd-mini-fine-tuned", *arms)
@@ -208,9 +208,8 @@ def test_a_dry_run_plans_policy_gradient_before_the_weights_it_starts_from(desk,
 
     assert code == 0
     runs = json.loads(capsys.readouterr().out)["runs"]
-    assert {run["note"] for run in runs if "infgen" in run["run"]} == {
-        "after policy-gradient-2"
-    }
+    notes = {run["run"].split(",")[0]: run["note"] for run in runs}
+    assert notes == {"infgen": "", "catk": "after smart", "smart": ""}
 
 
 def test_a_failing_arm_is_named_beside_those_that_are_there_and_the_exit_code_is_1(
