@@ -13,7 +13,8 @@ removes agents while the scene is simulated, and learns from the state that it g
   fewer insertions where the log has none, say, is corrected later: else excess would be
   corrected mostly by more removals, and its lack by more insertions. To be inserted are
   missing agents, those first that came into view last; to be removed are those whom the
-  log removes, and of the surplus those whom the network is most ready to remove.
+  log removes, and for those of them whom the network has removed before, surplus agents in
+  their place, sampled by how ready the network is to remove them.
 - An insertion that the network makes is that of the next agent to be inserted, at its
   logged pose; or of one that it samples, and then nothing is learned of later turns.
 
@@ -36,6 +37,7 @@ from infgen.model.network import Network
 from infgen.model.sampling import choose
 from infgen.model.training.closed_loop import move_near_log
 from infgen.model.training.population_targets import targets
+from infgen.model.training.rate_samples import LEAST_UNIFORM
 from infgen.model.training.simulation import (
     ABSENT,
     FREE_ROWS,
@@ -236,26 +238,30 @@ class _PopulationLoop(Simulation):
     def _label_removals(
         self, token: int, matched: Tensor, surplus: Tensor, logit: Tensor | None
     ) -> None:
-        """Say who is to be removed [scene, agent]; of other surplus agents nothing."""
+        """Say who is to be removed [scene, agent]: as many as the log removes.
+
+        All others are to stay, the surplus too. Were nothing learned of those, as many
+        removals would be too few: the network removes some agents before the log does.
+        """
         removal, told = self.played.removal[:, token], self.logged.told[:, token]
         known = told.any(dim=1, keepdim=True)
-        self.played.told[:, token] = told & ~surplus
+        self.played.told[:, token] = told | (known & surplus)
         if logit is None:
             return
         leaving = matched & removal
-        more = self._correction(
+        gone = (self.logged.removal[:, token] & told & ~matched).sum(dim=1)
+        more = gone + self._correction(
             Rate.REMOVAL,
             known[:, 0],
             self._excess(token - 1, inserted=True),
-            -leaving.sum(dim=1),
-            surplus.sum(dim=1),
+            -gone - leaving.sum(dim=1),
+            surplus.sum(dim=1) - gone,
         )
-        readiness = logit.masked_fill(~surplus, -torch.inf)
-        ready = _first(readiness, more) & surplus
-        removal |= ready
-        self.played.told[:, token] |= known & ready
-        reluctance = (-logit).masked_fill(~leaving, -torch.inf)
-        removal &= ~(_first(reluctance, -more) & leaving)
+        uniform = self.uniforms.draw(*logit.shape).clamp(min=LEAST_UNIFORM)
+        # The first ones of these are a sample without replacement (Gumbel's trick).
+        readiness = logit - (-uniform.log()).log().to(logit)
+        removal &= ~(_first(-readiness.masked_fill(~leaving, torch.inf), -more) & leaving)
+        removal |= _first(readiness.masked_fill(~surplus, -torch.inf), more) & surplus
 
     def _to_insert(self, token: int) -> tuple[Tensor, Tensor]:
         """Agents to insert [scene, agent] in the insertion order, and their number."""

@@ -225,7 +225,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=19,
+    version=20,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,
