@@ -235,7 +235,7 @@ def test_as_many_are_to_be_removed_as_the_log_removes_whomever_the_network_has_r
     missing = logged.agents.visible.sum(dim=2) - played.visible.sum(dim=2)
     back = missing[:, 1:-1].sum(dim=1) / (2 * CORRECTION_TOKENS)
     assert (left + back.clamp(max=8)).mean() == pytest.approx(8, abs=1.5)
-    assert not none.removal.any(), "the log removes nobody"
+    assert not none.removal.any(), "the log removes none"
 
 
 def test_what_cannot_be_corrected_yet_is_corrected_later(new_network, record, limits):
