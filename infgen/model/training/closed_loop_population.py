@@ -227,8 +227,8 @@ class _PopulationLoop(Simulation):
             rate: What is corrected ...
             of: ... and in which scenes.
             excess: Simulated agents, less those of the log [scene].
-            least: The least that can be corrected [scene], not above zero ...
-            most: ... and the most, not below zero.
+            least: The least that can be corrected [scene] ...
+            most: ... and the most; below zero where some are to be owed.
         """
         self.owed[:, rate] += of * excess / (2 * CORRECTION_TOKENS)
         done = of * self.owed[:, rate].round().long().clamp(least, most)

@@ -36,28 +36,23 @@ class RateSamples:
         """
         shape, device = (*like.shape[:2], len(Rate)), like.device
         self.log_odds = torch.zeros(shape, dtype=torch.float64, device=device)
-        self._process, self._uniforms = process, uniforms
-        self._value = self.log_odds[:, 0]
-        self._begun = False
+        self._process, self._uniforms = None, uniforms
+        if process is not None:
+            numbers = process.mean, process.scale, process.persistence
+            self._process = [each.detach().double() for each in numbers]
+        self._value: Tensor | None = None
 
     def advance(self, token: int) -> None:
         """Go on to the next token step."""
         if self._process is None:
             return
-        mean, scale, persistence = (
-            each.detach().double()
-            for each in (
-                self._process.mean,
-                self._process.scale,
-                self._process.persistence,
-            )
-        )
-        kept = persistence if self._begun else torch.zeros_like(persistence)
-        uniform = self._uniforms.draw(*self._value.shape)
-        normal = torch.special.ndtri(uniform.clamp(min=LEAST_UNIFORM))
-        self._value = kept * self._value + (1 - kept.square()).sqrt() * normal
-        self._begun = True
-        self.log_odds[:, token] = mean + scale * self._value
+        mean, scale, kept = self._process
+        uniform = self._uniforms.draw(len(self.log_odds), len(Rate))
+        value = torch.special.ndtri(uniform.clamp(min=LEAST_UNIFORM))
+        if self._value is not None:
+            value = kept * self._value + (1 - kept.square()).sqrt() * value
+        self._value = value
+        self.log_odds[:, token] = mean + scale * value
 
     def of(self, rate: Rate, token: int) -> Float64[Tensor, " rollout"]:
         """Return what is added to the log-odds of one kind of decision."""
