@@ -40,12 +40,12 @@ from infgen.model.training.population_targets import targets
 from infgen.model.training.rate_samples import LEAST_UNIFORM
 from infgen.model.training.simulation import (
     ABSENT,
-    FREE_ROWS,
     INSERTED,
     PRESENT,
     REMOVED,
     NextInsertions,
     Simulation,
+    first_rows,
 )
 from infgen.tokens.insertion import insertion_key
 from infgen.tokens.scene_tokens import EGO, NO_CELL
@@ -93,9 +93,11 @@ def close_population_loop(
             simulation.insert(token)
     finally:
         network.train(learning)
-    return targets(
-        batch, simulation.logged, simulation.played, simulation.turns, network.grid
+    rows = int(simulation.used.max())
+    logged, played = (
+        first_rows(agents, rows) for agents in (simulation.logged, simulation.played)
     )
+    return targets(batch, logged, played, simulation.turns, network.grid)
 
 
 class _PopulationLoop(Simulation):
@@ -128,11 +130,11 @@ class _PopulationLoop(Simulation):
         visible = self.logged.visible
         born = visible.long().argmax(dim=1)  # The first one that is true.
         fresh_until = torch.where(born > 0, born + FRESH_TOKENS, -1)
-        rows = visible.shape[2]
         self.top = min(top, self.ends.pose.shape[1])
         self.off = torch.zeros_like(visible)
         self.fresh_until = torch.where(visible.any(dim=1), fresh_until, -1)
-        self.used = torch.full((len(visible),), rows - FREE_ROWS, device=visible.device)
+        rows = batch.agents.presence.shape[2]
+        self.used = torch.full((len(visible),), rows, device=visible.device)
         # Begun anywhere, or all scenes would be corrected at the same token steps.
         self.owed = self.uniforms.draw(len(visible), len(Rate)) - 0.5
 

@@ -35,8 +35,12 @@ from infgen.tokens.scene_tokens import (
     Presence,
 )
 
-FREE_ROWS = 16
-"""Rows appended to every scene, for agents that only the network inserts."""
+FREE_ROWS_PER_TOKEN = 2
+"""Rows appended to every scene for each token step, for agents that only the network
+inserts. If they ran out, no more agents would be inserted, and closed loop would teach to
+insert more than the log does: 62 token steps of towns take up to 100 of them."""
+VECTORS = ("pose", "size_lwh_m")
+"""What of agents has a further dimension behind that of agents."""
 ALL_STEPS = 31
 """Validity pattern of an agent that is seen at all steps of a token step."""
 ABSENT, PRESENT, INSERTED, REMOVED = (int(each) for each in Presence)
@@ -90,7 +94,7 @@ class Simulation(ABC):
         agents = map_tensors(batch.agents, lambda x: x.repeat(copies, *[1] * (x.dim() - 1)))
         device, scenes = agents.pose.device, len(batch.agents.pose)
         self.network, self.stepper = network, Stepper(network)
-        self.logged = _with_rows(agents, FREE_ROWS)
+        self.logged = _with_rows(agents, FREE_ROWS_PER_TOKEN * agents.presence.shape[1])
         rollouts, tokens, rows = self.logged.presence.shape
         scene = torch.arange(scenes, device=device).repeat(copies)
         self.memory = self.stepper.begin(batch.roads, scene, rows)
@@ -239,6 +243,15 @@ class Simulation(ABC):
         return self.stepper.entry_add(entries, self.token_step(token), Rows.where(fresh))
 
 
+def first_rows(agents: Agents, rows: int) -> Agents:
+    """Leave out all agents but those of the first rows."""
+    kept = {
+        each.name: getattr(agents, each.name).narrow(-1 - (each.name in VECTORS), 0, rows)
+        for each in fields(agents)
+    }
+    return replace(agents, **kept)
+
+
 def _with_rows(agents: Agents, more: int) -> Agents:
     """Append free rows for agents."""
     nothing = {"motion_token": NO_MOTION_TOKEN, "label": NO_MOTION_TOKEN}
@@ -246,7 +259,7 @@ def _with_rows(agents: Agents, more: int) -> Agents:
     padded = {}
     for each in fields(agents):
         values, fill = getattr(agents, each.name), nothing.get(each.name, 0)
-        if each.name in ("pose", "size_lwh_m"):
+        if each.name in VECTORS:
             padded[each.name] = pad(values, (0, 0, 0, more), value=fill)
         else:
             padded[each.name] = pad(values, (0, more), value=fill)

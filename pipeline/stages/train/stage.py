@@ -225,7 +225,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=20,
+    version=21,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,

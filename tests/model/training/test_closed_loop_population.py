@@ -14,7 +14,6 @@ from infgen.model.training.closed_loop_population import (
     close_population_loop,
 )
 from infgen.model.training.losses import losses, total
-from infgen.model.training.simulation import FREE_ROWS
 from infgen.tokens.grid import from_grid, make_grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence
 
@@ -76,7 +75,7 @@ def test_somebody_is_missing_somebody_surplus_and_somebody_inserted_again(
     there = logged.agents.visible
     simulated = played.agents.visible[..., :rows]
 
-    assert played.agents.presence.shape[2] == rows + FREE_ROWS
+    assert played.agents.presence.shape[2] > rows
     assert (there & ~simulated).any()
     assert (simulated & ~there).any()
     assert played.agents.visible[..., rows:].any()
@@ -84,6 +83,17 @@ def test_somebody_is_missing_somebody_surplus_and_somebody_inserted_again(
         (each.agents.presence == int(Presence.INSERTED)).sum(dim=1).max() > 1
         for each in (close_population_loop(restless, logged, 3, seed) for seed in range(12))
     )
+
+
+def test_rows_for_inserted_agents_last_until_the_end(new_network, logged):
+    network = biased(new_network().eval(), add=0.0, remove=NEVER)
+    rows, tokens = logged.agents.presence.shape[2], logged.agents.presence.shape[1]
+
+    played = close_population_loop(network, logged, 3, seed=1)
+
+    surplus = played.agents.presence[..., rows:] == int(Presence.INSERTED)
+    assert surplus[:, tokens // 2 :].any(dim=2).float().mean() > 0.3
+    assert surplus.any(dim=1).any(dim=0).all()  # No row is left without an agent.
 
 
 def test_each_insertion_has_its_turn_and_its_place(logged, played, grid_settings):

@@ -33,6 +33,7 @@ from infgen.model.training.simulation import (
     PRESENT,
     NextInsertions,
     Simulation,
+    first_rows,
 )
 
 HISTORY_TOKENS = 2
@@ -209,8 +210,12 @@ class _FreeSimulation(Simulation):
         self.used[at[0]] += 1
 
     def found(self, batch: Batch) -> SimulatedRollouts:
-        """Gather what was simulated."""
-        played, inserted = self.played, torch.zeros_like(self.moved)
+        """Gather what was simulated, without rows that no agent took."""
+        some = self.logged.visible | self.played.visible
+        rows = int(some.any(dim=1).any(dim=0).nonzero().max()) + 1
+        played, logged = first_rows(self.played, rows), first_rows(self.logged, rows)
+        moved, known = self.moved[..., :rows], self.known[:, :rows]
+        inserted = torch.zeros_like(moved)
         entries = insertions_of(self.turns, self.asked, played)
         details = inserted_details(entries, played)
         rollout = torch.arange(len(inserted), device=inserted.device)[:, None]
@@ -224,11 +229,11 @@ class _FreeSimulation(Simulation):
                 entries=entries,
                 details=describe_details(details, played, self.network.grid),
             ),
-            logged=self.logged,
+            logged=logged,
             count=len(played.pose) // len(batch.agents.pose),
-            moved=self.moved,
+            moved=moved,
             inserted=inserted,
-            known=self.known,
+            known=known,
             rate_log_odds=self.rates.log_odds.float(),
         )
 
