@@ -7,9 +7,10 @@ Logs, token step by token step as they are learned from, and what some weights e
 
 For every agent that a log inserts: the nats of its cell, and the entropy of the
 distribution (larger than the nats: less sure than it might be; smaller: too sure); what
-share of the distribution, and of logs, is on cells that hold an agent already; and what
-share of agents is of each type in logs, as expected at the cells of the logs, and as
-expected at cells that are sampled instead. The last line is one JSON object.
+share of the distribution, and of logs, is on cells that hold an agent already, and on cells
+whose centre is off the road; and what share of agents is of each type in logs, as expected
+at the cells of the logs, and as expected at cells that are sampled instead. The last line
+is one JSON object.
 """
 
 from collections.abc import Sequence
@@ -18,17 +19,22 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from logged_scenes import sum_over_logs, whole
 from torch import Tensor
 
 from infgen.model.agent_embedding import KINDS
 from infgen.model.batching.batch import Batch
 from infgen.model.network import Network
-from infgen.tokens.scene_tokens import SceneTokens
+from infgen.model.training.policy_gradient.road import read_roads
+from infgen.tokens.grid import from_grid
+from infgen.tokens.scene_tokens import EGO, SceneTokens
 from pipeline.commands.screen import show_table
 
-FIGURES = ("agents", "nats", "entropy", "held", "held_logged")
+FIGURES = (
+    *("agents", "nats", "entropy", "held", "held_logged"),
+    *("off_road", "off_road_logged"),
+)
 SEED = 0
 
 
@@ -56,6 +62,7 @@ def look(
             _types(network, each, rollout, place).sum(dim=0) for each in (batch, elsewhere)
         ]
     held = _held(batch, rollout, token, likely.shape[1])
+    off_road = _off_road(network, batch, token, likely.shape[1])
     each = torch.arange(len(cell))
     found = [
         len(cell),
@@ -63,6 +70,8 @@ def look(
         -(likely.exp() * likely).sum(),
         likely.exp()[held].sum(),
         held[each, cell].sum(),
+        likely.exp()[off_road].sum(),
+        off_road[each, cell].sum(),
     ]
     logged = details.agent_type[rollout, place].bincount(minlength=len(KINDS))
     return np.array([*map(float, found), *logged.tolist(), *torch.cat(types).tolist()])
@@ -91,21 +100,37 @@ def _held(
     return held.scatter(1, cell, True)[:, :-1]
 
 
+def _off_road(
+    network: Network, batch: Batch, token: Int64[Tensor, " agent"], cells: int
+) -> Bool[Tensor, "agent cell"]:
+    """Mark the cells whose centre is off the road, where the ego is then."""
+    (road,) = read_roads(batch.roads, network.map_vocabulary())
+    tokens, place = token.unique(return_inverse=True)
+    ego_pose = batch.agents.pose[0, tokens, EGO].numpy().repeat(cells, axis=0)
+    centre_m = np.tile(network.grid.centre_m[:cells], (len(tokens), 1))
+    point = np.column_stack([from_grid(centre_m, ego_pose), 0 * centre_m[:, 0]])
+    no_size_m = np.zeros((len(point), 2), dtype=np.float32)
+    off_m = road.off_m(point.astype(np.float32), no_size_m)
+    return torch.from_numpy(off_m > 0).view(len(tokens), cells)[place]
+
+
 def report(found: Float64[np.ndarray, " sum"]) -> list[dict[str, object]]:
     """Print both tables; return their rows."""
-    agents, nats, entropy, held, held_logged = found[: len(FIGURES)]
+    agents, nats, entropy, *shares = found[: len(FIGURES)]
     count = max(1.0, agents)
     figures: dict[str, object] = {
         "agents": int(agents),
         "nats": round(nats / count, 3),
         "entropy": round(entropy / count, 3),
-        "held": round(held / count, 4),
-        "held_logged": round(held_logged / count, 4),
+        **{
+            name: round(share / count, 4)
+            for name, share in zip(FIGURES[3:], shares, strict=True)
+        },
     }
-    shares = found[len(FIGURES) :].reshape(3, -1) / count
+    of_types = found[len(FIGURES) :].reshape(3, -1) / count
     types: list[dict[str, object]] = [
         {"types": name, **{x.name.lower(): round(share[x], 4) for x in KINDS}}
-        for name, share in zip(("logged", "at_logged", "at_sampled"), shares, strict=True)
+        for name, share in zip(("logged", "at_logged", "at_sampled"), of_types, strict=True)
     ]
     for title, rows in (("cells of inserted agents", [figures]), ("their types", types)):
         head = tuple(name.replace("_", " ") for name in rows[0])
