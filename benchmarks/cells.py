@@ -105,7 +105,7 @@ def _off_road(
 ) -> Bool[Tensor, "agent cell"]:
     """Mark the cells whose centre is off the road, where the ego is then."""
     (road,) = read_roads(batch.roads, network.map_vocabulary())
-    tokens, place = token.unique(return_inverse=True)
+    tokens, place = np.unique(token.numpy(), return_inverse=True)
     ego_pose = batch.agents.pose[0, tokens, EGO].numpy().repeat(cells, axis=0)
     centre_m = np.tile(network.grid.centre_m[:cells], (len(tokens), 1))
     point = np.column_stack([from_grid(centre_m, ego_pose), 0 * centre_m[:, 0]])
