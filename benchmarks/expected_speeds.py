@@ -6,10 +6,9 @@ Logs, token step by token step as they are learned from, and what some weights e
         [--split validation] [--scenes 80]
 
 The table has, for the ego and for other vehicles, by how fast they are, the mean speed of a
-token step, of the next one in the log, and of the next one that is expected: of all motion
-tokens, and of those that rollouts sample from (a nucleus of 0.9). A network that is right
-in the mean may still expect fast vehicles to brake; then rollouts, of many such steps, are
-slow. The last line is one JSON object.
+token step, of the next one in the log, and of the next one that is expected. A network that
+is right in the mean may still expect fast vehicles to brake; then rollouts, of many such
+steps, are slow. The last line is one JSON object.
 """
 
 from collections.abc import Sequence
@@ -30,11 +29,10 @@ from pipeline.commands.screen import show_table
 
 SPEED_EDGES_MPS = (0.5, 2.5, 5.0, 8.0, 11.0, 14.0)
 WHO = ("other vehicles", "the ego")
-NUCLEUS = 0.9
-COLUMNS = ("now", "next in the log", "expected", "expected, sampled from")
+COLUMNS = ("now", "next in the log", "expected")
 
 
-def look(network: Network, scene: SceneTokens) -> Float64[np.ndarray, "5 who bin"]:
+def look(network: Network, scene: SceneTokens) -> Float64[np.ndarray, "4 who bin"]:
     """Count token steps of vehicles in a log, and sum up the speeds of ``COLUMNS``."""
     batch = whole(network, scene)
     with torch.no_grad():
@@ -54,7 +52,6 @@ def look(network: Network, scene: SceneTokens) -> Float64[np.ndarray, "5 who bin
             speed_mps[now[mask]],
             speed_mps[then[mask]],
             likely @ speed_mps,
-            _nucleus(likely) @ speed_mps,
         ]
     )
     edges_mps = torch.tensor(SPEED_EDGES_MPS, dtype=torch.float64)
@@ -70,14 +67,7 @@ def _speed_mps(end_pose: Tensor) -> Float64[Tensor, " motion_token"]:
     return end[:, :2].norm(dim=1) * end[:, 0].sign() / CLOCK.token_s
 
 
-def _nucleus(likely: Float64[Tensor, "row token"]) -> Float64[Tensor, "row token"]:
-    """Leave the likeliest tokens, which have so much of the probability together."""
-    ordered, token = likely.sort(dim=1, descending=True)
-    kept = torch.where(ordered.cumsum(dim=1) - ordered < NUCLEUS, ordered, 0)
-    return torch.zeros_like(likely).scatter(1, token, kept / kept.sum(dim=1, keepdim=True))
-
-
-def report(found: Float64[np.ndarray, "5 who bin"]) -> list[dict[str, object]]:
+def report(found: Float64[np.ndarray, "4 who bin"]) -> list[dict[str, object]]:
     """Print the table; return its rows."""
     rows: list[dict[str, object]] = []
     bounds = [f"{low:g} to {high:g}" for low, high in pairwise(SPEED_EDGES_MPS)]

@@ -1,6 +1,6 @@
 """Scenes with the network's own insertions and removals: what they are, what they teach."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -85,15 +85,20 @@ def test_somebody_is_missing_somebody_surplus_and_somebody_inserted_again(
     )
 
 
-def test_rows_for_inserted_agents_last_until_the_end(new_network, logged):
+def test_rows_for_inserted_agents_last_until_the_end_of_a_long_log(
+    new_network, record, limits
+):
+    """One agent a token step is inserted in the mean, and the log inserts none."""
     network = biased(new_network().eval(), add=0.0, remove=NEVER)
-    rows, tokens = logged.agents.presence.shape[2], logged.agents.presence.shape[1]
+    scene = record(3, tokens=40, lives=[(0, 39)], spread_m=15.0)
+    logged = collate([scene] * 4, replace(limits, tokens=40), 7)
+    rows = logged.agents.presence.shape[2]
 
     played = close_population_loop(network, logged, 3, seed=1)
 
-    surplus = played.agents.presence[..., rows:] == int(Presence.INSERTED)
-    assert surplus[:, tokens // 2 :].any(dim=2).float().mean() > 0.3
-    assert surplus.any(dim=1).any(dim=0).all()  # No row is left without an agent.
+    inserted = played.agents.presence[..., rows:] == int(Presence.INSERTED)
+    assert inserted[:, 30:39].any(dim=2).float().mean() > 0.3
+    assert inserted.any(dim=1).any(dim=0).all()  # No row is left without an agent.
 
 
 def test_each_insertion_has_its_turn_and_its_place(logged, played, grid_settings):
