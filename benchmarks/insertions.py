@@ -92,7 +92,7 @@ class InsertedSample:
             "median m/s": float(np.median(mps)),
             "90 % m/s": float(np.percentile(mps, 90)),
             "vehicles off-road": float(off.mean()) if len(off) else None,
-            "overlap somebody": float(overlaps.mean()),
+            "overlap another": float(overlaps.mean()),
             "pedestrians": float((agent_type == AgentType.PEDESTRIAN).mean()),
             "cyclists": float((agent_type == AgentType.CYCLIST).mean()),
         }

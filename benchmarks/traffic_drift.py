@@ -10,8 +10,8 @@ around the ego, its speed and that of vehicles, the share of vehicles that are o
 how many token steps the ego, and other vehicles, set off after standing for two seconds.
 The second has by what share each of these is above the logs', and 95 % of resamples of the
 scenes. The third has who comes after now, from when it is near: speed in the first second,
-who begins off the road or on top of somebody, pedestrians and cyclists; below it stands how
-far apart logs and rollouts are in speeds and in the side inserted agents come from. A
+who begins off the road or overlaps another agent, pedestrians and cyclists; below it stands
+how far apart logs and rollouts are in speeds and in the side inserted agents come from. A
 rollout whose ego leaves the map, where a street out of town ends, counts until then. It is
 said how many do, how long one stands at most, and by how much agents, its speed and
 off-road shares drift from the first span, and from the second, to the last. The last line
