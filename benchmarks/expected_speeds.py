@@ -6,9 +6,11 @@ Logs, token step by token step as they are learned from, and what some weights e
         [--split validation] [--scenes 80]
 
 The table has, for the ego and for other vehicles, by how fast they are, the mean speed of a
-token step, of the next one in the log, and of the next one that is expected. A network that
-is right in the mean may still expect fast vehicles to brake; then rollouts, of many such
-steps, are slow. The last line is one JSON object.
+token step, of the next one in the log, and of the next one that is expected; then the
+spread that is expected around that, and the error, both as roots of mean squares: alike if
+the distribution is as wide as it should be. A network that is right in the mean may still
+expect fast vehicles to brake; then rollouts, of many such steps, are slow. The last line is
+one JSON object.
 """
 
 from collections.abc import Sequence
@@ -29,11 +31,13 @@ from pipeline.commands.screen import show_table
 
 SPEED_EDGES_MPS = (0.5, 2.5, 5.0, 8.0, 11.0, 14.0)
 WHO = ("other vehicles", "the ego")
-COLUMNS = ("now", "next in the log", "expected")
+MEANS = ("now", "next in the log", "expected")
+ROOTS = ("spread expected", "error")
+COLUMNS = MEANS + ROOTS
 
 
-def look(network: Network, scene: SceneTokens) -> Float64[np.ndarray, "4 who bin"]:
-    """Count token steps of vehicles in a log, and sum up the speeds of ``COLUMNS``."""
+def look(network: Network, scene: SceneTokens) -> Float64[np.ndarray, "6 who bin"]:
+    """Count token steps of vehicles in a log, and sum up what ``COLUMNS`` are made of."""
     batch = whole(network, scene)
     with torch.no_grad():
         motion = network(batch).motion
@@ -46,12 +50,15 @@ def look(network: Network, scene: SceneTokens) -> Float64[np.ndarray, "4 who bin
     known = [(each >= 0) & (each < len(speed_mps)) for each in (now, then)]
     mask = rows.pack(counted) & known[0] & known[1]
     likely = motion.motion_logits[mask].double().softmax(dim=1)
+    logged_mps, expected_mps = speed_mps[then[mask]], likely @ speed_mps
     each = torch.stack(
         [
             torch.ones(len(likely), dtype=torch.float64),
             speed_mps[now[mask]],
-            speed_mps[then[mask]],
-            likely @ speed_mps,
+            logged_mps,
+            expected_mps,
+            likely @ speed_mps.square() - expected_mps.square(),
+            (logged_mps - expected_mps).square(),
         ]
     )
     edges_mps = torch.tensor(SPEED_EDGES_MPS, dtype=torch.float64)
@@ -67,16 +74,18 @@ def _speed_mps(end_pose: Tensor) -> Float64[Tensor, " motion_token"]:
     return end[:, :2].norm(dim=1) * end[:, 0].sign() / CLOCK.token_s
 
 
-def report(found: Float64[np.ndarray, "4 who bin"]) -> list[dict[str, object]]:
+def report(found: Float64[np.ndarray, "6 who bin"]) -> list[dict[str, object]]:
     """Print the table; return its rows."""
     rows: list[dict[str, object]] = []
     bounds = [f"{low:g} to {high:g}" for low, high in pairwise(SPEED_EDGES_MPS)]
     names = [f"below {SPEED_EDGES_MPS[0]:g}", *bounds, f"{SPEED_EDGES_MPS[-1]:g} and more"]
     for who, sums in zip(WHO, found.swapaxes(0, 1), strict=True):
-        for name, (count, *speeds) in zip(names, sums.T, strict=True):
-            means = [round(each / max(1.0, count), 3) for each in speeds]
+        for name, (count, *added) in zip(names, sums.T, strict=True):
+            means = np.array(added) / max(1.0, count)
+            means[len(MEANS) :] **= 0.5
             told = {"who": who, "m/s": name, "token steps": int(count)}
-            rows.append({**told, **dict(zip(COLUMNS, means, strict=True))})
+            values = zip(COLUMNS, means.round(3).tolist(), strict=True)
+            rows.append({**told, **dict(values)})
     show_table(
         "speeds of vehicles, m/s",
         tuple(rows[0]),

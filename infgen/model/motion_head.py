@@ -7,23 +7,16 @@ tokens that lead to nearly the same place share features, so that few scenes tea
 them.
 """
 
-import math
 from functools import partial
 
-import numpy as np
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int64
 from torch import Tensor, nn
 
+from infgen.model.features.motion_waves import wave_phases
 from infgen.model.layers import by_agent_type, mlp
 from infgen.tokens.vocabulary import MotionVocabulary
 
-LONGEST_WAVE_M = 64.0
-"""Longer than any motion token. Each wave is half as long as the one before it ..."""
-WAVES = 9
-"""... down to a quarter of a metre."""
-TURN_WAVES = 6
-"""Waves of the heading, of which each turns twice as fast as the one before it."""
 UNIT_M = 10.0
 """Lengths are scaled to tens of metres, to match the size of the waves."""
 
@@ -40,7 +33,7 @@ class MotionHead(nn.Module):
         self, width: int, motion_feature_width: int, vocabulary: MotionVocabulary
     ) -> None:
         super().__init__()
-        waves = torch.from_numpy(_waves(vocabulary.end_pose))
+        waves = _waves(torch.from_numpy(vocabulary.end_pose).double())
         self.register_buffer("waves", waves, persistent=False)
         self.shape = nn.Sequential(
             nn.Linear(waves.shape[-1], 2 * motion_feature_width),
@@ -71,13 +64,9 @@ class MotionHead(nn.Module):
 
 
 def _waves(
-    end_pose: Float32[np.ndarray, "3 motion_token 3"],
-) -> Float32[np.ndarray, "3 motion_token wave"]:
+    end_pose: Float64[Tensor, "3 motion_token 3"],
+) -> Float32[Tensor, "3 motion_token wave"]:
     """Describe where motion tokens end, from coarse to fine."""
-    per_m = 2 * math.pi / LONGEST_WAVE_M * 2.0 ** np.arange(WAVES)
-    phase = [end_pose[..., axis, None] * per_m for axis in (0, 1)]
-    phase.append(end_pose[..., 2, None] * 2.0 ** np.arange(TURN_WAVES))
-    plain = end_pose / np.array([UNIT_M, UNIT_M, 1.0])
-    turns = np.concatenate(phase, axis=-1)
-    told = np.concatenate([plain, np.cos(turns), np.sin(turns)], axis=-1)
-    return told.astype(np.float32)
+    phase = wave_phases(end_pose)
+    plain = end_pose / torch.tensor([UNIT_M, UNIT_M, 1.0], dtype=torch.float64)
+    return torch.cat([plain, phase.cos(), phase.sin()], dim=-1).float()

@@ -15,6 +15,7 @@ from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.features.approach import ApproachFeatures, MovingPairs
 from infgen.model.features.clearance import Clearance
 from infgen.model.features.edge_clearance import EdgeClearance, EdgesNear
+from infgen.model.features.last_move import LastMove, LastMoveHead
 from infgen.model.features.removal import EgoPlace, RemovalFeatures
 from infgen.model.features.signals import SignalAhead
 from infgen.model.layers import Attention, AttentionSources, mlp, normed
@@ -44,6 +45,7 @@ class AgentContext:
         agents: Rows of the agents around them.
         moving: How they and others around them move, if that is used.
         edges: Road edges near them, if that is used.
+        last: How they moved last, if that is used.
         added: Added to their features [N, D], if anything is: ``MotionStack.added``.
         density: Agents around the ego of each [N], if that is used.
         ego_place: Where they are to the ego [N], if that is used.
@@ -56,6 +58,7 @@ class AgentContext:
     agents: NeighbourRows
     moving: MovingPairs | None
     edges: EdgesNear | None
+    last: LastMove | None
     added: Tensor | None
     density: Density | None
     ego_place: EgoPlace | None
@@ -120,6 +123,7 @@ class MotionStack(nn.Module):
         clear, of_edges = settings.clearance_width, settings.edge_clearance_width
         self.clearance = Clearance(width, clear, vocabulary) if clear else None
         self.edges = EdgeClearance(width, of_edges, vocabulary) if of_edges else None
+        self.last = LastMoveHead(width, vocabulary) if settings.last_move_head else None
 
     def map_reach(self) -> NeighbourSpec:
         """How agents see roads."""
@@ -154,6 +158,13 @@ class MotionStack(nn.Module):
         step_m, _ = agents.moved()
         size_lw_m = agents.size_lwh_m[:, :2]
         return EdgesNear.of(roads.edges, agents.pose, step_m, size_lw_m, scene)
+
+    def last_move(self, agents: AgentRows) -> LastMove | None:
+        """Find how agents moved last, if that is used."""
+        if self.last is None:
+            return None
+        _, known = agents.moved()
+        return LastMove.between(agents.before, agents.pose, known)
 
     def added(
         self,
@@ -237,6 +248,8 @@ class MotionStack(nn.Module):
             moves = self.move(x_ND)
         else:
             raise ValueError("the motion head needs features; pass motion_features()")
+        if self.last is not None and sight.last is not None:
+            moves = moves + self.last(x_ND, agent_type, sight.last)
         heads = (self.clearance, sight.moving), (self.edges, sight.edges)
         judged = [
             head(x_ND, agent_type, seen)

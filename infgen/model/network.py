@@ -13,6 +13,7 @@ from infgen.model.device.index import BatchIndex
 from infgen.model.device.together import launched_together
 from infgen.model.features.anchors import AnchorHead
 from infgen.model.features.approach import ApproachFeatures
+from infgen.model.features.last_move import LastMoveHead
 from infgen.model.features.removal import EgoPlace, RemovalFeatures
 from infgen.model.insertion.agent_spacing import AgentSpacing
 from infgen.model.insertion.batch_pass import detail_outputs, insertion_outputs
@@ -45,7 +46,7 @@ from infgen.tokens.settings import TokenSettings
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 AgentFeatures = DensityFeatures | StandingFeatures | RemovalFeatures | ApproachFeatures
-MotionParts = AgentFeatures | AnchorHead
+MotionParts = AgentFeatures | AnchorHead | LastMoveHead
 CellParts = OffsetEmbedding | OffsetFeatures | CellRefinement | AgentSpacing
 AddedPart = MotionParts | CellParts | LatentRates
 """Parts that may be added to trained weights."""
@@ -216,6 +217,7 @@ class Network(nn.Module):
             around,
             moving,
             self.motion.edges_near(given, roads, of_row),
+            self.motion.last_move(given),
             self.motion.added(given.pose, moving, roads, of_row, token),
             None if density is None else density.take(rows.at // visible.shape[1]),
             _ego_place(agents, rows) if self.motion.ego_place is not None else None,

@@ -131,6 +131,9 @@ class ModelSettings:
     that it would leave over 2 s if all went on as they move; 0 for none."""
     edge_clearance_width: Count = 0
     """The same for how far each motion token leads over road edges within 1 s."""
+    last_move_head: Bool = False
+    """Whether logits of motion tokens depend on what each changes of the last move, beside
+    where it leads: speeds are held where logs are few, at high ones too."""
     signal_ahead_m: NonNegative = 0.0
     """Every agent sees the signal of its own lane up to so far ahead, and how long it has
     shown that; 0 to see it only among all other map tokens."""

@@ -75,6 +75,7 @@ VARIANTS = {
     "removal features": {"removal_features": True},
     "latent rates": {"latent_rates": True},
     "approach features": {"approach_features": True},
+    "last move": {"last_move_head": True, "motion_feature_width": 8},
     "clearance": {"clearance_width": 8, "edge_clearance_width": 8},
     "smart with patterns": {
         "insertion_and_removal": False,

@@ -30,6 +30,7 @@ VARIANTS = {
     "latent rates": {"latent_rates": True},
     "cell refinement": {"cell_feature_width": 4, "cell_refinement_width": 4},
     "agent spacing": {"agent_spacing_width": 4, "offset_token": True},
+    "last move": {"last_move_head": True},
     "clearance": {"clearance_width": 4, "edge_clearance_width": 4},
 }
 FASTEST_M = 20.0
