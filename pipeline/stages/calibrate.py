@@ -255,7 +255,7 @@ def _rates(counts: "FlowCounts") -> dict[str, float | None]:
 
 STAGE = Stage(
     name="calibrate",
-    version=12,
+    version=13,
     settings={
         "tokenize": TokenSettings,
         "rollout": RolloutSettings,

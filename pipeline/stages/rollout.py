@@ -189,7 +189,7 @@ def _report(rows: list[dict[str, Any]], refused: list[str]) -> Report:
 
 STAGE = Stage(
     name="rollout",
-    version=14,
+    version=15,
     settings={"rollout": RolloutSettings},
     plan=plan,
     work=simulate,

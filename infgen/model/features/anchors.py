@@ -32,6 +32,10 @@ APART_S = 1.5
 """Anchors lie far apart at the end of the token and so long after its beginning ..."""
 HEADING_M = 2.0
 """... and in heading, where a radian counts as so much."""
+FINER_PER_M = 2.0
+"""Of a token that is x metres long, lengths count less by the root of one plus so many
+times x. Else 3 of the package's 64 anchors of vehicles are slower than 3 m/s, as one in
+seven motion tokens is, and these take the values of anchors 0.4 m away."""
 
 ROWS = 256
 """Rows at once on a CPU: what their features need stays in its cache."""
@@ -58,10 +62,12 @@ class Anchors:
         velocity_mps = _velocity_mps(end_pose)
         heading_rad = end_pose[..., 2:]
         ends_m = end_pose[..., :2]
+        length_m = np.linalg.norm(ends_m, axis=-1, keepdims=True)
+        counts = (1 + FINER_PER_M * length_m) ** -0.5
         told = np.concatenate(
             [
-                ends_m,
-                ends_m + velocity_mps * (APART_S - CLOCK.token_s),
+                counts * ends_m,
+                counts * (ends_m + velocity_mps * (APART_S - CLOCK.token_s)),
                 HEADING_M * np.cos(heading_rad),
                 HEADING_M * np.sin(heading_rad),
             ],

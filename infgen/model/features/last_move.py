@@ -3,8 +3,8 @@
 An agent mostly goes on as it moved. Its features have to carry that move, by which the
 motion head (``motion_head``) then chooses among two thousand tokens: at high speeds, of
 which logs have few, agents were half a metre per second too slow after each token. Here
-each motion token is told by what it changes of the last move, which is exact at any speed,
-and the agent's features tell which changes are likely.
+a motion token is described by what it changes of the last move, which is exact at any
+speed, and the agent's features tell which changes are likely.
 
 Shape letters as in ``layers``; K is the number of waves, V are the motion tokens.
 """
@@ -29,7 +29,7 @@ class LastMove:
     Attributes:
         change: Where they ended, in the frames where they began, as a motion token's end
             pose: metres and radians.
-        known: Whether that is known; nobody just inserted has moved.
+        known: Whether that is known; just inserted agents have not moved.
     """
 
     change: Float32[Tensor, "row 3"]

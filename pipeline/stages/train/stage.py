@@ -225,7 +225,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=21,
+    version=22,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,

@@ -158,6 +158,16 @@ def test_motion_tokens_take_the_values_of_anchors_that_lead_as_far(anchors, dens
     assert away_m.mean() < 0.3
 
 
+def test_short_motion_tokens_have_anchors_as_near(anchors, dense_moves):
+    length_m = np.linalg.norm(dense_moves.end_pose[0, :, :2], axis=-1)
+    ends = anchors.share[0].T @ anchors.end_pose[0, :, :2]
+    away_m = np.linalg.norm(ends - dense_moves.end_pose[0, :, :2], axis=-1)
+
+    slow, fast = away_m[length_m < 1.5].mean(), away_m[length_m > 6].mean()
+
+    assert slow < fast / 2
+
+
 def test_before_training_no_logit_changes_and_afterwards_tokens_are_told_apart(clearance):
     moving, x = pairs(EAST, STANDS_AHEAD), torch.randn(2, 16)
     clearance.begin_at_zero()
