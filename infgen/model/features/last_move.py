@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor, nn
 
+from infgen.model.features.frames import to_local
 from infgen.model.features.motion_waves import wave_phases
 from infgen.model.layers import begin_last_at_zero, by_agent_type, full_precision, mlp
-from infgen.model.relations import wrap_angle
 from infgen.tokens.vocabulary import MotionVocabulary
 
 
@@ -43,11 +43,7 @@ class LastMove:
         known: Bool[Tensor, " row"],
     ) -> "LastMove":
         """Find the move from one pose to another."""
-        x_m, y_m, turned_rad = (pose - before).unbind(-1)
-        cos, sin = before[:, 2].cos(), before[:, 2].sin()
-        ahead_m, left_m = cos * x_m + sin * y_m, cos * y_m - sin * x_m
-        change = torch.stack([ahead_m, left_m, wrap_angle(turned_rad)], dim=-1)
-        return cls(change, known)
+        return cls(to_local(pose, before), known)
 
 
 class LastMoveHead(nn.Module):

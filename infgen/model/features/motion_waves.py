@@ -1,4 +1,4 @@
-"""Waves by which the ends of motion tokens are told, from coarse to fine."""
+"""Waves that describe the ends of motion tokens, from coarse to fine."""
 
 import math
 

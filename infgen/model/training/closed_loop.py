@@ -18,6 +18,7 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Agents, Batch, Details, Insertions
 from infgen.model.batching.insertion_targets import describe
+from infgen.model.features.frames import to_local, to_world
 from infgen.model.network import Network
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import TokenStep
@@ -25,8 +26,6 @@ from infgen.model.training.nearest_tokens import (
     MotionTokenEnds,
     nearest,
     nearest_of,
-    to_local,
-    to_world,
 )
 from infgen.tokens.grid import Grid, encode_cell, to_grid
 from infgen.tokens.scene_tokens import EGO, NO_CELL, Presence

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
+from infgen.model.features.frames import rotate
 from infgen.tokens.motion_tokens import make_match_table
 from infgen.tokens.vocabulary import MotionVocabulary
 
@@ -91,31 +92,6 @@ def nearest_of(
     return choice.gather(1, gap_m.argmin(dim=1, keepdim=True))[:, 0]
 
 
-def to_local(
-    pose: Float32[Tensor, "*row 3"], frame: Float32[Tensor, "*row 3"]
-) -> Float32[Tensor, "*row 3"]:
-    """Express world poses in the frame of other poses. Inverse of ``to_world``."""
-    away_m = pose[..., :2] - frame[..., :2]
-    turn_rad = wrap_angle(pose[..., 2] - frame[..., 2])
-    return torch.cat([_rotate(away_m, -frame[..., 2]), turn_rad[..., None]], dim=-1)
-
-
-def to_world(
-    pose: Float32[Tensor, "*row 3"], frame: Float32[Tensor, "*row 3"]
-) -> Float32[Tensor, "*row 3"]:
-    """Bring poses given in the frame of other poses to the world."""
-    xy_m = _rotate(pose[..., :2], frame[..., 2]) + frame[..., :2]
-    heading_rad = wrap_angle(pose[..., 2] + frame[..., 2])
-    return torch.cat([xy_m, heading_rad[..., None]], dim=-1)
-
-
-def wrap_angle(angle_rad: Tensor) -> Tensor:
-    """Bring angles to [-pi, pi)."""
-    wrapped = torch.remainder(angle_rad + torch.pi, 2 * torch.pi) - torch.pi
-    # Rounding may lift an angle just below -pi to exactly +pi.
-    return torch.where(wrapped >= torch.pi, -torch.pi, wrapped)
-
-
 def _measured(wanted: Tensor, agent_type: Tensor, ends: MotionTokenEnds) -> Tensor:
     """The same by measuring all motion tokens: to choose few makes the host wait."""
     found = []
@@ -162,7 +138,7 @@ def _mean_gap(one_m: Tensor, other_m: Tensor) -> Tensor:
 def _corners(pose: Tensor, size_lw_m: Tensor) -> Tensor:
     """Return the corners [row, 8] of boxes: x of all four, then y of all four."""
     signs = _signs(pose.dtype, pose.device)
-    corners_m = _rotate(size_lw_m[..., None, :] * signs, pose[:, None, 2])
+    corners_m = rotate(size_lw_m[..., None, :] * signs, pose[:, None, 2])
     return (corners_m + pose[:, None, :2]).transpose(1, 2).flatten(1)
 
 
@@ -177,10 +153,3 @@ def _spread(pose: Tensor, reach_m: Tensor) -> Tensor:
     heading = pose[..., 2]
     turned_m = reach_m * heading.cos(), reach_m * heading.sin()
     return torch.stack([pose[..., 0], pose[..., 1], *turned_m], dim=-1)
-
-
-def _rotate(xy_m: Tensor, angle_rad: Tensor) -> Tensor:
-    """Turn points counter-clockwise about the origin."""
-    cos, sin = angle_rad.cos(), angle_rad.sin()
-    x_m, y_m = xy_m.unbind(-1)
-    return torch.stack([cos * x_m - sin * y_m, sin * x_m + cos * y_m], dim=-1)

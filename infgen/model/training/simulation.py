@@ -14,6 +14,7 @@ from torch.nn.functional import pad
 
 from infgen.model.batching.batch import Agents, Batch
 from infgen.model.batching.tensors import map_tensors
+from infgen.model.features.frames import to_world
 from infgen.model.latent_rates import Rate
 from infgen.model.network import Network
 from infgen.model.relations import Rows
@@ -22,7 +23,7 @@ from infgen.model.step_memory import Insertions as StepInsertions
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import PositionOutputs, TokenStep
 from infgen.model.training.closed_loop import token_step_at
-from infgen.model.training.nearest_tokens import MotionTokenEnds, to_world
+from infgen.model.training.nearest_tokens import MotionTokenEnds
 from infgen.model.training.own_choices import InsertedAgent, UniformNumbers, sample_agent
 from infgen.model.training.population_targets import InsertionTurns
 from infgen.model.training.rate_samples import RateSamples

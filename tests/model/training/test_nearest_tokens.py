@@ -7,12 +7,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from infgen import geometry
+from infgen.model.features.frames import to_local, to_world
 from infgen.model.training.nearest_tokens import (
     MotionTokenEnds,
     nearest,
     nearest_of,
-    to_local,
-    to_world,
 )
 from infgen.tokens.motion_tokens import advance, make_match_table, nearest_motion_tokens
 from infgen.tokens.vocabulary import BOX_LW_M, MotionVocabulary
