@@ -23,8 +23,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int8, Int16, Int64
 
+from infgen.model.batching.recovery import WHOLE_RECOVERY, Recovery
 from infgen.model.training_settings import TrainSettings
 from infgen.tokens.motion_tokens import (
     MatchTable,
@@ -61,6 +63,7 @@ class Perturbation:
         share: Of the motion tokens that are drawn; the others are the nearest.
         drift: Share of the agents that drift while they are on the motion token.
         near_map_tokens: For each map shape those that it is drawn from, itself the first.
+        recovery: How much of a deviation the motion token to learn makes good.
     """
 
     table: MatchTable
@@ -68,6 +71,7 @@ class Perturbation:
     share: float
     drift: float
     near_map_tokens: Int16[np.ndarray, "road near"]
+    recovery: Recovery = WHOLE_RECOVERY
 
 
 class PerturbedMotion(NamedTuple):
@@ -107,6 +111,7 @@ def make_perturbation(
         share=settings.motion_noise_share,
         drift=settings.lateral_drift_share,
         near_map_tokens=_near_map_tokens(roads, max(1, settings.map_noise_neighbours)),
+        recovery=Recovery.of(settings),
     )
 
 
@@ -205,9 +210,15 @@ def perturb_motion(logged: LoggedMotion, noise: Perturbation) -> PerturbedMotion
         ends[far] = advance(
             before[far], agent_type[rows[far]], taken[far], noise.table.vocabulary
         )
-        back = np.flatnonzero(aside_m[rows])  # To these, the nearest is on the drift.
+        # To those that drift, the nearest is on the drift.
+        is_led = aside_m[rows] != 0
+        back = np.flatnonzero(
+            is_led if noise.recovery.is_whole else is_led | strays.off[rows, token - 1]
+        )
+        logged_pose = pose[rows[back], token - 1]
+        target = _target(before[back], logged_pose, wanted[back], noise.recovery)
         nearest[back] = nearest_motion_tokens(
-            wanted[back], before[back], agent_type[rows[back]], noise.table
+            target, before[back], agent_type[rows[back]], noise.table
         )
 
         # Agents at their logged poses with logged tokens keep these bit for bit.
@@ -216,6 +227,17 @@ def perturb_motion(logged: LoggedMotion, noise: Perturbation) -> PerturbedMotion
         strays.pose[rows, token] = np.where(off[:, None], ends, wanted)
         strays.off[rows, token] = off
     return strays
+
+
+def _target(
+    pose: Float32[np.ndarray, "row 3"],
+    logged: Float32[np.ndarray, "row 3"],
+    next_logged: Float32[np.ndarray, "row 3"],
+    recovery: Recovery,
+) -> Float32[np.ndarray, "row 3"]:
+    """Say where agents should be one token step later (``Recovery.target``)."""
+    rows = (torch.from_numpy(each) for each in (pose, logged, next_logged))
+    return recovery.target(*rows).numpy()
 
 
 def _pushes(

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor, nn
 
-from infgen.model.features.frames import to_local
+from infgen.model.batching.frames import to_local
 from infgen.model.features.motion_waves import wave_phases
 from infgen.model.layers import begin_last_at_zero, by_agent_type, full_precision, mlp
 from infgen.tokens.vocabulary import MotionVocabulary

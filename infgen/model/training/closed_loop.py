@@ -4,7 +4,7 @@ CatK (SPEC 7.1): at every token step each agent takes, of the motion tokens that
 finds most likely, the one that ends nearest to where the log says the agent is. So the
 scene stays near the log, and all that is seen of it is the network's own doing. What is to
 be learned is the motion token of all that leads nearest to the log from where the agent has
-come to.
+come to, or only a part of the way there (``recovery``).
 
 Where the log says an agent is means its quantised pose, as batches hold it.
 """
@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from infgen.model.batching.batch import Agents, Batch, Details, Insertions
+from infgen.model.batching.frames import to_local, to_world
 from infgen.model.batching.insertion_targets import describe
-from infgen.model.features.frames import to_local, to_world
+from infgen.model.batching.recovery import WHOLE_RECOVERY, Recovery
 from infgen.model.network import Network
 from infgen.model.stepping import Stepper
 from infgen.model.token_step import TokenStep
@@ -32,7 +33,9 @@ from infgen.tokens.scene_tokens import EGO, NO_CELL, Presence
 
 
 @torch.no_grad()
-def close_loop(network: Network, batch: Batch, top: int) -> Batch:
+def close_loop(
+    network: Network, batch: Batch, top: int, recovery: Recovery = WHOLE_RECOVERY
+) -> Batch:
     """Simulate a batch from its first token step on, close to the log.
 
     Insertions, removals and gaps are those of the log: inserted agents start at their true
@@ -44,6 +47,7 @@ def close_loop(network: Network, batch: Batch, top: int) -> Batch:
         network: The network; its mode (training or not) is kept.
         batch: Scenes as logged, without noise, on the network's device.
         top: Most likely motion tokens that each is chosen from.
+        recovery: How much of a deviation the motion token to learn makes good.
 
     Returns:
         The batch to learn from, with other poses, moves, labels and cells.
@@ -57,7 +61,7 @@ def close_loop(network: Network, batch: Batch, top: int) -> Batch:
         )
     learning = network.training
     try:
-        agents, off = _play(network, batch, top)
+        agents, off = _play(network, batch, top, recovery)
     finally:
         network.train(learning)
     return replace(
@@ -68,7 +72,9 @@ def close_loop(network: Network, batch: Batch, top: int) -> Batch:
     )
 
 
-def _play(network: Network, batch: Batch, top: int) -> tuple[Agents, Tensor]:
+def _play(
+    network: Network, batch: Batch, top: int, recovery: Recovery
+) -> tuple[Agents, Tensor]:
     """Simulate all agents; also mark where [scene, token, agent] they are not as logged."""
     logged, stepper, grid = batch.agents, Stepper(network), network.grid
     device = logged.pose.device
@@ -90,7 +96,8 @@ def _play(network: Network, batch: Batch, top: int) -> tuple[Agents, Tensor]:
     for token in range(1, tokens):
         said = stepper.motion_step(memory, token_step_at(played, token - 1))
         who = logged.observed[:, token] & logged.visible[:, token - 1]
-        move_near_log(played, logged, off, token, who, said.motion_logits, top, ends)
+        choice = said.motion_logits, top, ends, recovery
+        move_near_log(played, logged, off, token, who, *choice)
         played.cell[:, token] = _cells(played, logged, off, token, grid)
     return played, off
 
@@ -104,6 +111,7 @@ def move_near_log(
     logits: Tensor,
     top: int,
     ends: MotionTokenEnds,
+    recovery: Recovery,
 ) -> None:
     """Write the next motion tokens of some agents, and where these lead.
 
@@ -116,6 +124,7 @@ def move_near_log(
         logits: Of their motion tokens [scene, agent, motion_token].
         top: Most likely motion tokens that each is chosen from.
         ends: Where motion tokens end.
+        recovery: How much of a deviation the motion token to learn makes good.
     """
     take, write = _rows_of(who)
     before, true = take(played.pose[:, token - 1]), take(logged.pose[:, token])
@@ -129,7 +138,11 @@ def move_near_log(
     led = to_world(ends.pose[agent_type, taken], before)
     write(off[:, token], strays)
     write(played.motion_token[:, token], taken)
-    write(played.label[:, token], nearest(wanted, agent_type, ends))
+    # After a gap in its log an agent is to be where the log has it.
+    was_seen = take(logged.observed[:, token - 1])[:, None]
+    was = torch.where(was_seen, take(logged.pose[:, token - 1]), before)
+    target = recovery.target(before, was, true)
+    write(played.label[:, token], nearest(to_local(target, before), agent_type, ends))
     write(played.pose[:, token], torch.where(strays[:, None], led, true))
 
 

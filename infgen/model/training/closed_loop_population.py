@@ -31,6 +31,7 @@ from torch import Tensor
 
 from infgen.model.batching.batch import Batch
 from infgen.model.batching.padding import NO_AGENT
+from infgen.model.batching.recovery import WHOLE_RECOVERY, Recovery
 from infgen.model.latent_rates import Rate
 from infgen.model.long_memory import count_around
 from infgen.model.network import Network
@@ -61,7 +62,12 @@ where agents come into view."""
 
 @torch.no_grad()
 def close_population_loop(
-    network: Network, batch: Batch, top: int, seed: int, latent_rate_scale: float = 1.0
+    network: Network,
+    batch: Batch,
+    top: int,
+    seed: int,
+    latent_rate_scale: float = 1.0,
+    recovery: Recovery = WHOLE_RECOVERY,
 ) -> Batch:
     """Simulate a batch with the insertions and removals of the network itself.
 
@@ -72,6 +78,7 @@ def close_population_loop(
             chosen from; 0 to move these as the batch has it.
         seed: Of everything that is sampled.
         latent_rate_scale: Latent rates vary so much, beside what the network has learned.
+        recovery: How much of a deviation the motion token to learn makes good.
 
     Returns:
         The batch to learn from; it has more rows of agents.
@@ -86,7 +93,7 @@ def close_population_loop(
         )
     learning = network.training
     try:
-        simulation = _PopulationLoop(network, batch, top, seed, latent_rate_scale)
+        simulation = _PopulationLoop(network, batch, top, seed, latent_rate_scale, recovery)
         for token in range(1, simulation.logged.pose.shape[1]):
             simulation.rates.advance(token)
             simulation.move(token)
@@ -105,6 +112,7 @@ class _PopulationLoop(Simulation):
 
     Attributes:
         top: Most likely motion tokens that are chosen from; 0 to follow the batch.
+        recovery: How much of a deviation the motion token to learn makes good.
         off: Whether agents are not as logged [scene, token, agent].
         fresh_until: Last token step at which each agent is fresh [scene, agent].
         used: Rows in use [scene].
@@ -124,6 +132,7 @@ class _PopulationLoop(Simulation):
         top: int,
         seed: int,
         latent_rate_scale: float,
+        recovery: Recovery,
     ) -> None:
         """Begin with the first token step as logged."""
         super().__init__(network, batch, seed, latent_rate_scale)
@@ -131,6 +140,7 @@ class _PopulationLoop(Simulation):
         born = visible.long().argmax(dim=1)  # The first one that is true.
         fresh_until = torch.where(born > 0, born + FRESH_TOKENS, -1)
         self.top = min(top, self.ends.pose.shape[1])
+        self.recovery = recovery
         self.off = torch.zeros_like(visible)
         self.fresh_until = torch.where(visible.any(dim=1), fresh_until, -1)
         rows = batch.agents.presence.shape[2]
@@ -154,7 +164,7 @@ class _PopulationLoop(Simulation):
         self._label_removals(token, matched, surplus, said.remove_logit)
         who, logits = matched & seen & observed, said.motion_logits
         if self.top:
-            near = who, logits, self.top, self.ends
+            near = who, logits, self.top, self.ends, self.recovery
             move_near_log(played, logged, self.off, token, *near)
         self._move_freely(token, surplus, logits)
         known = logged.told[:, token].any(dim=1, keepdim=True)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
-from infgen.model.features.frames import rotate
+from infgen.model.batching.frames import rotate
 from infgen.tokens.motion_tokens import make_match_table
 from infgen.tokens.vocabulary import MotionVocabulary
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from infgen.model.batching.batch import Agents, Batch
+from infgen.model.batching.frames import to_world
 from infgen.model.batching.tensors import map_tensors
-from infgen.model.features.frames import to_world
 from infgen.model.latent_rates import Rate
 from infgen.model.network import Network
 from infgen.model.relations import Rows

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import Batch
+from infgen.model.batching.recovery import Recovery
 from infgen.model.batching.supervision import Supervision, supervised_choices
 from infgen.model.device.packed import IndexedBatch, PackedBatch, prepared
 from infgen.model.network import Network
@@ -109,14 +110,15 @@ def _near_log(
     here: IndexedBatch, network: Network, settings: TrainSettings, seed: int
 ) -> IndexedBatch:
     """Simulate a batch near to its log for closed-loop fine-tuning."""
-    top = settings.closed_loop_top_k
+    top, recovery = settings.closed_loop_top_k, Recovery.of(settings)
     if settings.closed_loop_population:
         scale = settings.latent_rate_scale
-        simulated = close_population_loop(network, here.batch, top, seed, scale)
+        simulated = close_population_loop(network, here.batch, top, seed, scale, recovery)
         return IndexedBatch(simulated, None, None)  # Others are there than in the log.
     if not top:
         return here
-    return replace(here, batch=close_loop(network, here.batch, top), supervision=None)
+    simulated = close_loop(network, here.batch, top, recovery)
+    return replace(here, batch=simulated, supervision=None)
 
 
 def each_terms(

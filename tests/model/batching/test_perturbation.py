@@ -21,6 +21,7 @@ from infgen.model.batching.perturbation import (
     perturb_motion,
     perturb_scenes,
 )
+from infgen.model.batching.recovery import WHOLE_RECOVERY, Recovery
 from infgen.tokens.motion_tokens import advance, make_match_table, nearest_motion_tokens
 from infgen.tokens.scene_tokens import NO_MOTION_TOKEN
 from infgen.tokens.vocabulary import BOX_LW_M, MapVocabulary, MotionVocabulary
@@ -52,10 +53,10 @@ def fan_matches():
     return make_match_table(fan_moves())
 
 
-def noise_of(vocabulary, moves, share=1.0, drift=0.0):
+def noise_of(vocabulary, moves, share=1.0, drift=0.0, recovery=WHOLE_RECOVERY):
     wide = vocabulary is fan_moves()
     matches = fan_matches() if wide else make_match_table(vocabulary)
-    return Perturbation(matches, moves, share, drift, ITSELF)
+    return Perturbation(matches, moves, share, drift, ITSELF, recovery)
 
 
 def five_metre_drives(vocabulary, agents=400, tokens=18):
@@ -254,6 +255,37 @@ def test_a_share_of_the_drivers_drifts_for_seconds_and_learns_the_way_back():
     across_m = 5 * np.sin(turned_rad) + back_m * np.cos(turned_rad)
     far = np.abs(settled_m[:, :-1]) > 0.5
     assert (across_m[far] * settled_m[:, :-1][far] < 0).mean() > 0.95
+
+
+def test_who_drifts_learns_to_come_back_by_the_share_that_is_to_be_made_good():
+    vocabulary = fan_moves()
+    drives = five_metre_drives(vocabulary)
+    noise = noise_of(vocabulary, 1, drift=1.0, recovery=Recovery(along=0.0, lateral=0.2))
+
+    strays = stray(drives, noise)
+
+    aside_m = strays.pose[..., 1] - drives[1][..., 1]
+    ends = advance(strays.pose[:, 6].copy(), drives[0], strays.label[:, 7], vocabulary)
+    to_be_aside_m = ends[:, 1] - drives[1][:, 7, 1]
+    far = np.abs(aside_m[:, 6]) > 0.5
+    assert far.sum() > 50
+    share = to_be_aside_m[far] / aside_m[far, 6]
+    assert 0.75 < share.mean() < 0.85
+    # All of it would be made good in one token step.
+    whole = stray(drives, noise_of(vocabulary, 1, drift=1.0))
+    ends = advance(whole.pose[:, 6].copy(), drives[0], whole.label[:, 7], vocabulary)
+    assert np.abs(ends[far, 1] - drives[1][far, 7, 1]).mean() < 0.2
+
+
+def test_with_noise_along_the_way_who_is_ahead_is_to_go_as_fast_as_the_log():
+    vocabulary = straight_moves()
+    drives = metre_drives(agents=50)
+    noise = noise_of(vocabulary, 3, recovery=Recovery(along=0.0, lateral=1.0))
+
+    strays = stray(drives, noise)
+
+    assert (strays.motion_token[:, 1:] != 10).mean() > 0.5
+    assert (strays.label[:, 1:] == 10).all()
 
 
 def test_who_hardly_moves_does_not_drift():

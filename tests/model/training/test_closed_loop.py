@@ -9,6 +9,7 @@ import torch
 from infgen.config import TrainSettings
 from infgen.model.batching.batch import collate
 from infgen.model.batching.insertion_targets import OUTSIDE
+from infgen.model.batching.recovery import Recovery
 from infgen.model.training.closed_loop import close_loop
 from infgen.model.training.losses import losses, total
 from infgen.tokens.grid import decode_cell, encode_cell, from_grid, make_grid, to_grid
@@ -163,6 +164,28 @@ def test_poses_follow_moves_and_labels_lead_back_to_the_log(logged, played, voca
     after_m = np.linalg.norm((end(label) - truth)[:, :2], axis=1)
     assert after_m.mean() < away_m.mean()
     assert (motion_token != label).any()
+
+
+def test_labels_may_lead_only_a_part_of_the_way_back(logged, network, vocabularies):
+    vocabulary, part = vocabularies()[0], Recovery(along=0.0, lateral=0.2)
+    whole, played = close_loop(network, logged, 3), close_loop(network, logged, 3, part)
+    agents, log = played.agents, logged.agents
+    scene, token, row = moves_made(played)
+    was_seen = log.observed[scene, token - 1, row]
+    scene, token, row = scene[was_seen], token[was_seen], row[was_seen]
+    agent_type = agents.agent_type[scene, row].numpy().astype(np.int8)
+    before = agents.pose[scene, token - 1, row]
+    was, truth = log.pose[scene, token - 1, row], log.pose[scene, token, row]
+
+    wanted = part.target(before, was, truth).numpy()
+
+    best = nearest_motion_tokens(
+        wanted, before.numpy(), agent_type, make_match_table(vocabulary)
+    )
+    label = agents.label[scene, token, row].numpy()
+    assert (label == best).mean() > 0.99  # Rounding decides between equally near ones.
+    assert (label != whole.agents.label[scene, token, row].numpy()).any()
+    assert torch.equal(agents.motion_token, whole.agents.motion_token)
 
 
 def test_who_comes_goes_and_is_not_seen_is_the_logs(logged, played):

@@ -7,7 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from infgen import geometry
-from infgen.model.features.frames import to_local, to_world
+from infgen.model.batching.frames import to_local, to_world
 from infgen.model.training.nearest_tokens import (
     MotionTokenEnds,
     nearest,
