@@ -119,10 +119,11 @@ class TrainSettings:
     which the network learns to come back."""
     along_recovery: Share = 1.0
     """Share of how far an agent is ahead of its log or behind it, by noise or in closed
-    loop, that the motion token to learn makes good in one token step; 1 for all (SMART,
-    CatK), which takes changes of speed that no log has."""
+    loop, that it makes good in one token step; 1 for all (SMART, CatK), which takes changes
+    of speed that no log has."""
     lateral_recovery: Share = 1.0
-    """The same of how far it is beside its log; less than all leads back in a curve."""
+    """The same of how far it is beside its log, of the motion token to learn; less than all
+    leads back in a curve."""
     map_noise_neighbours: Count = 0
     """A map token is drawn from so many shapes nearest to the true one (SPEC 1.3); 0 for
     the true ones."""

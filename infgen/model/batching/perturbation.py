@@ -19,7 +19,7 @@ is within centimetres of the log's own.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -63,7 +63,7 @@ class Perturbation:
         share: Of the motion tokens that are drawn; the others are the nearest.
         drift: Share of the agents that drift while they are on the motion token.
         near_map_tokens: For each map shape those that it is drawn from, itself the first.
-        recovery: How much of a deviation the motion token to learn makes good.
+        recovery: How much of a deviation is made good in a token step.
     """
 
     table: MatchTable
@@ -197,7 +197,9 @@ def perturb_motion(logged: LoggedMotion, noise: Perturbation) -> PerturbedMotion
         way_m = np.hypot(*(wanted - pose[rows, token - 1])[:, :2].T)
         was_m, aside_m = aside_m, np.zeros(len(agent_type))
         aside_m[rows] = _drifted(was_m[rows], way_m, logged.push[rows, token])
-        led = _drift_target(wanted, way_m, was_m[rows], aside_m[rows])
+        logged_pose = pose[rows, token - 1]
+        ahead = _target(before, logged_pose, wanted, replace(noise.recovery, lateral=1.0))
+        led = _drift_target(ahead, way_m, was_m[rows], aside_m[rows])
 
         rank = logged.rank[rows, token]
         nearest, taken = ranked_motion_tokens(
@@ -215,8 +217,7 @@ def perturb_motion(logged: LoggedMotion, noise: Perturbation) -> PerturbedMotion
         back = np.flatnonzero(
             is_led if noise.recovery.is_whole else is_led | strays.off[rows, token - 1]
         )
-        logged_pose = pose[rows[back], token - 1]
-        target = _target(before[back], logged_pose, wanted[back], noise.recovery)
+        target = _target(before[back], logged_pose[back], wanted[back], noise.recovery)
         nearest[back] = nearest_motion_tokens(
             target, before[back], agent_type[rows[back]], noise.table
         )

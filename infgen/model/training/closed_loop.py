@@ -4,7 +4,8 @@ CatK (SPEC 7.1): at every token step each agent takes, of the motion tokens that
 finds most likely, the one that ends nearest to where the log says the agent is. So the
 scene stays near the log, and all that is seen of it is the network's own doing. What is to
 be learned is the motion token of all that leads nearest to the log from where the agent has
-come to, or only a part of the way there (``recovery``).
+come to. Both may lead only a part of the way back (``recovery``): an agent that has fallen
+behind the log and catches up at once drives at speeds that no log has.
 
 Where the log says an agent is means its quantised pose, as batches hold it.
 """
@@ -47,7 +48,7 @@ def close_loop(
         network: The network; its mode (training or not) is kept.
         batch: Scenes as logged, without noise, on the network's device.
         top: Most likely motion tokens that each is chosen from.
-        recovery: How much of a deviation the motion token to learn makes good.
+        recovery: How much of a deviation is made good in a token step.
 
     Returns:
         The batch to learn from, with other poses, moves, labels and cells.
@@ -124,12 +125,15 @@ def move_near_log(
         logits: Of their motion tokens [scene, agent, motion_token].
         top: Most likely motion tokens that each is chosen from.
         ends: Where motion tokens end.
-        recovery: How much of a deviation the motion token to learn makes good.
+        recovery: How much of a deviation is made good in a token step.
     """
     take, write = _rows_of(who)
     before, true = take(played.pose[:, token - 1]), take(logged.pose[:, token])
     agent_type = take(logged.agent_type)
-    wanted = to_local(true, before)
+    # After a gap in its log an agent is to be where the log has it.
+    was_seen = take(logged.observed[:, token - 1])[:, None]
+    was = torch.where(was_seen, take(logged.pose[:, token - 1]), before)
+    wanted = to_local(recovery.target(before, was, true), before)
     likely = take(logits).topk(top).indices.sort().values
     taken = nearest_of(wanted, agent_type, likely, ends)
 
@@ -138,11 +142,7 @@ def move_near_log(
     led = to_world(ends.pose[agent_type, taken], before)
     write(off[:, token], strays)
     write(played.motion_token[:, token], taken)
-    # After a gap in its log an agent is to be where the log has it.
-    was_seen = take(logged.observed[:, token - 1])[:, None]
-    was = torch.where(was_seen, take(logged.pose[:, token - 1]), before)
-    target = recovery.target(before, was, true)
-    write(played.label[:, token], nearest(to_local(target, before), agent_type, ends))
+    write(played.label[:, token], nearest(wanted, agent_type, ends))
     write(played.pose[:, token], torch.where(strays[:, None], led, true))
 
 

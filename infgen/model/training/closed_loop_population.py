@@ -78,7 +78,7 @@ def close_population_loop(
             chosen from; 0 to move these as the batch has it.
         seed: Of everything that is sampled.
         latent_rate_scale: Latent rates vary so much, beside what the network has learned.
-        recovery: How much of a deviation the motion token to learn makes good.
+        recovery: How much of a deviation is made good in a token step.
 
     Returns:
         The batch to learn from; it has more rows of agents.
@@ -112,7 +112,7 @@ class _PopulationLoop(Simulation):
 
     Attributes:
         top: Most likely motion tokens that are chosen from; 0 to follow the batch.
-        recovery: How much of a deviation the motion token to learn makes good.
+        recovery: How much of a deviation is made good in a token step.
         off: Whether agents are not as logged [scene, token, agent].
         fresh_until: Last token step at which each agent is fresh [scene, agent].
         used: Rows in use [scene].

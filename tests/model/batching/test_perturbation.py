@@ -286,6 +286,23 @@ def test_with_noise_along_the_way_who_is_ahead_is_to_go_as_fast_as_the_log():
 
     assert (strays.motion_token[:, 1:] != 10).mean() > 0.5
     assert (strays.label[:, 1:] == 10).all()
+    # Nothing is made good, so what they are ahead or behind adds up.
+    ahead_m = strays.pose[..., 0] - drives[1][..., 0]
+    assert ahead_m[:, 12:].std() > 2 * ahead_m[:, 1].std() > 0
+
+
+def test_who_makes_good_a_share_strays_only_so_far():
+    vocabulary = straight_moves()
+    drives = metre_drives(agents=200, tokens=40)
+    noise = noise_of(vocabulary, 3, recovery=Recovery(along=0.3, lateral=1.0))
+
+    strays = stray(drives, noise)
+
+    ahead_m = strays.pose[..., 0] - drives[1][..., 0]
+    assert ahead_m[:, 30:].std() == pytest.approx(ahead_m[:, 10:20].std(), rel=0.2)
+    never = noise_of(vocabulary, 3, recovery=Recovery(along=0.0, lateral=1.0))
+    far_m = stray(drives, never).pose[..., 0] - drives[1][..., 0]
+    assert ahead_m[:, 30:].std() < 0.5 * far_m[:, 30:].std()
 
 
 def test_who_hardly_moves_does_not_drift():
