@@ -191,6 +191,7 @@ def perturb_motion(logged: LoggedMotion, noise: Perturbation) -> PerturbedMotion
         motion_token.copy(), pose.copy(), motion_token.copy(), np.zeros_like(logged.moving)
     )
     aside_m = np.zeros(len(agent_type))
+    along = replace(noise.recovery, lateral=1.0)  # Drift has its own way back.
     for token in range(1, logged.moving.shape[1]):
         rows = np.flatnonzero(logged.moving[:, token])
         before, wanted = strays.pose[rows, token - 1], pose[rows, token]
@@ -198,7 +199,7 @@ def perturb_motion(logged: LoggedMotion, noise: Perturbation) -> PerturbedMotion
         was_m, aside_m = aside_m, np.zeros(len(agent_type))
         aside_m[rows] = _drifted(was_m[rows], way_m, logged.push[rows, token])
         logged_pose = pose[rows, token - 1]
-        ahead = _target(before, logged_pose, wanted, replace(noise.recovery, lateral=1.0))
+        ahead = _target(before, logged_pose, wanted, along)
         led = _drift_target(ahead, way_m, was_m[rows], aside_m[rows])
 
         rank = logged.rank[rows, token]

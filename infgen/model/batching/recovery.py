@@ -2,9 +2,9 @@
 
 Who learns to be back in one token step (SMART, CatK: SPEC 2.3, 7.1) learns leaps. Led
 0.9 m too far along its way, a vehicle is to drive 1.8 m/s slower for half a second and then
-at the log's speed again; so motion tokens are expected to spread over speeds that no log
-has. Here it makes good a share of how far it is ahead of the log or behind it, and one of
-how far aside; unless that is all, it faces where this leads.
+at the log's speed again; presumably that is why motion tokens are expected to spread over
+more speeds than logs have. Here it makes good a share of how far it is ahead of the log or
+behind it, and one of how far aside; unless that is all, it faces where this leads.
 """
 
 from dataclasses import dataclass
@@ -61,15 +61,14 @@ class Recovery:
         if self.is_whole:
             return next_logged
         ahead_m, aside_m, turned_rad = to_local(pose, logged).unbind(-1)
-        if self.lateral == 1:
-            none = torch.zeros_like(aside_m)
-            left = torch.stack([(1 - self.along) * ahead_m, none, none], dim=-1)
-            return to_world(left, next_logged)
         left_aside_m = (1 - self.lateral) * aside_m
-        way_m = torch.linalg.vector_norm((next_logged - logged)[:, :2], dim=-1)
-        faces_rad = torch.atan2(left_aside_m - aside_m, way_m.clamp(min=LEAST_WAY_M))
-        kept_rad = (1 - self.lateral) * turned_rad
-        left_rad = torch.where(way_m < LEAST_WAY_M, kept_rad, faces_rad)
+        if self.lateral == 1:
+            left_rad = torch.zeros_like(turned_rad)
+        else:
+            way_m = torch.linalg.vector_norm((next_logged - logged)[:, :2], dim=-1)
+            faces_rad = torch.atan2(left_aside_m - aside_m, way_m.clamp(min=LEAST_WAY_M))
+            kept_rad = (1 - self.lateral) * turned_rad
+            left_rad = torch.where(way_m < LEAST_WAY_M, kept_rad, faces_rad)
         left = torch.stack([(1 - self.along) * ahead_m, left_aside_m, left_rad], dim=-1)
         return to_world(left, next_logged)
 
