@@ -15,6 +15,7 @@ from infgen.model.insertion.detail_query import (
     DetailStack,
     InsertionDetails,
 )
+from infgen.model.insertion.placement_features import Places
 from infgen.model.layers import full_precision, normed
 from infgen.model.long_memory import Standing, standing_after
 from infgen.model.neighbours import (
@@ -233,13 +234,17 @@ class InsertionStepper:
                 entries.active(size_lw_m)[of_each],
                 around.present,
             )
+        places = None
+        if details.placement is not None:
+            places = Places.on(entries.map, pose[:, 0], entries.active(entries.scene))
+        query = DetailQuery(details, x, pose[:, 0], near, beside, places)
         return InsertionDetails(
             said.agent_type_logits[:, 0],
             said.size_log_m.exp(),
             said.heading_logits,
             said.turned_rad,
             said.offset_m,
-            DetailQuery(details, x, pose[:, 0], near, beside) if sampled else None,
+            query if sampled else None,
         )
 
     def _cell_features(self, entries: Insertions) -> Tensor | None:

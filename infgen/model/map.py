@@ -7,7 +7,8 @@ from torch import Tensor, nn
 
 from infgen.model.batching.batch import MapTokens
 from infgen.model.device.index import MapIndex
-from infgen.model.features.edge_clearance import EdgeTokens
+from infgen.model.features.polyline_segments import lanes as all_lanes
+from infgen.model.features.polyline_segments import road_edges
 from infgen.model.features.signals import StopLines
 from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.map_grid import MapGrid
@@ -55,7 +56,8 @@ class MapEncoder(nn.Module):
         self.radius_m = settings.map_map_radius_m
         self.signals_each_step = settings.signals_each_step
         self.stop_lines = settings.signal_ahead_m > 0
-        self.edges = settings.edge_clearance_width > 0
+        self.edges = settings.edge_clearance_width > 0 or settings.placement_features
+        self.lanes = settings.placement_features
         self.neighbours = settings.map_map_neighbours
         curve_m = torch.from_numpy(vocabulary.curve_m.copy())
         self.register_buffer("curve_m", curve_m, persistent=False)
@@ -134,9 +136,11 @@ class MapEncoder(nn.Module):
         lines = None
         if self.stop_lines:
             lines = StopLines.of(roads) if index is None else index.lines
-        edges = None
+        edges = lanes = None
         if self.edges:
-            edges = EdgeTokens.of(roads) if index is None else index.edges
+            edges = road_edges(roads) if index is None else index.edges
+        if self.lanes:
+            lanes = all_lanes(roads) if index is None else index.lanes
         return MapFeatures(
             rows,
             features,
@@ -147,6 +151,7 @@ class MapEncoder(nn.Module):
             signal_states,
             lines,
             edges,
+            lanes,
         )
 
     def predict_hidden(

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from infgen.model.attention.neighbour_attention import Shared
-from infgen.model.features.edge_clearance import EdgeTokens
+from infgen.model.features.polyline_segments import PolylineSegments
 from infgen.model.features.signals import StopLines
 from infgen.model.layers import AttentionSources
 from infgen.model.map_grid import MapGrid
@@ -120,7 +120,8 @@ class MapFeatures:
         signal_states: What those with a traffic light look like, if that is seen as it
             changes.
         lines: Stop lines of signals, if agents get the signal ahead as a feature.
-        edges: Road edges, if agents judge motion tokens by them.
+        edges: Road edges, if motion tokens or offset bins are judged by them.
+        lanes: Lanes, if headings of inserted agents are.
     """
 
     rows: Rows
@@ -131,7 +132,8 @@ class MapFeatures:
     grid: MapGrid
     signal_states: "SignalStates | None"
     lines: StopLines | None
-    edges: EdgeTokens | None
+    edges: PolylineSegments | None
+    lanes: PolylineSegments | None
 
     def at(self, scene: Tensor, place: Tensor, token: Tensor | None) -> Tensor:
         """Rows [N, K] of the features of places [N, K] of maps [N], at token steps [N]."""

@@ -21,6 +21,7 @@ from infgen.model.insertion.cell_query import CellStack
 from infgen.model.insertion.cell_refinement import CellRefinement
 from infgen.model.insertion.detail_features import OffsetEmbedding, OffsetFeatures
 from infgen.model.insertion.detail_query import DetailStack
+from infgen.model.insertion.placement_features import PlacementFeatures
 from infgen.model.latent_rates import LatentRates
 from infgen.model.layers import initialise, normed
 from infgen.model.logits import MapOutputs, MotionOutputs, Outputs
@@ -47,8 +48,9 @@ from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 AgentFeatures = DensityFeatures | StandingFeatures | RemovalFeatures | ApproachFeatures
 MotionParts = AgentFeatures | AnchorHead | LastMoveHead
-CellParts = OffsetEmbedding | OffsetFeatures | CellRefinement | AgentSpacing
-AddedPart = MotionParts | CellParts | LatentRates
+CellParts = CellRefinement | AgentSpacing
+DetailParts = OffsetEmbedding | OffsetFeatures | PlacementFeatures
+AddedPart = MotionParts | CellParts | DetailParts | LatentRates
 """Parts that may be added to trained weights."""
 
 

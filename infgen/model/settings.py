@@ -99,6 +99,9 @@ class ModelSettings:
     from those there, and from each other; 0 for none. It does not change whether
     agents are inserted, and needs `position_token` for cells and `offset_token` for offset
     bins."""
+    placement_features: Bool = False
+    """Whether offset bins of inserted agents are judged by how far each is over the nearest
+    road edge, and headings by their angles to the lanes there. It needs `offset_token`."""
     motion_feature_width: Count = 0
     """Width of features of where each motion token leads, from which its logit is computed;
     0 for one logit per token, each learned alone, as in the paper."""

@@ -72,6 +72,7 @@ VARIANTS = {
     "long memory": {"density_features": True, "standing_features": True},
     "cell refinement": {"cell_refinement_width": 8},
     "agent spacing": {"agent_spacing_width": 4, "offset_token": True},
+    "placement features": {"placement_features": True, "offset_token": True},
     "removal features": {"removal_features": True},
     "latent rates": {"latent_rates": True},
     "approach features": {"approach_features": True},

@@ -29,7 +29,11 @@ VARIANTS = {
     "rotary": {"relations": "rotary"},
     "latent rates": {"latent_rates": True},
     "cell refinement": {"cell_feature_width": 4, "cell_refinement_width": 4},
-    "agent spacing": {"agent_spacing_width": 4, "offset_token": True},
+    "agent spacing": {
+        "agent_spacing_width": 4,
+        "offset_token": True,
+        "placement_features": True,
+    },
     "last move": {"last_move_head": True},
     "clearance": {"clearance_width": 4, "edge_clearance_width": 4},
 }

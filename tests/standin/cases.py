@@ -298,6 +298,7 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {
             **FEATURES,
             "offset_token": True,
+            "placement_features": True,
             "cell_refinement_width": 4,
             "agent_spacing_width": 4,
         },

@@ -12,7 +12,8 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from infgen.model.batching.batch import Batch, MapTokens
-from infgen.model.features.edge_clearance import EdgeTokens
+from infgen.model.features.polyline_segments import PolylineSegments, road_edges
+from infgen.model.features.polyline_segments import lanes as all_lanes
 from infgen.model.features.signals import StopLines
 from infgen.model.map_grid import MapGrid
 from infgen.model.relations import Rows
@@ -33,6 +34,7 @@ class MapIndex:
         lit: Rows of the map tokens with a traffic light.
         lines: Stop lines.
         edges: Road edges.
+        lanes: Lanes.
     """
 
     rows: Rows
@@ -41,14 +43,16 @@ class MapIndex:
     before: Int64[Tensor, " prediction"]
     lit: Int64[Tensor, " lit"]
     lines: StopLines
-    edges: EdgeTokens
+    edges: PolylineSegments
+    lanes: PolylineSegments
 
     @classmethod
     def of(cls, roads: MapTokens) -> "MapIndex":
         """Find the places of some maps."""
         rows, grid = Rows.where(roads.real), MapGrid.of(roads.pose, roads.real)
-        edges = EdgeTokens.of(roads)
-        for each in (grid, edges.grid):
+        edges = road_edges(roads)
+        lanes = all_lanes(roads)
+        for each in (grid, edges.grid, lanes.grid):
             each.measure(MOST_SQUARES)
         wanted = roads.predicted
         before = rows.number.roll(1, dims=1)
@@ -60,6 +64,7 @@ class MapIndex:
             lit=rows.pack(roads.light).nonzero()[:, 0],
             lines=StopLines.of(roads),
             edges=edges,
+            lanes=lanes,
         )
 
 

@@ -13,14 +13,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
-from torch.nn import functional
 
-from infgen.model.batching.batch import MapTokens
 from infgen.model.features.anchors import AnchorHead, Anchors, row_parts
+from infgen.model.features.polyline_segments import PolylineSegments
 from infgen.model.layers import full_precision
-from infgen.model.map_grid import MapGrid
-from infgen.tokens.map import PolylineType
-from infgen.tokens.vocabulary import MAP_SPACING_M, MotionVocabulary
+from infgen.tokens.vocabulary import MotionVocabulary
 
 EDGES = 16
 """Edges that an agent keeps clear of: those nearest to where it would be next ..."""
@@ -31,46 +28,9 @@ POINTS = ((0.5, 1.0), (0.5, -1.0), (1.0, 1.0))
 motion token."""
 KNOTS_M = (-3.0, -1.5, -0.75, -0.25, 0.0, 0.25, 0.75, 2.0)
 """Between how far boxes are over an edge: how much of each interval is passed is told."""
-LENGTH_M = 10 * MAP_SPACING_M
-"""Of an edge that nothing follows."""
 ALONG_ITS_SIDE = 1e-2
 """Of two edges as far away, which meet in a corner, the one that has it more to its side
 tells on which side of the corner a point is."""
-
-
-@dataclass(frozen=True, slots=True)
-class EdgeTokens:
-    """Road edges of maps, in straight pieces, with the road on their left.
-
-    Attributes:
-        start_m: Where they begin; padding is anywhere [scene, edge, 2].
-        along_m: From there to where they end [scene, edge, 2].
-        grid: The same by where their middles are.
-    """
-
-    start_m: Float32[Tensor, "scene edge 2"]
-    along_m: Float32[Tensor, "scene edge 2"]
-    grid: MapGrid
-
-    @classmethod
-    def of(cls, roads: MapTokens) -> "EdgeTokens":
-        """Find the edges of maps; each ends where the next one begins."""
-        is_edge = roads.real & (roads.polyline_type == int(PolylineType.ROAD_EDGE))
-        count = int(is_edge.sum(dim=1).max()) if is_edge.numel() else 0
-        at = is_edge.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :count]
-        start_m, heading_rad = roads.pose[..., :2], roads.pose[..., 2]
-        straight_m = LENGTH_M * torch.stack([heading_rad.cos(), heading_rad.sin()], dim=-1)
-        goes_on = roads.follows.roll(-1, dims=1) & is_edge.roll(-1, dims=1)
-        goes_on[:, -1:] = False
-        to_next_m = start_m.roll(-1, dims=1) - start_m
-        along_m = torch.where(goes_on[..., None], to_next_m, straight_m)
-
-        def chosen(values: Tensor) -> Tensor:
-            return values.gather(1, at[..., None].expand(-1, -1, values.shape[-1]))
-
-        start_m, along_m = chosen(start_m), chosen(along_m)
-        middle = functional.pad(start_m + along_m / 2, (0, 1))
-        return cls(start_m, along_m, MapGrid.of(middle, is_edge.gather(1, at)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +56,7 @@ class EdgesNear:
     @torch.no_grad()
     def of(
         cls,
-        edges: EdgeTokens,
+        edges: PolylineSegments,
         pose: Float32[Tensor, "row 3"],
         step_m: Float32[Tensor, "row 2"],
         size_lw_m: Float32[Tensor, "row 2"],

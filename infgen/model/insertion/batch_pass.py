@@ -11,6 +11,7 @@ from infgen.model.insertion.agent_spacing import SpacedAgents, swept
 from infgen.model.insertion.cell_features import CellSources
 from infgen.model.insertion.cell_query import CellStack
 from infgen.model.insertion.detail_query import DetailStack
+from infgen.model.insertion.placement_features import Places
 from infgen.model.logits import DetailOutputs, InsertionOutputs
 from infgen.model.long_memory import Density
 from infgen.model.neighbours import (
@@ -126,10 +127,11 @@ def detail_outputs(
             steps_m(agents)[of_each],
         )
         beside = SpacedAgents(raw, around.index, *boxes, around.present)
+    places = None if stack.placement is None else Places.on(roads, pose, scene)
     return replace(
         said,
-        offset_logits=stack.offset_logits(x, agent_type, pose, near, beside),
-        heading_logits=stack.heading_logits(x, agent_type, offset, pose, near),
+        offset_logits=stack.offset_logits(x, agent_type, pose, near, beside, places),
+        heading_logits=stack.heading_logits(x, agent_type, offset, pose, near, places),
     )
 
 

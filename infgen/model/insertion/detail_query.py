@@ -18,6 +18,7 @@ from infgen.model.insertion.detail_features import (
     OffsetEmbedding,
     OffsetFeatures,
 )
+from infgen.model.insertion.placement_features import PlacementFeatures, Places
 from infgen.model.insertion.query_block import QueryBlock
 from infgen.model.layers import AttentionSources, embedding_mlp, full_precision, mlp
 from infgen.model.logits import DetailOutputs
@@ -69,6 +70,8 @@ class DetailStack(nn.Module):
         self.given_offset = OffsetEmbedding(width, grid) if binned else None
         spaced = settings.agent_spacing_width if binned else 0
         self.spacing = OffsetSpacing(width, spaced, grid) if spaced else None
+        placed = binned and settings.placement_features
+        self.placement = PlacementFeatures(width, grid) if placed else None
 
     def map_reach(self) -> NeighbourSpec:
         """How the query sees roads."""
@@ -105,6 +108,7 @@ class DetailStack(nn.Module):
         pose: Tensor,
         roads: CellSources,
         agents: SpacedAgents | None,
+        places: Places | None = None,
     ) -> Tensor:
         """Return logits of the offset bins [N, offset].
 
@@ -114,12 +118,15 @@ class DetailStack(nn.Module):
             pose: Pose of the query [N, 3] ...
             roads: ... and the map tokens seen from there ...
             agents: ... and the agents, if gaps to them are used.
+            places: The places, if distances from road edges are used.
         """
         assert self.offset_bins is not None
         given = x + self.given_kind(agent_type)
         logits: Tensor = self.offset_bins(given, pose, roads)
         if self.spacing is not None and agents is not None:
             logits = logits + self.spacing.choose(given, pose, agents)
+        if self.placement is not None and places is not None:
+            logits = logits + self.placement.offsets(given, places)
         return logits
 
     def heading_logits(
@@ -129,6 +136,7 @@ class DetailStack(nn.Module):
         offset: Tensor,
         pose: Tensor,
         roads: CellSources,
+        places: Places | None = None,
     ) -> Tensor:
         """Return logits of headings [N, heading] at known offset bins [N].
 
@@ -138,9 +146,11 @@ class DetailStack(nn.Module):
         assert self.heading is not None
         given = x + self.given_kind(agent_type) + self.given_offset(offset)
         logits: Tensor = self.heading(given)
+        offset_m = self.given_offset.offset_m[offset]
         if self.bearings is not None:
-            offset_m = self.given_offset.offset_m[offset]
             logits = logits + self.bearings(given, pose, roads, offset_m)
+        if self.placement is not None and places is not None:
+            logits = logits + self.placement.headings(given, places, offset_m)
         return logits
 
     def answer(
@@ -183,6 +193,7 @@ class DetailQuery:
         pose: Its pose [N, 3].
         roads: Map tokens that it sees.
         agents: Agents that it sees, if gaps to them are used.
+        places: Where it is, if distances from road edges and angles to lanes are used.
     """
 
     stack: DetailStack
@@ -190,6 +201,7 @@ class DetailQuery:
     pose: Tensor
     roads: CellSources
     agents: SpacedAgents | None = None
+    places: Places | None = None
 
     @torch.no_grad()
     def offset_logits(self, agent_type: Tensor) -> Tensor:
@@ -197,7 +209,7 @@ class DetailQuery:
         x = self.features.float()
         with full_precision(x):
             return self.stack.offset_logits(
-                x, agent_type, self.pose, self.roads, self.agents
+                x, agent_type, self.pose, self.roads, self.agents, self.places
             )
 
     @torch.no_grad()
@@ -205,7 +217,9 @@ class DetailQuery:
         """Return logits of heading bins [N, heading] given offset bins [N] as well."""
         x = self.features.float()
         with full_precision(x):
-            return self.stack.heading_logits(x, agent_type, offset, self.pose, self.roads)
+            return self.stack.heading_logits(
+                x, agent_type, offset, self.pose, self.roads, self.places
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,8 @@ from infgen.model.features.edge_clearance import (
     POINTS,
     EdgeClearance,
     EdgesNear,
-    EdgeTokens,
 )
+from infgen.model.features.polyline_segments import PolylineSegments
 from infgen.scene import AgentType
 from infgen.tokens.map import PolylineType
 
@@ -30,7 +30,7 @@ def edges(*poses, follows=None, kind=PolylineType.ROAD_EDGE):
     """Edges of one map that begin at poses."""
     count = len(poses)
     nothing = torch.zeros((1, count), dtype=torch.int64)
-    return EdgeTokens.of(
+    return PolylineSegments.of(
         MapTokens(
             real=torch.ones((1, count), dtype=torch.bool),
             pose=torch.tensor([poses], dtype=torch.float32).view(1, count, 3),
@@ -42,7 +42,8 @@ def edges(*poses, follows=None, kind=PolylineType.ROAD_EDGE):
             shown=nothing[:, None],
             follows=torch.tensor([follows or [False] * count], dtype=torch.bool),
             picked=torch.zeros((1, count), dtype=torch.bool),
-        )
+        ),
+        PolylineType.ROAD_EDGE,
     )
 
 
