@@ -56,7 +56,8 @@ class MapEncoder(nn.Module):
         self.radius_m = settings.map_map_radius_m
         self.signals_each_step = settings.signals_each_step
         self.stop_lines = settings.signal_ahead_m > 0
-        self.edges = settings.edge_clearance_width > 0 or settings.placement_features
+        by_edges = settings.over_edge_head or settings.placement_features
+        self.edges = settings.edge_clearance_width > 0 or by_edges
         self.lanes = settings.placement_features
         self.neighbours = settings.map_map_neighbours
         curve_m = torch.from_numpy(vocabulary.curve_m.copy())

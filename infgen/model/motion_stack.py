@@ -16,6 +16,7 @@ from infgen.model.features.approach import ApproachFeatures, MovingPairs
 from infgen.model.features.clearance import Clearance
 from infgen.model.features.edge_clearance import EdgeClearance, EdgesNear
 from infgen.model.features.last_move import LastMove, LastMoveHead
+from infgen.model.features.over_edge import OverEdgeHead
 from infgen.model.features.removal import EgoPlace, RemovalFeatures
 from infgen.model.features.signals import SignalAhead
 from infgen.model.layers import Attention, AttentionSources, mlp, normed
@@ -124,6 +125,8 @@ class MotionStack(nn.Module):
         self.clearance = Clearance(width, clear, vocabulary) if clear else None
         self.edges = EdgeClearance(width, of_edges, vocabulary) if of_edges else None
         self.last = LastMoveHead(width, vocabulary) if settings.last_move_head else None
+        over_edge = settings.over_edge_head
+        self.over_edge = OverEdgeHead(width, vocabulary) if over_edge else None
 
     def map_reach(self) -> NeighbourSpec:
         """How agents see roads."""
@@ -153,7 +156,7 @@ class MotionStack(nn.Module):
         self, agents: AgentRows, roads: MapFeatures, scene: Tensor
     ) -> EdgesNear | None:
         """Find the road edges near agents on maps ``scene`` [N], if that is used."""
-        if self.edges is None or roads.edges is None:
+        if roads.edges is None or (self.edges is None and self.over_edge is None):
             return None
         step_m, _ = agents.moved()
         size_lw_m = agents.size_lwh_m[:, :2]
@@ -250,6 +253,8 @@ class MotionStack(nn.Module):
             raise ValueError("the motion head needs features; pass motion_features()")
         if self.last is not None and sight.last is not None:
             moves = moves + self.last(x_ND, agent_type, sight.last)
+        if self.over_edge is not None and sight.edges is not None:
+            moves = moves + self.over_edge(x_ND, agent_type, sight.edges)
         heads = (self.clearance, sight.moving), (self.edges, sight.edges)
         judged = [
             head(x_ND, agent_type, seen)

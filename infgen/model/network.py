@@ -14,6 +14,7 @@ from infgen.model.device.together import launched_together
 from infgen.model.features.anchors import AnchorHead
 from infgen.model.features.approach import ApproachFeatures
 from infgen.model.features.last_move import LastMoveHead
+from infgen.model.features.over_edge import OverEdgeHead
 from infgen.model.features.removal import EgoPlace, RemovalFeatures
 from infgen.model.insertion.agent_spacing import AgentSpacing
 from infgen.model.insertion.batch_pass import detail_outputs, insertion_outputs
@@ -47,7 +48,7 @@ from infgen.tokens.settings import TokenSettings
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 AgentFeatures = DensityFeatures | StandingFeatures | RemovalFeatures | ApproachFeatures
-MotionParts = AgentFeatures | AnchorHead | LastMoveHead
+MotionParts = AgentFeatures | AnchorHead | LastMoveHead | OverEdgeHead
 CellParts = CellRefinement | AgentSpacing
 DetailParts = OffsetEmbedding | OffsetFeatures | PlacementFeatures
 AddedPart = MotionParts | CellParts | DetailParts | LatentRates

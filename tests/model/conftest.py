@@ -8,9 +8,11 @@ import torch
 
 from infgen.config import ModelSettings, TokenSettings
 from infgen.geometry import to_world
-from infgen.model.batching.batch import Limits
+from infgen.model.batching.batch import Limits, MapTokens
+from infgen.model.features.polyline_segments import road_edges
 from infgen.model.network import Network
 from infgen.tokens.grid import encode_cell, encode_heading, make_grid, to_grid
+from infgen.tokens.map import PolylineType
 from infgen.tokens.scene_tokens import (
     FIRST_MOTION_TOKEN,
     NO_CELL,
@@ -76,6 +78,7 @@ VARIANTS = {
     "removal features": {"removal_features": True},
     "latent rates": {"latent_rates": True},
     "approach features": {"approach_features": True},
+    "over edge": {"over_edge_head": True},
     "last move": {"last_move_head": True, "motion_feature_width": 8},
     "clearance": {"clearance_width": 8, "edge_clearance_width": 8},
     "smart with patterns": {
@@ -298,3 +301,36 @@ def vocabularies():
         return make_motion_codebook(num_motion_tokens), make_road_codebook(num_map_tokens)
 
     return make
+
+
+def _lines(kind, *poses, follows=None):
+    count = len(poses)
+    nothing = torch.zeros((1, count), dtype=torch.int64)
+    return MapTokens(
+        real=torch.ones((1, count), dtype=torch.bool),
+        pose=torch.tensor([poses], dtype=torch.float32).view(1, count, 3),
+        token=nothing,
+        point_type=nothing,
+        polyline_type=torch.full((1, count), int(kind)),
+        signal=nothing,
+        light=nothing,
+        shown=nothing[:, None],
+        follows=torch.tensor([follows or [False] * count], dtype=torch.bool),
+        picked=torch.zeros((1, count), dtype=torch.bool),
+    )
+
+
+@pytest.fixture
+def lines():
+    """Map tokens of one map, by polyline type and poses; ``follows`` joins them."""
+    return _lines
+
+
+@pytest.fixture
+def edges():
+    """Road edges of one map that begin at poses."""
+
+    def found(*poses, follows=None, kind=PolylineType.ROAD_EDGE):
+        return road_edges(_lines(kind, *poses, follows=follows))
+
+    return found

@@ -34,7 +34,7 @@ VARIANTS = {
         "offset_token": True,
         "placement_features": True,
     },
-    "last move": {"last_move_head": True},
+    "last move": {"last_move_head": True, "over_edge_head": True},
     "clearance": {"clearance_width": 4, "edge_clearance_width": 4},
 }
 FASTEST_M = 20.0

@@ -290,6 +290,7 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
             "clearance_width": 4,
             "edge_clearance_width": 4,
             "last_move_head": True,
+            "over_edge_head": True,
             "latent_rates": True,
         },
         {"motion_noise_neighbours": 5, "closed_loop_population": True},

@@ -28,6 +28,8 @@ POINTS = ((0.5, 1.0), (0.5, -1.0), (1.0, 1.0))
 motion token."""
 KNOTS_M = (-3.0, -1.5, -0.75, -0.25, 0.0, 0.25, 0.75, 2.0)
 """Between how far boxes are over an edge: how much of each interval is passed is told."""
+NOW = (((0, 0), (0, 0), (1, -1), (0, 0), (-1, -1)),)
+"""The front and the rear where the box is now [1, 5, 2]; see ``EdgesNear.over_m``."""
 ALONG_ITS_SIDE = 1e-2
 """Of two edges as far away, which meet in a corner, the one that has it more to its side
 tells on which side of the corner a point is."""
@@ -140,10 +142,10 @@ class EdgeClearance(AnchorHead):
         super().__init__(width, head_width, features, anchors)
         for name, array in (
             ("points", _points(anchors)),
-            ("now", np.array([[[0, 0], [0, 0], [1, -1], [0, 0], [-1, -1]]])),
-            ("knot_m", np.array(KNOTS_M)),
+            ("now", NOW),
+            ("knot_m", KNOTS_M),
         ):
-            buffer = torch.from_numpy(array.astype(np.float32))
+            buffer = torch.from_numpy(np.asarray(array, dtype=np.float32))
             self.register_buffer(name, buffer, persistent=False)
 
     def forward(

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from infgen.model.batching.batch import MapTokens
 from infgen.model.features.anchors import Anchors
 from infgen.model.features.edge_clearance import (
     KNOTS_M,
@@ -12,7 +11,6 @@ from infgen.model.features.edge_clearance import (
     EdgeClearance,
     EdgesNear,
 )
-from infgen.model.features.polyline_segments import PolylineSegments
 from infgen.scene import AgentType
 from infgen.tokens.map import PolylineType
 
@@ -24,27 +22,6 @@ AT_ORIGIN = (0.0, 0.0, 0.0)
 def clearance(dense_moves):
     torch.manual_seed(0)
     return EdgeClearance(16, 8, dense_moves)
-
-
-def edges(*poses, follows=None, kind=PolylineType.ROAD_EDGE):
-    """Edges of one map that begin at poses."""
-    count = len(poses)
-    nothing = torch.zeros((1, count), dtype=torch.int64)
-    return PolylineSegments.of(
-        MapTokens(
-            real=torch.ones((1, count), dtype=torch.bool),
-            pose=torch.tensor([poses], dtype=torch.float32).view(1, count, 3),
-            token=nothing,
-            point_type=nothing,
-            polyline_type=torch.full((1, count), int(kind)),
-            signal=nothing,
-            light=nothing,
-            shown=nothing[:, None],
-            follows=torch.tensor([follows or [False] * count], dtype=torch.bool),
-            picked=torch.zeros((1, count), dtype=torch.bool),
-        ),
-        PolylineType.ROAD_EDGE,
-    )
 
 
 def near(found, *poses):
@@ -68,7 +45,7 @@ RIGHT = [(x, -3.0, 0.0) for x in (-10.0, -5.0, 0.0, 5.0)]
 """An edge three metres to the right of an agent at the origin, the road on its left."""
 
 
-def test_how_far_a_box_is_over_an_edge_is_its_half_width_more_than_its_middle():
+def test_how_far_a_box_is_over_an_edge_is_its_half_width_more_than_its_middle(edges):
     found = edges(*RIGHT)
 
     over_m = front_over_m(found, AT_ORIGIN, (0, -2, 0), (0, -3.5, 0), (0, -2, -np.pi / 2))
@@ -76,13 +53,13 @@ def test_how_far_a_box_is_over_an_edge_is_its_half_width_more_than_its_middle():
     assert over_m == pytest.approx([-2.0, 0.0, 1.5, 1.0], abs=1e-5)
 
 
-def test_beyond_an_end_the_distance_is_that_of_the_end():
+def test_beyond_an_end_the_distance_is_that_of_the_end(edges):
     over_m = front_over_m(edges((0.0, 3.0, np.pi)), (3.0 - 1.0, 7.0, 0.0))
 
     assert over_m == pytest.approx([5.0 + 1.0], abs=1e-5)
 
 
-def test_pieces_end_where_the_next_ones_begin():
+def test_pieces_end_where_the_next_ones_begin(edges):
     bent = edges((0.0, -3.0, 0.0), (4.0, -2.0, 0.0), follows=[False, True])
 
     assert bent.along_m[0].tolist() == [[4.0, 1.0], [5.0, 0.0]]
@@ -91,7 +68,9 @@ def test_pieces_end_where_the_next_ones_begin():
 
 
 @pytest.mark.parametrize("aside_m", [0.3, -0.3])
-def test_ahead_of_a_tip_the_edge_that_has_a_point_more_to_its_side_tells_the_side(aside_m):
+def test_ahead_of_a_tip_the_edge_with_a_point_more_to_its_side_tells_the_side(
+    aside_m, edges
+):
     tip = edges((-5.0, 0.0, 0.0), (0.0, 0.0, np.pi + 0.2), follows=[False, True])
     assert front_over_m(tip, (-3.0, 1.0, 0.0)) == pytest.approx([0.0], abs=1e-5)
     assert front_over_m(tip, (-3.0, -0.2, 0.0))[0] > WIDTH_M / 2
@@ -101,14 +80,14 @@ def test_ahead_of_a_tip_the_edge_that_has_a_point_more_to_its_side_tells_the_sid
     assert over_m[0] < WIDTH_M / 2
 
 
-def test_without_edges_nothing_is_over_one(clearance):
+def test_without_edges_nothing_is_over_one(clearance, edges):
     kind = torch.zeros(1, dtype=torch.int64)
     for found in (edges(), edges((500.0, 0.0, 0.0)), edges(*RIGHT, kind=PolylineType.LANE)):
         assert front_over_m(found, AT_ORIGIN) == [-np.inf]
         assert not clearance.features(kind, near(found, AT_ORIGIN)).any()
 
 
-def test_features_are_how_far_anchors_lead_over_edges(clearance, dense_moves):
+def test_features_are_how_far_anchors_lead_over_edges(clearance, dense_moves, edges):
     anchors = Anchors.of(dense_moves)
     kind = torch.full((1,), int(AgentType.VEHICLE))
     pose = (0.0, -1.5, -0.3)
@@ -137,7 +116,7 @@ def test_features_are_how_far_anchors_lead_over_edges(clearance, dense_moves):
             np.testing.assert_allclose(part, wanted, atol=2e-5)
 
 
-def test_features_are_the_same_wherever_the_scene_lies(clearance):
+def test_features_are_the_same_wherever_the_scene_lies(clearance, edges):
     def moved(pose):
         return (40.0 - pose[1], 7.0 + pose[0], pose[2] + np.pi / 2)
 
@@ -151,7 +130,7 @@ def test_features_are_the_same_wherever_the_scene_lies(clearance):
     torch.testing.assert_close(here, there, rtol=1e-4, atol=1e-4)
 
 
-def test_rows_at_once_change_nothing(clearance, monkeypatch):
+def test_rows_at_once_change_nothing(clearance, monkeypatch, edges):
     kind, found = torch.zeros(3, dtype=torch.int64), edges(*RIGHT)
     agents = near(found, AT_ORIGIN, (2.0, -1.0, 0.4), (0.0, -3.0, 1.0))
     together = clearance.features(kind, agents)
@@ -161,7 +140,7 @@ def test_rows_at_once_change_nothing(clearance, monkeypatch):
     assert torch.equal(together, clearance.features(kind, agents))
 
 
-def test_before_training_no_logit_changes_and_afterwards_tokens_are_told_apart(clearance):
+def test_before_training_no_logit_changes_and_then_tokens_are_told_apart(clearance, edges):
     kind, x = torch.zeros(1, dtype=torch.int64), torch.randn(1, 16)
     agents = near(edges(*RIGHT), AT_ORIGIN)
     clearance.begin_at_zero()

@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from infgen.model.batching.batch import MapTokens
 from infgen.model.features.polyline_segments import lanes, road_edges
 from infgen.model.insertion.placement_features import (
     ANGLE_STEPS,
@@ -33,30 +32,11 @@ def placement(grid):
     return PlacementFeatures(WIDTH, grid)
 
 
-def lines(kind, *poses):
-    """Map tokens of one map, each alone."""
-    count = len(poses)
-    nothing = torch.zeros((1, count), dtype=torch.int64)
-    alone = torch.zeros((1, count), dtype=torch.bool)
-    return MapTokens(
-        real=~alone,
-        pose=torch.tensor([poses], dtype=torch.float32).view(1, count, 3),
-        token=nothing,
-        point_type=nothing,
-        polyline_type=torch.full((1, count), int(kind)),
-        signal=nothing,
-        light=nothing,
-        shown=nothing[:, None],
-        follows=alone,
-        picked=alone,
-    )
-
-
 def at(*pose):
     return torch.tensor([pose], dtype=torch.float32), torch.zeros(1, dtype=torch.int64)
 
 
-def test_offset_bins_are_as_far_over_an_edge_as_they_lie_to_its_right(placement, grid):
+def test_offset_bins_are_as_far_over_an_edge_as_to_its_right(placement, grid, lines):
     edge = road_edges(lines(PolylineType.ROAD_EDGE, (-2.5, -1.0, EAST)))
 
     # A query that faces east: ahead of it is along the edge, its right is over it.
@@ -66,7 +46,7 @@ def test_offset_bins_are_as_far_over_an_edge_as_they_lie_to_its_right(placement,
     torch.testing.assert_close(over_m[0], right_m - 1.0, atol=1e-5, rtol=0)
 
 
-def test_turning_query_and_edge_changes_nothing(placement):
+def test_turning_query_and_edge_changes_nothing(placement, lines):
     edge = lines(PolylineType.ROAD_EDGE, (-2.5, -1.0, EAST))
     turned = lines(PolylineType.ROAD_EDGE, (1.0, -2.5, NORTH))
 
@@ -76,7 +56,7 @@ def test_turning_query_and_edge_changes_nothing(placement):
     torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
 
 
-def test_headings_are_turned_from_the_lane_nearest_in_angle(placement, grid):
+def test_headings_are_turned_from_the_lane_nearest_in_angle(placement, grid, lines):
     both = lanes(lines(PolylineType.LANE, (-2.5, 0.5, EAST), (0.5, -2.5, NORTH)))
 
     turned_rad = placement.turned_rad(*at(0, 0, EAST), both)[0]
@@ -95,7 +75,7 @@ def test_headings_are_turned_from_the_lane_nearest_in_angle(placement, grid):
     [(PolylineType.LANE, 2.1), (PolylineType.ROAD_LINE, 0.0), (PolylineType.LANE, 200.0)],
     ids=["beside", "no lane", "far away"],
 )
-def test_without_a_lane_there_no_heading_is_judged(placement, kind, left_m):
+def test_without_a_lane_there_no_heading_is_judged(placement, kind, left_m, lines):
     found = lanes(lines(kind, (-2.5, left_m, EAST)))
 
     turned_rad = placement.turned_rad(*at(0, 0, EAST), found)
@@ -103,7 +83,7 @@ def test_without_a_lane_there_no_heading_is_judged(placement, kind, left_m):
     assert turned_rad.isinf().all()
 
 
-def test_maps_without_lanes_or_edges(placement, grid):
+def test_maps_without_lanes_or_edges(placement, grid, lines):
     none = lines(PolylineType.AREA)
 
     over_m = placement.over_m(*at(0, 0, EAST), road_edges(none))
@@ -114,7 +94,7 @@ def test_maps_without_lanes_or_edges(placement, grid):
     assert turned_rad.isinf().all()
 
 
-def test_what_is_said_is_interpolated(placement):
+def test_what_is_said_is_interpolated(placement, lines):
     """Knots that say where they are give back distances and angles."""
     knots = torch.arange(placement.over_steps + 1) * OVER_STEP_M - OVER_REACH_M
     angles = torch.arange(ANGLE_STEPS + 1) * (math.pi / ANGLE_STEPS)
