@@ -46,6 +46,7 @@ class AgentContext:
         agents: Rows of the agents around them.
         moving: How they and others around them move, if that is used.
         edges: Road edges near them, if that is used.
+        over_edge: How far those just inserted are over an edge, if that is used.
         last: How they moved last, if that is used.
         added: Added to their features [N, D], if anything is: ``MotionStack.added``.
         density: Agents around the ego of each [N], if that is used.
@@ -59,6 +60,7 @@ class AgentContext:
     agents: NeighbourRows
     moving: MovingPairs | None
     edges: EdgesNear | None
+    over_edge: Tensor | None
     last: LastMove | None
     added: Tensor | None
     density: Density | None
@@ -162,6 +164,15 @@ class MotionStack(nn.Module):
         size_lw_m = agents.size_lwh_m[:, :2]
         return EdgesNear.of(roads.edges, agents.pose, step_m, size_lw_m, scene)
 
+    def inserted_over_edge(
+        self, agents: AgentRows, edges: EdgesNear | None
+    ) -> Tensor | None:
+        """Say how far just inserted agents are over an edge, if that is used."""
+        if self.over_edge is None or edges is None:
+            return None
+        _, moved = agents.moved()
+        return self.over_edge.passed(edges, ~moved)
+
     def last_move(self, agents: AgentRows) -> LastMove | None:
         """Find how agents moved last, if that is used."""
         if self.last is None:
@@ -253,8 +264,8 @@ class MotionStack(nn.Module):
             raise ValueError("the motion head needs features; pass motion_features()")
         if self.last is not None and sight.last is not None:
             moves = moves + self.last(x_ND, agent_type, sight.last)
-        if self.over_edge is not None and sight.edges is not None:
-            moves = moves + self.over_edge(x_ND, agent_type, sight.edges)
+        if self.over_edge is not None and sight.over_edge is not None:
+            moves = moves + self.over_edge(x_ND, agent_type, sight.over_edge)
         heads = (self.clearance, sight.moving), (self.edges, sight.edges)
         judged = [
             head(x_ND, agent_type, seen)

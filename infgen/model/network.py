@@ -210,6 +210,7 @@ class Network(nn.Module):
         around = find_others(self.motion.agents_reach(), by_token, pose, visible)
         moving = self.motion.moving(given, around)
         of_row = rows.at // agents.visible[0].numel()
+        edges = self.motion.edges_near(given, roads, of_row)
         sight = AgentContext(
             past_relation,
             past_present,
@@ -219,7 +220,8 @@ class Network(nn.Module):
             ),
             around,
             moving,
-            self.motion.edges_near(given, roads, of_row),
+            edges,
+            self.motion.inserted_over_edge(given, edges),
             self.motion.last_move(given),
             self.motion.added(given.pose, moving, roads, of_row, token),
             None if density is None else density.take(rows.at // visible.shape[1]),

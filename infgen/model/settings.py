@@ -138,8 +138,8 @@ class ModelSettings:
     """Whether logits of motion tokens depend on what each changes of the last move, beside
     where it leads: speeds are held where logs are few, at high ones too."""
     over_edge_head: Bool = False
-    """Whether logits of motion tokens that drive depend on how far the box is over the
-    nearest road edge now, beside where they lead."""
+    """Whether logits of motion tokens that drive depend, for just inserted agents, on how
+    far the box is over the nearest road edge, beside where they lead."""
     signal_ahead_m: NonNegative = 0.0
     """Every agent sees the signal of its own lane up to so far ahead, and how long it has
     shown that; 0 to see it only among all other map tokens."""

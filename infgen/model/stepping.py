@@ -190,6 +190,7 @@ class Stepper(InsertionStepper):
             around,
             moving,
             edges,
+            self.network.motion.inserted_over_edge(agents, edges),
             self.network.motion.last_move(agents),
             added,
             density,

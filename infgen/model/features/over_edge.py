@@ -1,16 +1,16 @@
-"""Boxes over road edges: logits of motion tokens by how far each goes.
+"""Inserted boxes over road edges: logits of motion tokens by how far each goes.
 
 Clearance from road edges (``edge_clearance``) compares where motion tokens lead. A box that
 moves along an edge stays as far over it as one that stands, so the two look the same. Here
-it is known how far the box is over the nearest edge now: of logged vehicles that are
-inserted across a road edge hardly one drives.
+it is known how far the box of a just inserted agent is over the nearest edge: of logged
+vehicles that are inserted across a road edge hardly one drives.
 
 Shape letters as in ``anchors``.
 """
 
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor, nn
 
 from infgen.model.features.edge_clearance import NOW, EdgesNear
@@ -25,7 +25,7 @@ DRIVES_M = 1.0
 
 
 class OverEdgeHead(nn.Module):
-    """What is added to logits of motion tokens that drive, by where the box is."""
+    """What is added to logits of motion tokens that drive, by where a box was inserted."""
 
     drives: Tensor
     now: Tensor
@@ -46,23 +46,28 @@ class OverEdgeHead(nn.Module):
         nn.init.zeros_(self.say.bias)
 
     def forward(
-        self, x_ND: Tensor, agent_type: Int64[Tensor, " row"], edges: EdgesNear
+        self,
+        x_ND: Tensor,
+        agent_type: Int64[Tensor, " row"],
+        passed: Float32[Tensor, "row interval"],
     ) -> Tensor:
         """Compute what is added to logits [N, V].
 
         Args:
             x_ND: Features of the agents.
             agent_type: ``AgentType`` of each.
-            edges: Edges near each.
+            passed: Intervals that they have passed.
         """
         said: Tensor = self.say(x_ND)
-        odds = (said * self.passed(edges).to(said.dtype)).sum(dim=1, keepdim=True)
+        odds = (said * passed.to(said.dtype)).sum(dim=1, keepdim=True)
         return odds * self.drives.to(odds.dtype)[agent_type]
 
     @torch.no_grad()
-    def passed(self, edges: EdgesNear) -> Tensor:
-        """Say how much of each interval boxes have passed [N, interval]."""
+    def passed(
+        self, edges: EdgesNear, inserted: Bool[Tensor, " row"]
+    ) -> Float32[Tensor, "row interval"]:
+        """Say how much of each interval just inserted boxes have passed; others none."""
         with full_precision(edges.told):
             over_m = edges.over_m(self.now).amax(dim=1, keepdim=True)
         low, high = self.knot_m[:-1], self.knot_m[1:]
-        return ((over_m - low) / (high - low)).clamp(0, 1)
+        return ((over_m - low) / (high - low)).clamp(0, 1) * inserted[:, None]

@@ -9,6 +9,8 @@ from infgen.scene import AgentType
 
 LENGTH_M, WIDTH_M = 4.0, 2.0
 X = torch.zeros((1, 16))
+VEHICLE = torch.tensor([int(AgentType.VEHICLE)])
+INSERTED = torch.tensor([True])
 
 
 @pytest.fixture
@@ -40,7 +42,7 @@ def beside(edges, left_m):
 )
 def test_intervals_that_a_box_has_passed(head, edges, left_m, passed):
     """Its right side is a metre nearer to the edge than its middle."""
-    found = head.passed(beside(edges, left_m))
+    found = head.passed(beside(edges, left_m), INSERTED)
 
     torch.testing.assert_close(found, torch.tensor([passed]).float(), atol=1e-4, rtol=0)
 
@@ -50,7 +52,7 @@ def test_without_edges_nothing_is_passed(head, edges):
         edges(), *(torch.zeros((1, n)) for n in (3, 2, 2)), torch.zeros(1).long()
     )
 
-    assert (head.passed(none) == 0).all()
+    assert (head.passed(none, INSERTED) == 0).all()
 
 
 def test_tokens_count_by_how_far_they_go(head, edges, dense_moves):
@@ -58,7 +60,7 @@ def test_tokens_count_by_how_far_they_go(head, edges, dense_moves):
     torch.nn.init.zeros_(head.say.weight)
     head.say.bias.data = torch.full((len(KNOTS_M) - 1,), -2.0 / (len(KNOTS_M) - 1))
 
-    logits = head(X, torch.tensor([int(AgentType.VEHICLE)]), beside(edges, 0.0))
+    logits = head(X, VEHICLE, head.passed(beside(edges, 0.0), INSERTED))
 
     end_m = torch.from_numpy(dense_moves.end_pose[int(AgentType.VEHICLE), :, :2])
     expected = -2 * (end_m.norm(dim=-1) / DRIVES_M).clamp(max=1)
@@ -68,6 +70,10 @@ def test_tokens_count_by_how_far_they_go(head, edges, dense_moves):
 
 
 def test_on_the_road_no_logit_changes(head, edges):
-    logits = head(X, torch.tensor([int(AgentType.VEHICLE)]), beside(edges, 4.0))
+    logits = head(X, VEHICLE, head.passed(beside(edges, 4.0), INSERTED))
 
     assert (logits == 0).all()
+
+
+def test_who_has_moved_is_not_told(head, edges):
+    assert (head.passed(beside(edges, 0.0), ~INSERTED) == 0).all()
