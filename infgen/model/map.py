@@ -7,8 +7,7 @@ from torch import Tensor, nn
 
 from infgen.model.batching.batch import MapTokens
 from infgen.model.device.index import MapIndex
-from infgen.model.features.polyline_segments import lanes as all_lanes
-from infgen.model.features.polyline_segments import road_edges
+from infgen.model.features.polyline_segments import lane_centres, road_edges
 from infgen.model.features.signals import StopLines
 from infgen.model.layers import Attention, embedding_mlp, gather, mlp, normed
 from infgen.model.map_grid import MapGrid
@@ -141,7 +140,7 @@ class MapEncoder(nn.Module):
         if self.edges:
             edges = road_edges(roads) if index is None else index.edges
         if self.lanes:
-            lanes = all_lanes(roads) if index is None else index.lanes
+            lanes = lane_centres(roads) if index is None else index.lanes
         return MapFeatures(
             rows,
             features,

@@ -12,8 +12,11 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from infgen.model.batching.batch import Batch, MapTokens
-from infgen.model.features.polyline_segments import PolylineSegments, road_edges
-from infgen.model.features.polyline_segments import lanes as all_lanes
+from infgen.model.features.polyline_segments import (
+    PolylineSegments,
+    lane_centres,
+    road_edges,
+)
 from infgen.model.features.signals import StopLines
 from infgen.model.map_grid import MapGrid
 from infgen.model.relations import Rows
@@ -51,7 +54,7 @@ class MapIndex:
         """Find the places of some maps."""
         rows, grid = Rows.where(roads.real), MapGrid.of(roads.pose, roads.real)
         edges = road_edges(roads)
-        lanes = all_lanes(roads)
+        lanes = lane_centres(roads)
         for each in (grid, edges.grid, lanes.grid):
             each.measure(MOST_SQUARES)
         wanted = roads.predicted

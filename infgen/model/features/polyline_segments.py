@@ -60,6 +60,6 @@ def road_edges(roads: MapTokens) -> PolylineSegments:
     return PolylineSegments.of(roads, PolylineType.ROAD_EDGE)
 
 
-def lanes(roads: MapTokens) -> PolylineSegments:
+def lane_centres(roads: MapTokens) -> PolylineSegments:
     """Find the lanes of maps."""
     return PolylineSegments.of(roads, PolylineType.LANE)

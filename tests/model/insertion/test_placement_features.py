@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from infgen.model.features.polyline_segments import lanes, road_edges
+from infgen.model.features.polyline_segments import lane_centres, road_edges
 from infgen.model.insertion.placement_features import (
     ANGLE_STEPS,
     OVER_REACH_M,
@@ -57,7 +57,7 @@ def test_turning_query_and_edge_changes_nothing(placement, lines):
 
 
 def test_headings_are_turned_from_the_lane_nearest_in_angle(placement, grid, lines):
-    both = lanes(lines(PolylineType.LANE, (-2.5, 0.5, EAST), (0.5, -2.5, NORTH)))
+    both = lane_centres(lines(PolylineType.LANE, (-2.5, 0.5, EAST), (0.5, -2.5, NORTH)))
 
     turned_rad = placement.turned_rad(*at(0, 0, EAST), both)[0]
 
@@ -76,7 +76,7 @@ def test_headings_are_turned_from_the_lane_nearest_in_angle(placement, grid, lin
     ids=["beside", "no lane", "far away"],
 )
 def test_without_a_lane_there_no_heading_is_judged(placement, kind, left_m, lines):
-    found = lanes(lines(kind, (-2.5, left_m, EAST)))
+    found = lane_centres(lines(kind, (-2.5, left_m, EAST)))
 
     turned_rad = placement.turned_rad(*at(0, 0, EAST), found)
 
@@ -87,7 +87,7 @@ def test_maps_without_lanes_or_edges(placement, grid, lines):
     none = lines(PolylineType.AREA)
 
     over_m = placement.over_m(*at(0, 0, EAST), road_edges(none))
-    turned_rad = placement.turned_rad(*at(0, 0, EAST), lanes(none))
+    turned_rad = placement.turned_rad(*at(0, 0, EAST), lane_centres(none))
 
     assert over_m.shape == (1, len(grid.offset_m))
     assert over_m.isneginf().all()
@@ -103,7 +103,9 @@ def test_what_is_said_is_interpolated(placement, lines):
         part.bias.data = values.float()
     x = torch.randn(1, WIDTH)
     edges = road_edges(lines(PolylineType.ROAD_EDGE, (-2.5, -1.0, EAST)))
-    places = Places(*at(0, 0, EAST), edges, lanes(lines(PolylineType.LANE, (0, 0, NORTH))))
+    places = Places(
+        *at(0, 0, EAST), edges, lane_centres(lines(PolylineType.LANE, (0, 0, NORTH)))
+    )
 
     over_m = placement.offsets(x, places)
     turned_rad = placement.headings(x, places, torch.tensor([[-2.0, 1.0]]))
