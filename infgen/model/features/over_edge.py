@@ -21,7 +21,7 @@ KNOTS_M = (-1.5, -0.75, -0.4, -0.2, -0.1, 0.0, 0.1, 0.25)
 """Between how far boxes are over an edge: how much of each interval is passed is told.
 Farther off it all are alike: vehicles parked beside the road."""
 DRIVES_M = 1.0
-"""Motion tokens that go as far as this drive; the way of those that do not counts."""
+"""Motion tokens that go as far as this drive; shorter ones count for their share of it."""
 
 
 class OverEdgeHead(nn.Module):

@@ -159,11 +159,8 @@ class OffsetFeatures(nn.Module):
         x_m, y_m = away_m.unbind(-1)
         along_m, left_m = cos * y_m - sin * x_m, -cos * x_m - sin * y_m
         at = (left_m + LATERAL_REACH_M) / LATERAL_STEP_M
-        at = at.clamp(0, self.steps - LAST_SHARE)
-        lower = at.floor()
-        share, lower = at - lower, lower.long()
-        profile = profile.float()  # A product, so of low precision under autocast.
-        said = torch.lerp(profile.gather(2, lower), profile.gather(2, lower + 1), share)
+        # A product, so of low precision under autocast.
+        said = between_knots(profile.float(), at)
         beside = (2 - (along_m / ROAD_MIDDLE_M - 1).abs()).clamp(0, 1)
         return (said * beside * roads.present[..., None]).sum(dim=1)
 
@@ -171,3 +168,11 @@ class OffsetFeatures(nn.Module):
 def _ring(values: Tensor) -> Tensor:
     """Continue bins around the full turn, as far as a convolution reaches."""
     return functional.pad(values, (BIN_REACH, BIN_REACH), mode="circular")
+
+
+def between_knots(said: Tensor, at: Tensor) -> Tensor:
+    """Interpolate what knots [..., knot] say at places [..., place], in knots from 0 on."""
+    at = at.clamp(0, said.shape[-1] - 1 - LAST_SHARE)
+    lower = at.floor()
+    share, lower = at - lower, lower.long()
+    return torch.lerp(said.gather(-1, lower), said.gather(-1, lower + 1), share)

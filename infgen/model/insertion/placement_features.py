@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from infgen.model.features.edge_clearance import EdgesNear
 from infgen.model.features.polyline_segments import PolylineSegments
+from infgen.model.insertion.detail_features import between_knots
 from infgen.model.neighbours import MapFeatures, cell_pose
 from infgen.model.relations import wrap_angle
 from infgen.tokens.grid import Grid
@@ -34,8 +35,6 @@ ON_LANE_M = 2.0
 """... and of these, those that pass it as near as that."""
 ANGLE_STEPS = 12
 """Angles to lanes are told apart by so many steps, from along them to against them."""
-LAST_SHARE = 1e-4
-"""Of a step: so far from the last one, one further is always there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +89,7 @@ class PlacementFeatures(nn.Module):
         """Say how much queries are for offset bins, by distance over the nearest edge."""
         over_m = self.over_m(places.pose, places.scene, places.edges)
         at = (over_m.clamp(-OVER_REACH_M, OVER_REACH_M) + OVER_REACH_M) / OVER_STEP_M
-        return _between(self.over(x_ND).float(), at)
+        return between_knots(self.over(x_ND).float(), at)
 
     @torch.no_grad()
     def over_m(
@@ -113,7 +112,7 @@ class PlacementFeatures(nn.Module):
         turned_rad = self.turned_rad(pose, places.scene, places.lanes)
         there = turned_rad.isfinite()
         at = torch.where(there, turned_rad, 0) * (ANGLE_STEPS / math.pi)
-        return _between(self.angle(x_ND).float(), at) * there
+        return between_knots(self.angle(x_ND).float(), at) * there
 
     @torch.no_grad()
     def turned_rad(
@@ -133,13 +132,3 @@ class PlacementFeatures(nn.Module):
         turned_rad = torch.where(present[..., None], turned_rad, torch.inf)
         none = turned_rad.new_full((len(pose), 1, len(self.heading_rad)), torch.inf)
         return torch.cat([turned_rad, none], dim=1).amin(dim=1)
-
-
-def _between(
-    said: Float32[Tensor, "row knot"], at: Float32[Tensor, "row place"]
-) -> Float32[Tensor, "row place"]:
-    """Interpolate what is said at knots, counted from 0."""
-    at = at.clamp(0, said.shape[1] - 1 - LAST_SHARE)
-    lower = at.floor()
-    share, lower = at - lower, lower.long()
-    return torch.lerp(said.gather(1, lower), said.gather(1, lower + 1), share)
