@@ -1,37 +1,12 @@
-"""What ``infgen.geometry`` and ``infgen.tokens.grid`` do to arrays, for tensors."""
-
-import math
+"""Boxes that overlap, and the cells of ``infgen.tokens.grid``, for tensors."""
 
 import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
+from infgen.model.batching.frames import rotate
 from infgen.tokens.grid import Grid
 from infgen.tokens.scene_tokens import NO_CELL
-
-
-def wrap_angle(angle_rad: Float32[Tensor, "*shape"]) -> Float32[Tensor, "*shape"]:
-    """Bring angles to [-pi, pi)."""
-    wrapped = torch.remainder(angle_rad + math.pi, 2 * math.pi) - math.pi
-    return torch.where(wrapped >= math.pi, -math.pi, wrapped)
-
-
-def rotate(
-    xy_m: Float32[Tensor, "*shape 2"], angle_rad: Float32[Tensor, "*#shape"]
-) -> Float32[Tensor, "*shape 2"]:
-    """Turn points counter-clockwise about the origin."""
-    cos, sin = angle_rad.cos(), angle_rad.sin()
-    x_m, y_m = xy_m.unbind(-1)
-    return torch.stack([cos * x_m - sin * y_m, sin * x_m + cos * y_m], dim=-1)
-
-
-def to_world(
-    pose: Float32[Tensor, "*shape 3"], frame: Float32[Tensor, "*shape 3"]
-) -> Float32[Tensor, "*shape 3"]:
-    """Bring poses given in the frame of other poses to the world."""
-    xy_m = rotate(pose[..., :2], frame[..., 2]) + frame[..., :2]
-    heading_rad = wrap_angle(pose[..., 2] + frame[..., 2])
-    return torch.cat([xy_m, heading_rad[..., None]], dim=-1)
 
 
 def boxes_overlap(

@@ -15,12 +15,13 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
+from infgen.model.batching.frames import wrap_angle
 from infgen.model.neighbours import cell_pose, grid_place
 from infgen.model.relations import Rows
 from infgen.model.sampling import choose, sample_event
 from infgen.model.step_memory import StepMemory
 from infgen.model.token_step import PositionOutputs, TokenStep
-from infgen.rollout.device.geometry import DeviceGrid, wrap_angle
+from infgen.rollout.device.geometry import DeviceGrid
 from infgen.rollout.device.graphs import Capture, PassGraphs, cuda_graph
 from infgen.rollout.device.positions import DeviceMask
 from infgen.rollout.device.random_numbers import DeviceStreams

@@ -5,8 +5,9 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
+from infgen.model.batching.frames import to_world
 from infgen.model.token_step import TokenStep
-from infgen.rollout.device.geometry import boxes_overlap, to_world
+from infgen.rollout.device.geometry import boxes_overlap
 from infgen.rollout.rules.insertion_mask import FAR_M, InsertionMask
 from infgen.scene import AgentType
 from infgen.tokens.scene_tokens import Presence
