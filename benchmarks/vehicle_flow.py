@@ -8,7 +8,8 @@ Half second by half second after now, by distance to the ego: how many vehicles 
 the share of them that is gone half a second later, and how many in 10 s are inserted, where
 they are after their first half second. Speeds and counts may be right in sum though those
 that drive come and go too close to the ego. Logs are as they are tokenized, so short gaps
-of a track are no removals. The last line is one JSON object.
+of a track are no removals; rollouts count to their end, also where the ego leaves the
+map. The last line is one JSON object.
 """
 
 import argparse
