@@ -76,6 +76,9 @@ class TownsOptions:
     variety: Annotated[
         str, typer.Option(help="Which towns: basic, broad (they differ more), or recovery.")
     ] = "basic"
+    scenes_per_town: Annotated[
+        int, typer.Option(help="Scenes of each town; 0: ten (of broad ones five).")
+    ] = 0
 
     def write(self, tell: Callable[[Event], None]) -> "Written":
         """Write their records, with progress events."""

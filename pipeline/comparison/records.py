@@ -41,6 +41,7 @@ def town_orders(comparison: Comparison) -> Iterator[Order]:
             split=split,
             scenes_per_file=towns.scenes_per_file,
             variety=towns.variety,
+            scenes_per_town=towns.scenes_per_town,
         )
 
 

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic.dataclasses import dataclass
 
-from infgen.settings import RULES, AtLeastOne, Positive, Seed
+from infgen.settings import RULES, AtLeastOne, Count, Positive, Seed
 
 
 @dataclass(frozen=True, slots=True, config=RULES)
@@ -21,3 +21,5 @@ class TownSet:
     """Most scenes of a file."""
     variety: Literal["basic", "broad"] = "basic"
     """How much towns differ in streets, drivers and demand."""
+    scenes_per_town: Count = 0
+    """Scenes of each town; 0 for as many as the variety has."""

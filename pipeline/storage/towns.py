@@ -44,6 +44,9 @@ class Order:
         scenes_per_file: Scenes of each file but perhaps the last.
         jobs: Processes that work side by side; 0 for one per core.
         variety: How much towns differ, by name (``infgen.sources.towns.variety``).
+        scenes_per_town: Scenes of each town, the first ones of those that the variety has;
+            0 for all of them. Scenes of one town have its streets and demand in common, so
+            many towns with one scene each tell more than as many scenes of few.
     """
 
     out: Path
@@ -54,6 +57,7 @@ class Order:
     scenes_per_file: int
     jobs: int = 0
     variety: str = "basic"
+    scenes_per_town: int = 0
 
     def __post_init__(self) -> None:
         """Refuse what cannot be made.
@@ -75,6 +79,12 @@ class Order:
         if self.variety not in _varieties():
             raise ConfigError(
                 f"towns of variety {self.variety!r}; expected {' or '.join(_varieties())}"
+            )
+        most = _varieties()[self.variety].scenes_per_town
+        if not 0 <= self.scenes_per_town <= most:
+            raise ConfigError(
+                f"{self.scenes_per_town} scenes per town; variety {self.variety} has "
+                f"1 to {most}, or 0 for all"
             )
 
     @property
@@ -103,6 +113,7 @@ class Part:
     first: int
     count: int
     variety: str
+    scenes_per_town: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,9 +172,9 @@ def write_part(part: Part) -> Path:
     from infgen.sources.towns.numbering import draw_scenes  # noqa: PLC0415
     from infgen.sources.womd_write import encode_scenario, tfrecord  # noqa: PLC0415
 
-    variety = _varieties()[part.variety]
+    variety, each = _varieties()[part.variety], part.scenes_per_town
     scenes = draw_scenes(
-        part.seed, part.split, part.num_steps, part.first, part.count, variety
+        part.seed, part.split, part.num_steps, part.first, part.count, variety, each
     )
     records = [encode_scenario(scene) for scene in scenes]
     write_file(part.path, tfrecord(records, zipped=True))
@@ -184,13 +195,14 @@ def _begin(order: Order) -> None:
         "steps": order.num_steps,
     }
     asked |= {"seed": order.seed, "scenes_per_file": order.scenes_per_file}
-    asked |= {"variety": order.variety}
+    asked |= {"variety": order.variety, "scenes_per_town": order.scenes_per_town}
     path = order.out / f"{order.split}.towns.json"
     if not path.is_file():
         write_json(path, asked)
         return
-    # Towns that name no variety were written before there were several.
-    there: dict[str, object] = {"variety": "basic", **json.loads(path.read_text())}
+    # Towns that do not name these were written before there was a choice.
+    before: dict[str, object] = {"variety": "basic", "scenes_per_town": 0}
+    there = before | json.loads(path.read_text())
     for name, value in asked.items():
         if there.get(name) != value:
             raise ConfigError(
@@ -210,7 +222,14 @@ def _parts(order: Order) -> Iterator[Part]:
         first = shard * order.scenes_per_file
         count = min(order.scenes_per_file, order.scenes - first)
         yield Part(
-            path, order.split, order.seed, order.num_steps, first, count, order.variety
+            path=path,
+            split=order.split,
+            seed=order.seed,
+            num_steps=order.num_steps,
+            first=first,
+            count=count,
+            variety=order.variety,
+            scenes_per_town=order.scenes_per_town,
         )
 
 

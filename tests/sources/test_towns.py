@@ -13,7 +13,7 @@ from infgen.scene import (
     SignalState,
 )
 from infgen.sources.towns import builtin_records
-from infgen.sources.towns.builtin import BUILTIN, BUILTIN_SEED, NUM_STEPS, builtin_numbers
+from infgen.sources.towns.builtin import BUILTIN, BUILTIN_SEED, NUM_STEPS
 from infgen.sources.towns.numbering import draw_scenes
 from infgen.sources.womd import iter_scenes
 from infgen.sources.womd_write import encode_scenario
@@ -47,9 +47,11 @@ def test_records_that_come_with_the_package_are_small_and_whole(scenes):
 @needs_sumo
 @pytest.mark.slow
 def test_built_in_records_are_what_their_seed_draws(scenes):
-    row, number = 26, builtin_numbers("validation")[2]
+    row = 26
 
-    drawn = list(draw_scenes(BUILTIN_SEED, "validation", NUM_STEPS, number, 2))
+    drawn = list(
+        draw_scenes(BUILTIN_SEED, "validation", NUM_STEPS, 2, 2, scenes_per_town=2)
+    )
 
     # Within a grid step: another processor may round a sine differently.
     for at, scene in enumerate(drawn):
@@ -64,6 +66,15 @@ def test_a_scene_is_the_same_whoever_draws_it_and_with_which_others():
 
     assert encode_scenario(both[1]) == encode_scenario(alone)
     assert both[0].scenario_id != alone.scenario_id
+
+
+@needs_sumo
+@pytest.mark.slow
+def test_scenes_of_more_towns_are_the_first_ones_of_each():
+    (of_second_town,) = draw_scenes(5, "training", 40, 1, 1, scenes_per_town=1)
+    (eleventh,) = draw_scenes(5, "training", 40, 10, 1)
+
+    assert encode_scenario(of_second_town) == encode_scenario(eleventh)
 
 
 @needs_sumo

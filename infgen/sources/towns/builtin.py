@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from infgen.sources.towns.numbering import draw_scenes
-from infgen.sources.towns.variety import BASIC
 from infgen.sources.womd_write import encode_scenario, write_tfrecord
 
 BUILTIN_SEED = 2
@@ -20,16 +19,6 @@ def builtin_records() -> list[Path]:
     return sorted(_RECORDS.glob("*.tfrecord*"))
 
 
-def builtin_numbers(split: str) -> list[int]:
-    """Numbers of the scenes of a split, in the order of the files."""
-    towns, _ = BUILTIN[split]
-    return [
-        town * BASIC.scenes_per_town + at
-        for town in range(towns)
-        for at in range(SCENES_EACH)
-    ]
-
-
 def write_builtin(out: Path) -> list[Path]:
     """Write the files that come with the package again.
 
@@ -37,18 +26,14 @@ def write_builtin(out: Path) -> list[Path]:
         SumoError: if SUMO is missing or fails.
     """
     paths = []
-    for split, (_, per_file) in BUILTIN.items():
-        numbers = builtin_numbers(split)
-        starts = range(0, len(numbers), per_file * SCENES_EACH)
-        for shard, start in enumerate(starts):
+    for split, (towns, per_file) in BUILTIN.items():
+        count = per_file * SCENES_EACH
+        starts = range(0, towns * SCENES_EACH, count)
+        for shard, first in enumerate(starts):
             path = out / f"{split}.tfrecord-{shard:05d}-of-{len(starts):05d}.gz"
-            records = [
-                encode_scenario(scene)
-                for number in numbers[start : start + per_file * SCENES_EACH : SCENES_EACH]
-                for scene in draw_scenes(
-                    BUILTIN_SEED, split, NUM_STEPS, number, SCENES_EACH
-                )
-            ]
-            write_tfrecord(path, records)
+            scenes = draw_scenes(
+                BUILTIN_SEED, split, NUM_STEPS, first, count, scenes_per_town=SCENES_EACH
+            )
+            write_tfrecord(path, [encode_scenario(scene) for scene in scenes])
             paths.append(path)
     return paths

@@ -1,4 +1,4 @@
-"""Scenes by number: ten of each town."""
+"""Scenes by number: as many of each town as its variety says, or fewer."""
 
 from collections.abc import Iterator
 from itertools import groupby
@@ -25,10 +25,12 @@ def draw_scenes(
     first: int,
     count: int,
     variety: Variety = BASIC,
+    scenes_per_town: int = 0,
 ) -> Iterator[Scene]:
     """Draw scenes of a split by number.
 
-    Each depends on the seed, the split, its length, its number and the variety alone.
+    Each depends on the seed, the split, its length, its town and its place among the scenes
+    of that town, and the variety alone.
 
     Args:
         seed: Other scenes for another seed.
@@ -37,11 +39,13 @@ def draw_scenes(
         first: Number of the first scene.
         count: How many.
         variety: Ranges that towns are drawn from.
+        scenes_per_town: Only so many of each town have a number, its first ones; 0 for all
+            that the variety has.
 
     Raises:
         SumoError: if SUMO is missing or fails.
     """
-    numbers, each = range(first, first + count), variety.scenes_per_town
+    numbers, each = range(first, first + count), scenes_per_town or variety.scenes_per_town
     kind = "towns" if variety is BASIC else f"towns-{variety.name}"
     for place, wanted in groupby(numbers, key=lambda number: number // each):
         name = f"{kind}/{seed}/{split}/{num_steps}/{place}"

@@ -77,6 +77,7 @@ def test_what_a_killed_run_left_half_written_is_cleared(tmp_path, quick):
         ({"scenes": 3}, "scenes 2, not 3"),
         ({"scenes_per_file": 2}, "scenes_per_file 1, not 2"),
         ({"variety": "broad"}, "variety basic, not broad"),
+        ({"scenes_per_town": 1}, "scenes_per_town 0, not 1"),
     ],
 )
 def test_towns_of_another_order_are_not_mixed_with(tmp_path, quick, more, message):
@@ -101,6 +102,9 @@ def test_splits_may_share_a_folder(tmp_path, quick):
         ({"seconds": 1.0}, "scenes of 1 s; expected 2.1 to 600"),
         ({"seconds": 601.0}, "scenes of 601 s"),
         ({"jobs": -1}, "-1 jobs"),
+        ({"scenes_per_town": 11}, "11 scenes per town; variety basic has 1 to 10"),
+        ({"scenes_per_town": -1}, "-1 scenes per town"),
+        ({"scenes_per_town": 6, "variety": "broad"}, "variety broad has 1 to 5"),
     ],
 )
 def test_what_cannot_be_made_is_refused(tmp_path, more, message):
@@ -162,11 +166,12 @@ def test_any_number_of_processes_writes_the_same_bytes(tmp_path):
     assert asked["seed"] == 3
 
 
-def test_towns_that_name_no_variety_are_basic(tmp_path, quick):
+def test_towns_of_before_a_choice_are_basic_with_all_scenes(tmp_path, quick):
     write_towns(order(tmp_path))
     path = tmp_path / "training.towns.json"
     about = json.loads(path.read_text())
     assert about.pop("variety") == "basic"
+    assert about.pop("scenes_per_town") == 0
     path.write_text(json.dumps(about))
 
     assert write_towns(order(tmp_path)).before == 2
