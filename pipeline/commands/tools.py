@@ -74,7 +74,10 @@ class TownsOptions:
     scenes_per_file: Annotated[int, typer.Option(help="Most scenes of a file.")] = 20
     jobs: Annotated[int, typer.Option(help="Processes; 0: one per core.")] = 0
     variety: Annotated[
-        str, typer.Option(help="Which towns: basic, broad (they differ more), or recovery.")
+        str,
+        typer.Option(
+            help="basic, broad (they differ more), recovery or steady (docs/towns.md)."
+        ),
     ] = "basic"
     scenes_per_town: Annotated[
         int, typer.Option(help="Scenes of each town; 0: ten (of broad ones five).")

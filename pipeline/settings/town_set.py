@@ -19,7 +19,7 @@ class TownSet:
     """Another seed gives other towns."""
     scenes_per_file: AtLeastOne = 20
     """Most scenes of a file."""
-    variety: Literal["basic", "broad"] = "basic"
+    variety: Literal["basic", "broad", "steady"] = "basic"
     """How much towns differ in streets, drivers and demand."""
     scenes_per_town: Count = 0
     """Scenes of each town; 0 for as many as the variety has."""

@@ -68,7 +68,9 @@ def _find_town(name: str, num_steps: int, variety: Variety) -> tuple[Town, list[
         steps = max(LEAST_STEPS, 3 * num_steps // 2)
         town = make_town(stream(name, "town", attempt), steps, spread, variety)
         rng = stream(name, "views", attempt)
-        views = draw_views(town, wanted, num_steps, FROM_RIM_M, rng, every)
+        views = draw_views(
+            town, wanted, num_steps, FROM_RIM_M, rng, every, variety.at_any_time
+        )
         if len(views) == wanted:
             return town, views
         attempt += 1

@@ -2,7 +2,8 @@
 
 ``BASIC`` is what the records and the weights of the package were made with; its scenes keep
 their bytes. ``BROAD`` has more layouts, demands and drivers, and vehicles that park. In
-``RECOVERY`` some drivers have not looked ahead as a scene begins, and recover from it.
+``RECOVERY`` some drivers have not looked ahead as a scene begins, and recover from it. In
+``STEADY`` what a car does next does not decide whether it records.
 """
 
 from collections.abc import Mapping
@@ -133,6 +134,8 @@ class Variety:
         streets: Of streets.
         drivers: Of drivers.
         demand: Of demand.
+        at_any_time: Whether a car is recorded at any time of its drive alike, and not
+            rather where it goes far in the next half minute.
     """
 
     name: str
@@ -140,6 +143,7 @@ class Variety:
     streets: StreetVariety
     drivers: DriverVariety
     demand: DemandVariety
+    at_any_time: bool = False
 
 
 BASIC = Variety(
@@ -213,5 +217,6 @@ RECOVERY = replace(
         ),
     ),
 )
-VARIETIES = {each.name: each for each in (BASIC, BROAD, RECOVERY)}
+STEADY = replace(BASIC, name="steady", at_any_time=True)
+VARIETIES = {each.name: each for each in (BASIC, BROAD, RECOVERY, STEADY)}
 """By name, the default first."""

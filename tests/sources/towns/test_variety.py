@@ -20,7 +20,7 @@ STEPS = 300
 
 
 def test_basic_comes_first_and_names_are_their_own():
-    assert list(VARIETIES) == ["basic", "broad", "recovery"]
+    assert list(VARIETIES) == ["basic", "broad", "recovery", "steady"]
     assert all(VARIETIES[name].name == name for name in VARIETIES)
 
 

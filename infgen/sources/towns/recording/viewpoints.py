@@ -35,10 +35,12 @@ def draw_views(
     from_rim_m: float,
     rng: np.random.Generator,
     start_every: int = START_EVERY,
+    at_any_time: bool = False,
 ) -> list[View]:
     """Draw views, no two of one car at one time; fewer if the town has not so many.
 
-    A car is drawn the more likely the farther it goes, then and in the seconds after it.
+    A car is drawn the more likely the farther it goes, then and in the seconds after it;
+    or, at any time of its drive alike, the farther it goes in all the time of the town.
 
     Args:
         town: Where.
@@ -47,6 +49,9 @@ def draw_views(
         from_rim_m: How far the car keeps away from where streets end.
         rng: Of all that is drawn.
         start_every: Recordings begin at steps that are multiples of it.
+        at_any_time: Whether the way in all the time of the town counts. Then what a car
+            does next does not decide whether it is recorded, so as many stand at the end of
+            recordings as at their beginning.
     """
     able = _able(town, from_rim_m)
     drive = max(num_steps, min(DRIVE_STEPS, town.num_steps - num_steps))
@@ -58,6 +63,8 @@ def draw_views(
     far_m = np.pad(np.cumsum(speed_mps, axis=1), ((0, 0), (1, 0))) * CLOCK.step_s
     way_m = far_m[:, starts + drive - 1] - far_m[:, starts]
     busy = 1 + _moving_near(town, starts + num_steps // 2, speed_mps)
+    if at_any_time:
+        way_m, busy = far_m[:, -1:], busy.mean(axis=1, keepdims=True)
     weight = np.where(lasting, (STANDING_M + way_m) * busy, 0.0)
     views: list[View] = []
     while len(views) < count and weight.any():

@@ -1,5 +1,6 @@
 """From a town and its traffic to a scene: a town made by hand around a crossing."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -99,6 +100,33 @@ def test_who_sets_off_later_is_chosen_while_it_still_stands(town):
     # By the way it goes while it is recorded, one in a hundred.
     assert 0.05 < np.mean([view == View(1, 0) for view in drawn]) < 0.2
     assert np.mean([view.ego == 0 for view in drawn]) < 0.1
+
+
+def test_at_any_time_alike_what_a_car_does_next_does_not_matter(town):
+    velocity_mps = np.zeros((2, STEPS, 2))
+    velocity_mps[1, 60:, 0] = 10.0
+    sets_off, stops = (
+        replace(town, bodies=replace(town.bodies, velocity_mps=each))
+        for each in (velocity_mps, velocity_mps[:, ::-1])
+    )
+
+    def draw(at_any_time):
+        return [
+            Counter(
+                view.start
+                for at in range(200)
+                for view in draw_views(
+                    each, 1, 40, RIM_M, np.random.default_rng(at), at_any_time=at_any_time
+                )
+            )
+            for each in (sets_off, stops)
+        ]
+
+    before, after = draw(at_any_time=True)
+    assert before == after
+    assert max(before.values()) < 1.5 * min(before.values())
+    before, after = draw(at_any_time=False)
+    assert before != after
 
 
 def test_no_two_views_are_of_one_car_at_one_time(town):
