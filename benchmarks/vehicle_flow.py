@@ -7,15 +7,18 @@ Reads the logs' tokens and the rollouts of a root::
 Half second by half second after now, by distance to the ego: how many vehicles there are,
 the share of them that is gone half a second later, and how many in 10 s are inserted, where
 they are after their first half second. Speeds and counts may be right in sum though those
-that drive come and go too close to the ego. Logs are as they are tokenized, so short gaps
-of a track are no removals; rollouts count to their end, also where the ego leaves the
-map. The last line is one JSON object.
+that drive come and go too close to the ego. The second table has the inserted ones by
+whether they face away from the ego, towards it or past it (by more than 60 degrees), and
+the share that drives on in the next half second: at the edge of what an ego sees, logs
+have few that drive away. Logs are as they are tokenized, so short gaps of a track are no
+removals; rollouts count to their end, also where the ego leaves the map. The last line is
+one JSON object.
 """
 
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +41,9 @@ RING_EDGES_M = (0.0, 20.0, 40.0, 55.0, 65.0, 75.0)
 """Distances to the ego; the last ring has no end."""
 STATES = ("drives", "stands")
 FIGURES = ("present", "removed", "inserted", "token steps")
+WAYS = ("away", "past", "towards")
+ALONG = 0.5
+"""Who faces away from the ego, or towards it, has a cosine beyond it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +52,14 @@ class Tracks:
 
     Attributes:
         xy_m: Where they are.
+        heading_rad: Which way they face.
         there: Whether they are, from the end of their first half second on.
         is_vehicle: Whether they are vehicles other than the ego.
         ego: Row of the ego.
     """
 
     xy_m: Float[np.ndarray, "agent token 2"]
+    heading_rad: Float[np.ndarray, "agent token"]
     there: Bool[np.ndarray, "agent token"]
     is_vehicle: Bool[np.ndarray, " agent"]
     ego: int
@@ -61,6 +69,7 @@ def tracks_of_log(scene: SceneTokens) -> Tracks:
     """Read a tokenized log."""
     return Tracks(
         scene.pose[:, scene.now :, :2],
+        scene.pose[:, scene.now :, 2],
         scene.presence[:, scene.now :] == Presence.PRESENT,
         _is_vehicle(scene.agent_type, scene.ego),
         scene.ego,
@@ -72,6 +81,7 @@ def tracks_of_rollout(rollout: Rollout) -> Tracks:
     steps = slice(rollout.now, None, CLOCK.steps_per_token)
     return Tracks(
         rollout.xyz_m[:, steps, :2],
+        rollout.heading_rad[:, steps],
         rollout.valid[:, steps],
         _is_vehicle(rollout.agent_type, rollout.ego),
         rollout.ego,
@@ -109,6 +119,48 @@ def flow(tracks: Tracks) -> Float64[np.ndarray, "figure state ring"]:
     return np.stack([*found, steps]).reshape(len(FIGURES), len(STATES), -1).astype(float)
 
 
+def ways(tracks: Tracks) -> Float64[np.ndarray, "figure way ring"]:
+    """Count inserted vehicles of a log or rollout, and those of them that drive on.
+
+    Those that are gone after their first half second count in neither; token steps, the
+    third figure, are the same in each ring.
+    """
+    there = tracks.there[tracks.is_vehicle]
+    xy_m = tracks.xy_m[tracks.is_vehicle].astype(np.float64)
+    heading_rad = tracks.heading_rad[tracks.is_vehicle]
+    row, before = np.nonzero(~there[:, :-2] & there[:, 1:-1] & there[:, 2:])
+    at = before + 1
+    from_ego_m = xy_m[row, at] - tracks.xy_m[tracks.ego, at].astype(np.float64)
+    away_m = np.linalg.norm(from_ego_m, axis=-1)
+    facing = np.stack([np.cos(heading_rad[row, at]), np.sin(heading_rad[row, at])], axis=-1)
+    cosine = (facing * from_ego_m).sum(axis=-1) / np.maximum(away_m, 1e-6)
+    way = np.where(cosine > ALONG, 0, np.where(cosine < -ALONG, 2, 1))
+    drives = np.linalg.norm(xy_m[row, at + 1] - xy_m[row, at], axis=-1) > DRIVING_M
+    group = way * len(RING_EDGES_M) + np.digitize(away_m, RING_EDGES_M[1:])
+    groups = len(WAYS) * len(RING_EDGES_M)
+    found = [
+        np.bincount(group[mask], minlength=groups)
+        for mask in (np.ones_like(drives), drives)
+    ]
+    steps = np.full(groups, there.shape[1] - 1)
+    return np.stack([*found, steps]).reshape(3, len(WAYS), -1).astype(float)
+
+
+def ways_rows(found: Float64[np.ndarray, "figure way ring"]) -> list[dict[str, Any]]:
+    """Tell the figures of each way and ring: rates and shares."""
+    inserted, drive, steps = found
+    return [
+        {
+            "faces": way,
+            "away_m": least_m,
+            "inserted_per_10s": inserted[at, ring] / steps[at, ring] * 10 / CLOCK.token_s,
+            "drives": drive[at, ring] / max(inserted[at, ring], 1),
+        }
+        for at, way in enumerate(WAYS)
+        for ring, least_m in enumerate(RING_EDGES_M)
+    ]
+
+
 def rows_of(found: Float64[np.ndarray, "figure state ring"]) -> list[dict[str, Any]]:
     """Tell the figures of each state and ring: means, shares and rates."""
     present, removed, inserted, steps = found
@@ -128,8 +180,25 @@ def rows_of(found: Float64[np.ndarray, "figure state ring"]) -> list[dict[str, A
     return rows
 
 
+def report_ways(logs: list[dict[str, Any]], rollouts: list[dict[str, Any]]) -> None:
+    """Print the second table."""
+    show_table(
+        "inserted vehicles by where they face: rollouts (logs)",
+        ("faces", "m to the ego, from", "inserted in 10 s", "drives on"),
+        [
+            (
+                ours["faces"],
+                f"{ours['away_m']:.0f}",
+                f"{ours['inserted_per_10s']:.2f} ({theirs['inserted_per_10s']:.2f})",
+                f"{ours['drives']:.1%} ({theirs['drives']:.1%})",
+            )
+            for ours, theirs in zip(rollouts, logs, strict=True)
+        ],
+    )
+
+
 def report(logs: list[dict[str, Any]], rollouts: list[dict[str, Any]]) -> None:
-    """Print the table."""
+    """Print the first table."""
     show_table(
         "vehicles after now: rollouts (logs)",
         ("vehicle", "m to the ego, from", "present", "removed", "inserted in 10 s"),
@@ -146,27 +215,46 @@ def report(logs: list[dict[str, Any]], rollouts: list[dict[str, Any]]) -> None:
     )
 
 
+@dataclass(slots=True)
+class _Sums:
+    """What ``flow`` and ``ways`` count in all logs, or all rollouts."""
+
+    flow: np.ndarray = field(
+        default_factory=lambda: np.zeros((len(FIGURES), len(STATES), len(RING_EDGES_M)))
+    )
+    ways: np.ndarray = field(
+        default_factory=lambda: np.zeros((3, len(WAYS), len(RING_EDGES_M)))
+    )
+
+    def take(self, tracks: Tracks) -> None:
+        self.flow = self.flow + flow(tracks)
+        self.ways = self.ways + ways(tracks)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Look at a root's rollouts, and at the logs that they go on from."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("root", type=Path, help="root with stages tokenize and rollout")
     root = parser.parse_args(arguments).root
-    played: dict[str, np.ndarray] = {}
+    played, simulated = _Sums(), set()
     for unit in unit_folders(root / "latest" / "rollout") or []:
         for rollout in read_rollouts(unit):
-            found = flow(tracks_of_rollout(rollout))
-            played[rollout.scenario_id] = played.get(rollout.scenario_id, 0) + found
-    scenes = TokenScenes(shards(root))
-    logged = [
-        flow(tracks_of_log(scene))
-        for scene in (scenes[row] for row in range(len(scenes)))
-        if scene.scenario_id in played
-    ]
-    if not logged:
+            played.take(tracks_of_rollout(rollout))
+            simulated.add(rollout.scenario_id)
+    scenes, logged, count = TokenScenes(shards(root)), _Sums(), 0
+    for row in range(len(scenes)):
+        scene = scenes[row]
+        if scene.scenario_id in simulated:
+            logged.take(tracks_of_log(scene))
+            count += 1
+    if not count:
         parser.error(f"{root} has no rollouts, or no tokens of their scenes")
-    logs, rollouts = rows_of(np.sum(logged, 0)), rows_of(np.sum(list(played.values()), 0))
+    logs, rollouts = rows_of(logged.flow), rows_of(played.flow)
     report(logs, rollouts)
-    print(json.dumps({"scenes": len(logged), "logs": logs, "rollouts": rollouts}))
+    found = {"scenes": count, "logs": logs, "rollouts": rollouts}
+    logs, rollouts = ways_rows(logged.ways), ways_rows(played.ways)
+    report_ways(logs, rollouts)
+    print(json.dumps(found | {"logs_inserted": logs, "rollouts_inserted": rollouts}))
 
 
 if __name__ == "__main__":

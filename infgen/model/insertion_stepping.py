@@ -15,6 +15,7 @@ from infgen.model.insertion.detail_query import (
     DetailStack,
     InsertionDetails,
 )
+from infgen.model.insertion.lane_directions import LanesAround
 from infgen.model.insertion.placement_features import Places
 from infgen.model.layers import full_precision, normed
 from infgen.model.long_memory import Standing, standing_after
@@ -258,7 +259,8 @@ class InsertionStepper:
             self._raw(entries), row.view_as(token_step.presence), token_step.pose, there
         )
         roads = CellSources.roads(entries.map, entries.scene)
-        described: Tensor = cell_features(token_step.pose[:, EGO], roads, lying)
+        lanes = LanesAround.of(entries.map, entries.scene)
+        described: Tensor = cell_features(token_step.pose[:, EGO], roads, lying, lanes)
         return described
 
     def _no_spacing(self, rollouts: int, like: Tensor) -> Tensor | None:

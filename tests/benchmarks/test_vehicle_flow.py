@@ -27,7 +27,9 @@ def tracks(flow, *vehicles):
         ]
     )
     is_vehicle = np.arange(len(there)) > 0
-    return flow.Tracks(np.stack([x_m, 0 * x_m], axis=-1), there, is_vehicle, 0)
+    heading_rad = np.where(x_m == x_m[:, :1], np.pi / 2, 0.0)
+    heading_rad[:, :-1] = heading_rad[:, 1:]
+    return flow.Tracks(np.stack([x_m, 0 * x_m], axis=-1), heading_rad, there, is_vehicle, 0)
 
 
 def test_those_that_stay_are_neither_inserted_nor_removed(flow):
@@ -68,3 +70,25 @@ def test_rates_are_those_of_ten_seconds(flow):
     assert row["inserted_per_10s"] == pytest.approx(1 / 2.5 * 10)
     assert row["removed"] == 1
     assert row["present"] == pytest.approx(1 / 5)
+
+
+def test_inserted_vehicles_are_told_by_where_they_face_and_whether_they_drive_on(flow):
+    # One drives away at 60 m, one drives on behind the ego towards it, one stands across;
+    # the last is gone after half a second.
+    vehicles = (54, 2, {3, 4}), (-50, 2, {2, 3}), (10, 0, {2, 3, 4}), (12, 0, {3})
+    inserted, drive, steps = flow.ways(tracks(flow, *vehicles))
+
+    np.testing.assert_array_equal(inserted[0], [0, 0, 0, 1, 0, 0])
+    np.testing.assert_array_equal(inserted[1], [1, 0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(inserted[2], [0, 0, 1, 0, 0, 0])
+    np.testing.assert_array_equal(drive[[0, 2]], inserted[[0, 2]])
+    assert not drive[1].any()
+    assert (steps == TOKENS - 1).all()
+
+
+def test_rates_by_where_they_face_are_those_of_ten_seconds(flow):
+    rows = flow.ways_rows(flow.ways(tracks(flow, (54, 2, {3, 4}))))
+
+    (row,) = [row for row in rows if row["inserted_per_10s"]]
+    assert (row["faces"], row["away_m"], row["drives"]) == ("away", 55.0, 1.0)
+    assert row["inserted_per_10s"] == pytest.approx(1 / 2.5 * 10)
