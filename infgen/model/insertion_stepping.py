@@ -15,7 +15,6 @@ from infgen.model.insertion.detail_query import (
     DetailStack,
     InsertionDetails,
 )
-from infgen.model.insertion.lane_directions import LanesAround
 from infgen.model.insertion.placement_features import Places
 from infgen.model.layers import full_precision, normed
 from infgen.model.long_memory import Standing, standing_after
@@ -259,8 +258,7 @@ class InsertionStepper:
             self._raw(entries), row.view_as(token_step.presence), token_step.pose, there
         )
         roads = CellSources.roads(entries.map, entries.scene)
-        lanes = LanesAround.of(entries.map, entries.scene)
-        described: Tensor = cell_features(token_step.pose[:, EGO], roads, lying, lanes)
+        described: Tensor = cell_features(token_step.pose[:, EGO], roads, lying)
         return described
 
     def _no_spacing(self, rollouts: int, like: Tensor) -> Tensor | None:

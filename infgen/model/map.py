@@ -57,7 +57,7 @@ class MapEncoder(nn.Module):
         self.stop_lines = settings.signal_ahead_m > 0
         by_edges = settings.over_edge_head or settings.placement_features
         self.edges = settings.edge_clearance_width > 0 or by_edges
-        self.lanes = settings.placement_features or settings.cell_lane_directions
+        self.lanes = settings.placement_features
         self.neighbours = settings.map_map_neighbours
         curve_m = torch.from_numpy(vocabulary.curve_m.copy())
         self.register_buffer("curve_m", curve_m, persistent=False)

@@ -121,7 +121,7 @@ class MapFeatures:
             changes.
         lines: Stop lines of signals, if agents get the signal ahead as a feature.
         edges: Road edges, if motion tokens or offset bins are judged by them.
-        lanes: Lanes, if headings of inserted agents or cells are.
+        lanes: Lanes, if headings of inserted agents are.
     """
 
     rows: Rows
@@ -300,8 +300,8 @@ def cell_pose(
 
 
 def grid_place(pose: Tensor, ego_pose: Tensor) -> Float32[Tensor, "*row 2"]:
-    """Where poses or places are in the ego's grid frame. Inverse of ``cell_pose``."""
+    """Where poses [..., 3] are in the ego's grid frame. Inverse of ``cell_pose``."""
     turn_rad = math.pi / 2 - ego_pose[..., 2]
     cos, sin = turn_rad.cos(), turn_rad.sin()
-    x_m, y_m = (pose[..., :2] - ego_pose[..., :2]).unbind(-1)
+    x_m, y_m = (pose - ego_pose)[..., :2].unbind(-1)
     return torch.stack([cos * x_m - sin * y_m, sin * x_m + cos * y_m], dim=-1)

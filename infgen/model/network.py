@@ -22,7 +22,6 @@ from infgen.model.insertion.cell_query import CellStack
 from infgen.model.insertion.cell_refinement import CellRefinement
 from infgen.model.insertion.detail_features import OffsetEmbedding, OffsetFeatures
 from infgen.model.insertion.detail_query import DetailStack
-from infgen.model.insertion.lane_directions import LaneDirections
 from infgen.model.insertion.placement_features import PlacementFeatures
 from infgen.model.latent_rates import LatentRates
 from infgen.model.layers import initialise, normed
@@ -50,7 +49,7 @@ from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
 AgentFeatures = DensityFeatures | StandingFeatures | RemovalFeatures | ApproachFeatures
 MotionParts = AgentFeatures | AnchorHead | LastMoveHead | OverEdgeHead
-CellParts = CellRefinement | LaneDirections | AgentSpacing
+CellParts = CellRefinement | AgentSpacing
 DetailParts = OffsetEmbedding | OffsetFeatures | PlacementFeatures
 AddedPart = MotionParts | CellParts | DetailParts | LatentRates
 """Parts that may be added to trained weights."""

@@ -93,9 +93,6 @@ class ModelSettings:
     """Width of a closer look at the cells that position logits are of, up to 9 m around
     each, a multiple of 4; 0 for none. It does not change whether agents are inserted, and
     needs `cell_feature_width` and `position_token`, without which there is none."""
-    cell_lane_directions: Bool = False
-    """Whether that closer look knows which way lanes lead at each cell: away from the ego,
-    towards it, or past it. It needs `cell_refinement_width`."""
     agent_spacing_width: Count = 0
     """Width of what agents say of the cells, and the offset bins, around them by the gaps
     to their boxes and what these sweep within a second: how far inserted agents keep

@@ -112,7 +112,7 @@ def test_untrained_features_change_no_logit(tiny, new_network, batch):
     features = (
         *("density_features", "standing_features"),
         *("removal_features", "approach_features", "latent_rates", "last_move_head"),
-        *("over_edge_head", "cell_lane_directions"),
+        "over_edge_head",
     )
     widths = {
         "cell_refinement_width": 8,
@@ -128,7 +128,7 @@ def test_untrained_features_change_no_logit(tiny, new_network, batch):
 
     one, two = plain(batch), network(batch)
 
-    assert len(network.added_parts()) == 13
+    assert len(network.added_parts()) == 12
     assert torch.equal(one.motion.motion_logits, two.motion.motion_logits)
     assert torch.equal(one.motion.remove_logit, two.motion.remove_logit)
     assert torch.equal(one.entries.add_logit, two.entries.add_logit)

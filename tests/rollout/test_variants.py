@@ -28,11 +28,7 @@ VARIANTS = {
     "patterns": {"validity_pattern_tokens": True},
     "rotary": {"relations": "rotary"},
     "latent rates": {"latent_rates": True},
-    "cell refinement": {
-        "cell_feature_width": 4,
-        "cell_refinement_width": 4,
-        "cell_lane_directions": True,
-    },
+    "cell refinement": {"cell_feature_width": 4, "cell_refinement_width": 4},
     "agent spacing": {
         "agent_spacing_width": 4,
         "offset_token": True,

@@ -301,7 +301,6 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
             "offset_token": True,
             "placement_features": True,
             "cell_refinement_width": 4,
-            "cell_lane_directions": True,
             "agent_spacing_width": 4,
         },
         {"closed_loop_population": True, "trained_parts": "details, motion"},

@@ -7,7 +7,7 @@ does.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 from torch import Tensor
 from torch.nn import functional
 
@@ -27,13 +27,11 @@ class PolylineSegments:
     Attributes:
         start_m: Where they begin; padding is anywhere [scene, segment, 2].
         along_m: From there to where they end [scene, segment, 2].
-        real: Which places hold a segment: maps have not as many.
         grid: The same by where their middles are.
     """
 
     start_m: Float32[Tensor, "scene segment 2"]
     along_m: Float32[Tensor, "scene segment 2"]
-    real: Bool[Tensor, "scene segment"]
     grid: MapGrid
 
     @classmethod
@@ -54,8 +52,7 @@ class PolylineSegments:
 
         start_m, along_m = taken(start_m), taken(along_m)
         middle = functional.pad(start_m + along_m / 2, (0, 1))
-        real = chosen.gather(1, at)
-        return cls(start_m, along_m, real, MapGrid.of(middle, real))
+        return cls(start_m, along_m, MapGrid.of(middle, chosen.gather(1, at)))
 
 
 def road_edges(roads: MapTokens) -> PolylineSegments:

@@ -11,7 +11,6 @@ from infgen.model.insertion.agent_spacing import SpacedAgents, swept
 from infgen.model.insertion.cell_features import CellSources
 from infgen.model.insertion.cell_query import CellStack
 from infgen.model.insertion.detail_query import DetailStack
-from infgen.model.insertion.lane_directions import LanesAround
 from infgen.model.insertion.placement_features import Places
 from infgen.model.logits import DetailOutputs, InsertionOutputs
 from infgen.model.long_memory import Density
@@ -67,10 +66,7 @@ def insertion_outputs(
         )
         map_of = asked.at // agents.pose.shape[1]
         cell_features = stack.cell_features(
-            asked.pack(ego_pose),
-            CellSources.roads(roads, map_of),
-            lying,
-            LanesAround.of(roads, map_of),
+            asked.pack(ego_pose), CellSources.roads(roads, map_of), lying
         )
     average = None if density is None else asked.pack(density.average)
     x = stack(occupied, map_seen, seen, average)

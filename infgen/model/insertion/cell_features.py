@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from infgen.model.insertion.cell_refinement import CellRefinement, lattice_centres_m
-from infgen.model.insertion.lane_directions import LanesAround, ways_of_lanes
 from infgen.model.layers import AttentionSources, embedding_mlp, gather
 from infgen.model.neighbours import MapFeatures, grid_place
 from infgen.tokens.grid import Grid
@@ -66,13 +65,7 @@ class CellFeatures(nn.Module):
     centre_m: Tensor
 
     def __init__(
-        self,
-        width: int,
-        cell_feature_width: int,
-        refinement_width: int,
-        grid: Grid,
-        *,
-        lane_directions: bool = False,
+        self, width: int, cell_feature_width: int, refinement_width: int, grid: Grid
     ) -> None:
         super().__init__()
         self.width = cell_feature_width
@@ -95,44 +88,26 @@ class CellFeatures(nn.Module):
         self.ask = nn.Linear(width, cell_feature_width)
         centres_m = lattice_centres_m(self.side, self.step_m)
         self.refinement = (
-            CellRefinement(
-                width,
-                cell_feature_width,
-                refinement_width,
-                centres_m,
-                lane_directions=lane_directions,
-            )
+            CellRefinement(width, cell_feature_width, refinement_width, centres_m)
             if refinement_width
             else None
         )
 
-    def forward(
-        self,
-        ego_pose: Tensor,
-        roads: CellSources,
-        agents: CellSources,
-        lanes: LanesAround | None = None,
-    ) -> Tensor:
+    def forward(self, ego_pose: Tensor, roads: CellSources, agents: CellSources) -> Tensor:
         """Describe the cells around egos [N, 3]: features [N, cell, C].
 
-        With a refinement, its features follow [N, cell, 2 C]; it alone looks at ``lanes``.
+        With a refinement, its features follow [N, cell, 2 C].
         """
-        square = self._cell_sources(ego_pose, roads, self.road) + self._cell_sources(
+        laid = self._cell_sources(ego_pose, roads, self.road) + self._cell_sources(
             ego_pose, agents, self.agent
         )
+        square = laid.view(len(ego_pose), self.side, self.side, laid.shape[1])
+        square = square.permute(0, 3, 1, 2)
         cells = self.beside(square).flatten(2)[..., self.lattice].mT
         keys: Tensor = self.key(functional.relu(cells + self.place(self.centre_m)))
         if self.refinement is None:
             return keys
-        ways = None
-        if self.refinement.lanes is not None and lanes is not None:
-            xy_m, of_each = ways_of_lanes(ego_pose, lanes)
-            at, inside = self._on_lattice(xy_m, lanes.present)
-            query, segment, counts = chosen(inside)
-            at, features = at[query, segment], of_each[query, segment]
-            ways = self._shared_out(len(ego_pose), query, at, features, counts)
-        refined = self.refinement(square, self.lattice, ways)
-        return torch.cat([keys, refined], dim=-1)
+        return torch.cat([keys, self.refinement(square, self.lattice)], dim=-1)
 
     def choose(self, x_NSD: Tensor, cells_NPC: Tensor) -> Tensor:
         """Say how much queries are for each cell: logits [N, S, cell]."""
@@ -149,57 +124,30 @@ class CellFeatures(nn.Module):
     def _cell_sources(
         self, ego_pose: Tensor, lying: CellSources, project: nn.Linear
     ) -> Tensor:
-        """Lay things onto the lattice: [N, C, side, side]."""
+        """Share things out between the four lattice points around each: [point, C]."""
+        last = self.side - 1
         xy_m = grid_place(lying.pose, ego_pose[:, None])
-        at, inside = self._on_lattice(xy_m, lying.present)
+        at = xy_m / self.step_m + last / 2  # column, row
+        inside = lying.present & (at > 0).all(dim=-1) & (at < last).all(dim=-1)
         query, thing, counts = chosen(inside)
         at = at[query, thing]
         turned_rad = lying.pose[query, thing, 2] - ego_pose[query, 2]
         features = gather(project(lying.features), lying.row[query, thing])
         features = functional.relu(features + self.turned(unit(turned_rad)))
-        return self._shared_out(len(ego_pose), query, at, features, counts)
-
-    def _on_lattice(self, xy_m: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-        """Find places [N, K, 2] on the lattice, as column and row, and which are inside."""
-        last = self.side - 1
-        at = xy_m / self.step_m + last / 2
-        return at, present & (at > 0).all(dim=-1) & (at < last).all(dim=-1)
-
-    def _shared_out(
-        self,
-        queries: int,
-        query: Tensor,
-        at: Tensor,
-        features: Tensor,
-        counts: Tensor | None,
-    ) -> Tensor:
-        """Share things out between the four lattice points around each.
-
-        Args:
-            queries: How many there are, N.
-            query: Query of each thing [M].
-            at: Column and row of each on the query's lattice [M, 2].
-            features: Its features [M, C].
-            counts: What each counts for [M, 1]; None for all alike.
-
-        Returns:
-            The lattices [N, C, side, side].
-        """
-        last = self.side - 1
         if counts is not None:
             features, at = features * counts, at.clamp(0, last)
+
         lower = at.floor().clamp(max=last - 1)
         share = at - lower
         token_step, row = lower.long().unbind(-1)
         first = (query * self.side + row) * self.side + token_step
-        laid = share.new_zeros((queries * self.side**2, features.shape[1]))
+        laid = share.new_zeros((len(ego_pose) * self.side**2, features.shape[1]))
         for up in (0, 1):
             for right in (0, 1):
                 weight = _part(share[:, 0], right) * _part(share[:, 1], up)
                 point = first + up * self.side + right
                 laid = laid.index_add(0, point, features * weight[:, None])
-        square = laid.view(queries, self.side, self.side, laid.shape[1])
-        return square.permute(0, 3, 1, 2)
+        return laid
 
 
 def chosen(inside: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -50,15 +50,7 @@ class CellStack(nn.Module):
         features = settings.cell_feature_width if by_cell else 0
         refined = settings.cell_refinement_width
         self.cell_features = (
-            CellFeatures(
-                width,
-                features,
-                refined,
-                grid,
-                lane_directions=settings.cell_lane_directions,
-            )
-            if features
-            else None
+            CellFeatures(width, features, refined, grid) if features else None
         )
         spaced = settings.agent_spacing_width if by_cell else 0
         self.spacing = CellSpacing(width, spaced, grid) if spaced else None

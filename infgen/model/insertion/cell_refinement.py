@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from infgen.model.insertion.lane_directions import LaneDirections
 from infgen.model.layers import embedding_mlp, full_precision
 from infgen.model.settings import REFINEMENT_GROUPS
 
@@ -25,13 +24,7 @@ class CellRefinement(nn.Module):
     centre_m: Tensor
 
     def __init__(
-        self,
-        width: int,
-        cell_feature_width: int,
-        refinement_width: int,
-        centre_m: Tensor,
-        *,
-        lane_directions: bool = False,
+        self, width: int, cell_feature_width: int, refinement_width: int, centre_m: Tensor
     ) -> None:
         """Begin with random weights.
 
@@ -40,7 +33,6 @@ class CellRefinement(nn.Module):
             cell_feature_width: Of what is laid onto the lattice.
             refinement_width: Of the features here, a multiple of ``REFINEMENT_GROUPS``.
             centre_m: Place of each lattice point in the grid frame [point, 2].
-            lane_directions: Whether it knows which way lanes lead.
         """
         super().__init__()
         self.register_buffer("centre_m", centre_m, persistent=False)
@@ -52,14 +44,13 @@ class CellRefinement(nn.Module):
         )
         self.key = nn.Linear(hidden, cell_feature_width)
         self.ask = nn.Linear(width, cell_feature_width)
-        self.lanes = LaneDirections(hidden) if lane_directions else None
 
     def begin_at_zero(self) -> None:
         """Change no logit until it is trained."""
         nn.init.zeros_(self.key.weight)
         nn.init.zeros_(self.key.bias)
 
-    def forward(self, laid: Tensor, lattice: Tensor, ways: Tensor | None = None) -> Tensor:
+    def forward(self, laid: Tensor, lattice: Tensor) -> Tensor:
         """Describe cells: features [N, cell, C].
 
         Convolutions are in float32 also under autocast: on CPUs the gradient of ``far`` in
@@ -68,15 +59,10 @@ class CellRefinement(nn.Module):
         Args:
             laid: What lies on the lattice [N, C, side, side].
             lattice: The lattice point of each cell [cell].
-            ways: Which ways lanes lead on the lattice, if that is known
-                [N, way, side, side].
         """
         place = self.place(self.centre_m).mT.view(1, -1, *laid.shape[2:])
         with full_precision(laid):
-            near = self.near(laid) + place.to(laid.dtype)
-            if self.lanes is not None and ways is not None:
-                near = near + self.lanes(ways)
-            near = functional.relu(near)
+            near = functional.relu(self.near(laid) + place.to(laid.dtype))
             seen = functional.relu(near + self.far(near))
         keys: Tensor = self.key(seen.flatten(2)[..., lattice].mT)
         return keys

@@ -124,7 +124,7 @@ def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_i
 FEATURES = (
     *("density_features", "standing_features", "removal_features"),
     *("approach_features", "offset_token", "latent_rates", "last_move_head"),
-    *("placement_features", "over_edge_head", "cell_lane_directions"),
+    *("placement_features", "over_edge_head"),
 )
 WIDTHS = (
     *("cell_refinement_width", "agent_spacing_width"),
@@ -147,7 +147,7 @@ def test_added_parts_may_be_missing_in_weights_to_begin_with(tmp_path):
 
     found, own = dict(network.named_parameters()), dict(plain.named_parameters())
     parts = tuple(network.added_parts())
-    assert len(parts) == 17
+    assert len(parts) == 16
     added = found.keys() - own.keys()
     assert added
     assert all(name.startswith(parts) for name in added)
