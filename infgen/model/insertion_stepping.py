@@ -118,11 +118,14 @@ class InsertionStepper:
             ),
             within=within,
             roads=roads,
+            ego=None,
             cell_features=None,
             spacing=self._no_spacing(rollouts, raw),
         )
         entries = self.entry_add(empty, token_step, rows)
-        return replace(entries, cell_features=self._cell_features(entries))
+        return replace(
+            entries, ego=self._ego(entries), cell_features=self._cell_features(entries)
+        )
 
     @torch.no_grad()
     def entry_add(
@@ -169,7 +172,8 @@ class InsertionStepper:
         occupied = cells.occupied(entries.active(entries.token_step.cell), agents.present)
         roads, cell_features = entries.around()
         average = entries.active(entries.average)
-        x = cells(occupied[:, None], roads, agents, average)[:, 0]
+        ego = None if entries.ego is None else entries.active(entries.ego)
+        x = cells(occupied[:, None], roads, agents, average, ego)[:, 0]
         each = torch.arange(len(x), device=x.device)
         rows, queries = Rows(each, each), x[:, None].float()
         with full_precision(x):
@@ -246,6 +250,15 @@ class InsertionStepper:
             said.offset_m,
             query if sampled else None,
         )
+
+    def _ego(self, entries: Insertions) -> Tensor | None:
+        """Describe every ego [rollout, D], if that is used."""
+        asking = self._asked()
+        if asking.cells.ego is None:
+            return None
+        turn = asking.cell_agents.relation.turn(entries.token_step.pose[:, EGO])
+        described: Tensor = asking.cells.ego(turned_back(entries.raw[:, EGO], turn))
+        return described
 
     def _cell_features(self, entries: Insertions) -> Tensor | None:
         """Describe the cells around every ego, before any inserted agent."""

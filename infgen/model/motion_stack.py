@@ -15,6 +15,7 @@ from infgen.model.attention.neighbour_attention import Shared
 from infgen.model.features.approach import ApproachFeatures, MovingPairs
 from infgen.model.features.clearance import Clearance
 from infgen.model.features.edge_clearance import EdgeClearance, EdgesNear
+from infgen.model.features.ego import EgoFeatures
 from infgen.model.features.last_move import LastMove, LastMoveHead
 from infgen.model.features.over_edge import OverEdgeHead
 from infgen.model.features.removal import EgoPlace, RemovalFeatures
@@ -27,6 +28,7 @@ from infgen.model.neighbours import MapFeatures, NeighbourRows, NeighbourSpec
 from infgen.model.relations import Rows, relation_embedding
 from infgen.model.rotary.turns import turned
 from infgen.model.settings import ModelSettings
+from infgen.tokens.scene_tokens import EGO
 from infgen.tokens.vocabulary import MotionVocabulary
 
 NUM_PATTERNS = 1 << CLOCK.steps_per_token
@@ -51,6 +53,7 @@ class AgentContext:
         added: Added to their features [N, D], if anything is: ``MotionStack.added``.
         density: Agents around the ego of each [N], if that is used.
         ego_place: Where they are to the ego [N], if that is used.
+        ego: What removal is told of the ego [N, D], if that is used.
     """
 
     past_relation: Shared
@@ -65,6 +68,7 @@ class AgentContext:
     added: Tensor | None
     density: Density | None
     ego_place: EgoPlace | None
+    ego: Tensor | None
 
 
 class MotionBlock(nn.Module):
@@ -118,6 +122,7 @@ class MotionStack(nn.Module):
             if leaves and settings.removal_features
             else None
         )
+        self.ego = EgoFeatures(width) if leaves and settings.ego_features else None
         patterns = settings.validity_pattern_tokens
         self.pattern = mlp(width, width, NUM_PATTERNS) if patterns else None
         ahead_m = settings.signal_ahead_m
@@ -179,6 +184,21 @@ class MotionStack(nn.Module):
             return None
         _, known = agents.moved()
         return LastMove.between(agents.before, agents.pose, known)
+
+    def ego_told(self, x_ND: Tensor, rows: Rows, visible: Tensor) -> Tensor | None:
+        """Tell removal what the ego of every agent does [N, D], if that is used.
+
+        Args:
+            x_ND: Embeddings of the agents.
+            rows: Their rows.
+            visible: All agents [..., agent] that are there.
+        """
+        if self.ego is None:
+            return None
+        number = rows.number[..., EGO].flatten()
+        there = visible[..., EGO].flatten()[:, None]
+        told: Tensor = self.ego(normed(x_ND)[number] * there)
+        return told[rows.at // visible.shape[-1]]
 
     def added(
         self,
@@ -245,6 +265,8 @@ class MotionStack(nn.Module):
             leaving = leaving + self.density(sight.density)
         if self.ego_place is not None and sight.ego_place is not None:
             leaving = leaving + self.ego_place(sight.ego_place)
+        if sight.ego is not None:
+            leaving = leaving + sight.ego
         return MotionOutputs(
             rows,
             self._moves(x_ND, agent_type, shapes, sight),

@@ -13,6 +13,7 @@ from infgen.model.device.index import BatchIndex
 from infgen.model.device.together import launched_together
 from infgen.model.features.anchors import AnchorHead
 from infgen.model.features.approach import ApproachFeatures
+from infgen.model.features.ego import EgoFeatures
 from infgen.model.features.last_move import LastMoveHead
 from infgen.model.features.over_edge import OverEdgeHead
 from infgen.model.features.removal import EgoPlace, RemovalFeatures
@@ -47,7 +48,8 @@ from infgen.tokens.scene_tokens import EGO, Presence
 from infgen.tokens.settings import TokenSettings
 from infgen.tokens.vocabulary import MapVocabulary, MotionVocabulary
 
-AgentFeatures = DensityFeatures | StandingFeatures | RemovalFeatures | ApproachFeatures
+SceneFeatures = DensityFeatures | EgoFeatures
+AgentFeatures = SceneFeatures | StandingFeatures | RemovalFeatures | ApproachFeatures
 MotionParts = AgentFeatures | AnchorHead | LastMoveHead | OverEdgeHead
 CellParts = CellRefinement | AgentSpacing
 DetailParts = OffsetEmbedding | OffsetFeatures | PlacementFeatures
@@ -226,6 +228,7 @@ class Network(nn.Module):
             self.motion.added(given.pose, moving, roads, of_row, token),
             None if density is None else density.take(rows.at // visible.shape[1]),
             _ego_place(agents, rows) if self.motion.ego_place is not None else None,
+            self.motion.ego_told(x, rows, agents.visible),
         )
         x = self.motion(x, past_index, sight)
         agent_type = rows.pack(agents.agent_type[:, None].expand(agents.visible.shape))

@@ -158,6 +158,7 @@ class Insertions:
         relation: How all rows stand to the ego [rollout, row, R].
         within: Which of them the ego's query sees [rollout, row].
         roads: Map tokens around the ego.
+        ego: What cell queries are told of the ego, if that is used [rollout, D].
         cell_features: Features of the cells around it, if they are used
             [rollout, cell, C].
         spacing: What the agents so far say of them, and of no cell, by the gaps between, if
@@ -178,6 +179,7 @@ class Insertions:
     relation: Tensor
     within: Tensor
     roads: AttentionSources
+    ego: Tensor | None
     cell_features: Tensor | None
     spacing: Tensor | None
     all_active: bool = True

@@ -111,7 +111,8 @@ class Stepper(InsertionStepper):
         memory.visible &= (token_step.presence != int(Presence.INSERTED))[..., None]
         standing = standing_after(memory.standing, *memory.last(), token_step)
         agents = agent_rows(*memory.last(), standing, token_step, rows)
-        x, sight = self._embed(agents), self._context(memory, token_step, rows, agents)
+        x = self._embed(agents)
+        sight = self._context(memory, token_step, rows, agents, x)
         x = x if sight.added is None else x + sight.added
         place = memory.columns % memory.window
         ring = torch.arange(memory.window, device=visible.device)
@@ -149,9 +150,14 @@ class Stepper(InsertionStepper):
         )
 
     def _context(
-        self, memory: StepMemory, token_step: TokenStep, rows: Rows, agents: AgentRows
+        self,
+        memory: StepMemory,
+        token_step: TokenStep,
+        rows: Rows,
+        agents: AgentRows,
+        x: Tensor,
     ) -> AgentContext:
-        """What the visible rows of a column see."""
+        """What the visible rows of a column see, whose embeddings are ``x``."""
         visible = token_step.visible
         around = find_others(self._agents_reach, rows, token_step.pose, visible)
         pose, rollout = agents.pose, rows.at // visible.shape[1]
@@ -195,4 +201,5 @@ class Stepper(InsertionStepper):
             added,
             density,
             ego_place,
+            self.network.motion.ego_told(x, rows, visible),
         )

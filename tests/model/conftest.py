@@ -72,6 +72,7 @@ VARIANTS = {
     "offset token": {"offset_token": True},
     "offset token, the paper's features": {"offset_token": True, "cell_feature_width": 0},
     "long memory": {"density_features": True, "standing_features": True},
+    "ego features": {"ego_features": True, "standing_features": True},
     "cell refinement": {"cell_refinement_width": 8},
     "agent spacing": {"agent_spacing_width": 4, "offset_token": True},
     "placement features": {"placement_features": True, "offset_token": True},

@@ -110,7 +110,7 @@ def batch(record, limits):
 def test_untrained_features_change_no_logit(tiny, new_network, batch):
     plain = new_network(tiny).eval()
     features = (
-        *("density_features", "standing_features"),
+        *("density_features", "ego_features", "standing_features"),
         *("removal_features", "approach_features", "latent_rates", "last_move_head"),
         "over_edge_head",
     )
@@ -128,15 +128,18 @@ def test_untrained_features_change_no_logit(tiny, new_network, batch):
 
     one, two = plain(batch), network(batch)
 
-    assert len(network.added_parts()) == 12
+    assert len(network.added_parts()) == 14
     assert torch.equal(one.motion.motion_logits, two.motion.motion_logits)
     assert torch.equal(one.motion.remove_logit, two.motion.remove_logit)
     assert torch.equal(one.entries.add_logit, two.entries.add_logit)
     assert torch.equal(one.entries.position_logits, two.entries.position_logits)
 
 
-def test_insertion_and_removal_see_density_and_motion_does_not(tiny, new_network, batch):
-    network = new_network(replace(tiny, density_features=True)).eval()
+@pytest.mark.parametrize("features", ["density_features", "ego_features"])
+def test_insertion_and_removal_see_the_scene_and_motion_does_not(
+    tiny, new_network, batch, features
+):
+    network = new_network(replace(tiny, **{features: True})).eval()
     before = network(batch)
     with torch.no_grad():
         for part in network.added_parts().values():

@@ -27,6 +27,7 @@ VARIANTS = {
     "offset token": {"offset_token": True, "cell_feature_width": 4},
     "patterns": {"validity_pattern_tokens": True},
     "rotary": {"relations": "rotary"},
+    "ego features": {"ego_features": True, "standing_features": True},
     "latent rates": {"latent_rates": True},
     "cell refinement": {"cell_feature_width": 4, "cell_refinement_width": 4},
     "agent spacing": {

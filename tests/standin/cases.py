@@ -284,6 +284,7 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {
             **FEATURES,
             "density_features": True,
+            "ego_features": True,
             "standing_features": True,
             "removal_features": True,
             "approach_features": True,

@@ -69,7 +69,11 @@ def insertion_outputs(
             asked.pack(ego_pose), CellSources.roads(roads, map_of), lying
         )
     average = None if density is None else asked.pack(density.average)
-    x = stack(occupied, map_seen, seen, average)
+    ego = None
+    if stack.ego is not None:
+        there = asked.pack(agents.visible[..., EGO])[:, None]
+        ego = stack.ego(raw[asked.pack(rows.number[..., EGO])] * there)
+    x = stack(occupied, map_seen, seen, average, ego)
     spaced = None
     if stack.spacing is not None:
         size_lw_m = agents.size_lwh_m[:, None, :, :2].expand(*agents.pose.shape[:3], 2)

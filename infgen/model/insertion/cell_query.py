@@ -8,6 +8,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from infgen.model.features.ego import EgoFeatures
 from infgen.model.insertion.agent_spacing import CellSpacing
 from infgen.model.insertion.cell_features import CellFeatures
 from infgen.model.insertion.query_block import QueryBlock
@@ -55,6 +56,7 @@ class CellStack(nn.Module):
         spaced = settings.agent_spacing_width if by_cell else 0
         self.spacing = CellSpacing(width, spaced, grid) if spaced else None
         self.density = DensityFeatures(width) if settings.density_features else None
+        self.ego = EgoFeatures(width) if settings.ego_features else None
 
     def map_reach(self) -> NeighbourSpec:
         """How the query sees roads."""
@@ -75,6 +77,7 @@ class CellStack(nn.Module):
         roads: AttentionSources,
         agents: AttentionSources,
         average: Tensor | None,
+        ego: Tensor | None,
     ) -> Tensor:
         """Answer queries: features [N, S, D].
 
@@ -84,12 +87,15 @@ class CellStack(nn.Module):
             agents: Agents around the ego; ``present`` differs by slot [N, S, K].
             average: Moving averages of their number before this token step
                 [N, constant], if that is used.
+            ego: What ``self.ego`` says of the ego [N, D], if it is used.
         """
         x = self.query.weight[0] + self.occupancy(occupied)
         if self.density is not None and average is not None:
             count = agents.present.sum(dim=-1).view(len(average), -1).to(average.dtype)
             before = average[:, None].expand(*count.shape, -1)
             x = x + self.density(Density(count, before))
+        if ego is not None:
+            x = x + ego[:, None]
         for block in self.blocks:
             x = block(x, roads, agents)
         return x

@@ -12,9 +12,10 @@ removes agents while the scene is simulated, and learns from the state that it g
   removals, so that in the mean the flow is that of the log. What cannot be corrected yet,
   fewer insertions where the log has none, say, is corrected later: else excess would be
   corrected mostly by more removals, and its lack by more insertions. To be inserted are
-  missing agents, those first that came into view last; to be removed are those whom the
-  log removes, and for those of them whom the network has removed before, surplus agents in
-  their place, sampled by how ready the network is to remove them.
+  missing agents, those first that came into view last, but none where another is
+  simulated: the network would learn to insert agents onto others. To be removed are
+  those whom the log removes, and for those of them whom the network has removed before,
+  surplus agents in their place, sampled by how ready the network is to remove them.
 - An insertion that the network makes is that of the next agent to be inserted, at its
   logged pose; or of one that it samples, and then nothing is learned of later turns.
 
@@ -29,6 +30,7 @@ ones move as the network samples, and teach no motion.
 import torch
 from torch import Tensor
 
+from infgen.geometry import boxes_overlap
 from infgen.model.batching.batch import Batch
 from infgen.model.batching.padding import NO_AGENT
 from infgen.model.batching.recovery import WHOLE_RECOVERY, Recovery
@@ -48,6 +50,7 @@ from infgen.model.training.simulation import (
     Simulation,
     first_rows,
 )
+from infgen.scene import AgentType
 from infgen.tokens.insertion import insertion_key
 from infgen.tokens.scene_tokens import EGO, NO_CELL
 
@@ -286,6 +289,7 @@ class _PopulationLoop(Simulation):
         missing &= cell != NO_CELL
         played.cell[:, token] = torch.where(missing, cell, played.cell[:, token])
         new = (missing & (presence == INSERTED)).sum(dim=1)
+        missing &= ~self._taken(token, missing)
         fewer = self._correction(
             Rate.INSERTION,
             self.asked[:, token],
@@ -305,6 +309,32 @@ class _PopulationLoop(Simulation):
         sorted_by = torch.from_numpy(key).to(pose).view(missing.shape)
         sorted_by = sorted_by.masked_fill(~missing, torch.inf)
         return sorted_by.argsort(dim=1, stable=True), number
+
+    def _taken(self, token: int, missing: Tensor) -> Tensor:
+        """Mark the missing agents whose logged boxes overlap those of simulated ones.
+
+        Pedestrians may overlap pedestrians, as in logs.
+        """
+        logged, played = self.logged, self.played
+        presence = played.presence[:, token]
+        there = played.observed[:, token] & (presence != ABSENT) & (presence != REMOVED)
+        scene, row = missing.nonzero(as_tuple=True)
+        place, other = there[scene].nonzero(as_tuple=True)
+        at, own, walks = scene[place], row[place], AgentType.PEDESTRIAN
+        boxes = (
+            logged.pose[at, token, own],
+            logged.size_lwh_m[at, own, :2],
+            played.pose[at, token, other],
+            played.size_lwh_m[at, other, :2],
+        )
+        overlaps = boxes_overlap(*(each.numpy(force=True) for each in boxes))
+        taken = torch.from_numpy(overlaps).to(missing.device)
+        taken &= (logged.agent_type[at, own] != walks) | (
+            played.agent_type[at, other] != walks
+        )
+        found = torch.zeros_like(missing)
+        found[at[taken], own[taken]] = True
+        return found
 
 
 def _first(values: Tensor, count: Tensor) -> Tensor:

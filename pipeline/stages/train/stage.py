@@ -225,7 +225,7 @@ def finish(
 
 STAGE = Stage(
     name="train",
-    version=22,
+    version=23,
     settings={"tokenize": TokenSettings, "model": ModelSettings, "train": TrainSettings},
     plan=plan,
     work=work,

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from infgen.config import TrainSettings
+from infgen.geometry import boxes_overlap
 from infgen.model.batching.batch import collate
 from infgen.model.batching.insertion_targets import OUTSIDE
 from infgen.model.batching.supervision import stay_mask
@@ -14,6 +15,7 @@ from infgen.model.training.closed_loop_population import (
     close_population_loop,
 )
 from infgen.model.training.losses import losses, total
+from infgen.scene import AgentType
 from infgen.tokens.grid import from_grid, make_grid
 from infgen.tokens.scene_tokens import NO_CELL, Presence
 
@@ -140,6 +142,34 @@ def test_insertions_to_learn_come_first_and_those_named_are_missing(logged, play
     assert torch.equal(
         entries.cell[scene, token, turn], played.agents.cell[scene, token, row]
     )
+
+
+def test_no_agent_of_the_log_is_inserted_onto_a_simulated_one(restless, record, limits):
+    lives = [(0, 11), *[(0, 4)] * 6, *[(3, 11)] * 6]
+    scene = record(3, tokens=12, lives=lives, spread_m=12.0)
+    logged = collate([scene] * 6, limits, 7)
+    rows = logged.agents.presence.shape[2]
+
+    agents = close_population_loop(restless, logged, 3, seed=2).agents
+
+    inserted = (agents.presence == int(Presence.INSERTED)) & (agents.turn >= 0)
+    inserted &= (agents.turn < OUTSIDE) & (torch.arange(inserted.shape[2]) < rows)
+    stays = agents.observed & (agents.presence == int(Presence.PRESENT))
+    scene, token, row = inserted.nonzero(as_tuple=True)
+    place, other = stays[scene, token].nonzero(as_tuple=True)
+    scene, token, row = scene[place], token[place], row[place]
+    overlaps = boxes_overlap(
+        agents.pose[scene, token, row].numpy(),
+        agents.size_lwh_m[scene, row, :2].numpy(),
+        agents.pose[scene, token, other].numpy(),
+        agents.size_lwh_m[scene, other, :2].numpy(),
+    )
+    walks = int(AgentType.PEDESTRIAN)
+    both_walk = (agents.agent_type[scene, row] == walks) & (
+        agents.agent_type[scene, other] == walks
+    )
+    assert len(place) > 100
+    assert not overlaps[~both_walk.numpy()].any()
 
 
 def test_a_network_that_inserts_nobody_is_to_insert_more_than_the_log_does(

@@ -122,7 +122,7 @@ def test_a_network_of_another_size_is_told_what_is_different_and_where_to_find_i
 
 
 FEATURES = (
-    *("density_features", "standing_features", "removal_features"),
+    *("density_features", "ego_features", "standing_features", "removal_features"),
     *("approach_features", "offset_token", "latent_rates", "last_move_head"),
     *("placement_features", "over_edge_head"),
 )
@@ -147,7 +147,7 @@ def test_added_parts_may_be_missing_in_weights_to_begin_with(tmp_path):
 
     found, own = dict(network.named_parameters()), dict(plain.named_parameters())
     parts = tuple(network.added_parts())
-    assert len(parts) == 16
+    assert len(parts) == 18
     added = found.keys() - own.keys()
     assert added
     assert all(name.startswith(parts) for name in added)
