@@ -121,8 +121,8 @@ class ModelSettings:
     vehicle that waits from one that is parked."""
     ego_features: Bool = False
     """Whether insertion and removal know what the ego did last, and, with
-    `standing_features`, for how long it has stood: where it stands, hardly an agent enters
-    or leaves."""
+    `standing_features`, for how long it has stood: where it stands, fewer agents enter and
+    leave, and others."""
     removal_features: Bool = False
     """Whether removal knows how far an agent is from the ego, in which direction, and
     whether it comes nearer: logs lose sight of agents at the edge of what the ego sees."""
