@@ -1,9 +1,10 @@
 """What the ego does, for insertion and removal.
 
-Where the ego stands, a third as many agents come into sight as where it drives, and other
-ones: ahead of an ego that drives come those that are slower. The query of insertion looks at the ego as
-at one of many agents around, and a removal at where an agent is to the ego. So both are
-told what the ego is and did last, and for how long it has stood, by its own embedding.
+Where the ego stands, a third as many agents come into sight as where it drives, and
+other ones: ahead of an ego that drives come those that are slower. The query of insertion
+looks at the ego as at one of many agents around, and a removal at where an agent is to the
+ego. So both are told what the ego is and did last, and for how long it has stood, by its
+own embedding.
 """
 
 from jaxtyping import Float
