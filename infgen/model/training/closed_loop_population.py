@@ -16,6 +16,8 @@ removes agents while the scene is simulated, and learns from the state that it g
   simulated: the network would learn to insert agents onto others. To be removed are
   those whom the log removes, and for those of them whom the network has removed before,
   surplus agents in their place, sampled by how ready the network is to remove them.
+  Excess is that within the radius of the grid. Of agents beyond it, where none can be
+  inserted, as many are to be removed as there are more than in the log.
 - An insertion that the network makes is that of the next agent to be inserted, at its
   logged pose; or of one that it samples, and then nothing is learned of later turns.
 
@@ -31,12 +33,12 @@ import torch
 from torch import Tensor
 
 from infgen.geometry import boxes_overlap
-from infgen.model.batching.batch import Batch
+from infgen.model.batching.batch import Agents, Batch
 from infgen.model.batching.padding import NO_AGENT
 from infgen.model.batching.recovery import WHOLE_RECOVERY, Recovery
 from infgen.model.latent_rates import Rate
-from infgen.model.long_memory import count_around
 from infgen.model.network import Network
+from infgen.model.relations import within_radius
 from infgen.model.sampling import choose
 from infgen.model.training.closed_loop import move_near_log
 from infgen.model.training.population_targets import targets
@@ -217,20 +219,28 @@ class _PopulationLoop(Simulation):
         found = self.cells(self.played.pose[:, token], token)
         cell[:, token] = torch.where(changed, found, cell[:, token])
 
-    def _excess(self, token: int, *, inserted: bool) -> Tensor:
+    def _near(self, agents: Agents, token: int) -> Tensor:
+        """Tell which agents are within the radius of the grid [scene, agent]."""
+        pose = agents.pose[:, token]
+        ego_pose = pose[:, EGO, None].expand_as(pose)
+        return within_radius(ego_pose, pose, self.network.grid.radius_m)
+
+    def _excess(self, token: int, *, inserted: bool, near: bool = True) -> Tensor:
         """Count simulated agents around the egos, less those of the log [scene].
 
         Args:
             token: Token step.
             inserted: Whether those who are inserted at it count.
+            near: Whether those within the radius of the grid count, or those beyond it.
         """
-        radius_m, counts = self.network.grid.radius_m, []
+        counts = []
         for agents in (self.played, self.logged):
-            presence, pose = agents.presence[:, token], agents.pose[:, token]
+            presence = agents.presence[:, token]
             stays = agents.visible[:, token] & (presence != REMOVED)
             if not inserted:
                 stays &= presence != INSERTED
-            counts.append(count_around(pose[:, EGO], pose, stays, radius_m))
+            stays &= self._near(agents, token) == near
+            counts.append(stays.sum(dim=1))
         return counts[0] - counts[1]
 
     def _correction(
@@ -263,20 +273,25 @@ class _PopulationLoop(Simulation):
         self.played.told[:, token] = told | (known & surplus)
         if logit is None:
             return
-        leaving = matched & removal
-        gone = (self.logged.removal[:, token] & told & ~matched).sum(dim=1)
+        near, logged_near = (
+            self._near(agents, token - 1) for agents in (self.played, self.logged)
+        )
+        leaving = matched & removal & near
+        gone = (self.logged.removal[:, token] & told & ~matched & logged_near).sum(dim=1)
         more = gone + self._correction(
             Rate.REMOVAL,
             known[:, 0],
             self._excess(token - 1, inserted=True),
             -gone - leaving.sum(dim=1),
-            surplus.sum(dim=1) - gone,
+            (surplus & near).sum(dim=1) - gone,
         )
         uniform = self.uniforms.draw(*logit.shape).clamp(min=LEAST_UNIFORM)
         # The first ones of these are a sample without replacement (Gumbel's trick).
         readiness = logit - (-uniform.log()).log().to(logit)
         removal &= ~(_first(-readiness.masked_fill(~leaving, torch.inf), -more) & leaving)
-        removal |= _first(readiness.masked_fill(~surplus, -torch.inf), more) & surplus
+        far = self._excess(token - 1, inserted=True, near=False) * known[:, 0]
+        for who, count in ((surplus & near, more), (surplus & ~near, far)):
+            removal |= _first(readiness.masked_fill(~who, -torch.inf), count) & who
 
     def _to_insert(self, token: int) -> tuple[Tensor, Tensor]:
         """Agents to insert [scene, agent] in the insertion order, and their number."""

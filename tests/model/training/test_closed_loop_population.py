@@ -59,6 +59,12 @@ def biased(network, *, add=None, remove=None):
     return network
 
 
+def far_from_ego(network, agents):
+    """Whether agents are beyond the radius of the grid [scene, token, agent]."""
+    away_m = (agents.pose[..., :2] - agents.pose[:, :, EGO, None, :2]).norm(dim=-1)
+    return away_m > network.grid.radius_m
+
+
 def test_agents_are_inserted_live_and_are_removed_in_this_order(played):
     presence = played.agents.presence
     before, after = presence[:, :-1], presence[:, 1:]
@@ -213,15 +219,40 @@ def test_a_network_that_inserts_always_is_to_remove_some_surplus_and_to_keep_the
     played = close_population_loop(network, logged, 3, 0)
 
     agents, rows = played.agents, logged.agents.presence.shape[2]
-    surplus = agents.observed[..., rows:] & logged.agents.told.any(dim=2, keepdim=True)
-    removal, told = agents.removal[..., rows:], agents.told[..., rows:]
-    known = logged.agents.told.any(dim=2, keepdim=True).expand_as(told)
-    assert torch.equal(told[surplus], known[surplus])
-    assert removal[surplus].any()
-    assert not removal[surplus].all()
+    removal, told = agents.removal[:, 1:, rows:], agents.told[:, 1:, rows:]
+    known = logged.agents.told[:, 1:].any(dim=2, keepdim=True).expand_as(told)
+    surplus = known & agents.visible[:, :-1, rows:] & agents.observed[:, 1:, rows:]
+    near = ~far_from_ego(network, agents)[:, :-1, rows:]
+    assert told[surplus].all()
+    assert removal[surplus & near].any()
+    assert not removal[surplus & near].all()
     mask = stay_mask(agents)
     assert not (mask[:, :-1] & ~agents.told[:, 1:]).any()
     assert not played.entries.add[:, 3:, 1:].any()
+
+
+def test_all_beyond_the_radius_are_to_be_removed_but_as_many_as_the_log_has_there(
+    new_network, record, limits
+):
+    network = biased(new_network().eval(), add=NEVER, remove=NEVER)
+    lives = [*[(0, 11)] * 12, *[(0, 3)] * 12]
+    logged = collate([record(3, tokens=12, lives=lives, spread_m=70.0)] * 2, limits, 7)
+    rows = logged.agents.presence.shape[2]
+
+    agents = close_population_loop(network, logged, 0, 0).agents
+
+    far = far_from_ego(network, agents)[:, :-1]
+    there = (agents.visible & (agents.presence != int(Presence.REMOVED)))[:, :-1]
+    logs = logged.agents.visible & (logged.agents.presence != int(Presence.REMOVED))
+    logs = (logs & far_from_ego(network, logged.agents))[:, :-1]
+    surplus = there & far
+    surplus[..., :rows] &= ~logged.agents.visible[:, 1:]
+    more = ((there & far).sum(dim=2) - logs.sum(dim=2)).clamp(min=0)
+    wanted = (agents.removal[:, 1:] & surplus).sum(dim=2)
+    assert logs.any()
+    assert logged.agents.told[:, 1:10].any(dim=2).all()
+    assert (more[:, 5:9] > 1).all()
+    assert torch.equal(wanted[:, 5:9], more[:, 5:9])
 
 
 @pytest.mark.parametrize("add", [None, NEVER, ALWAYS])
