@@ -37,7 +37,7 @@ format: $(INSTALLED)
 	$(BIN)/ruff format $(CODE)
 
 # Those that look at an experiment, or at checkouts, want to be told which; one is a part of another.
-OF_A_ROOT := $(addprefix benchmarks/,accelerations.py cells.py contacts.py conflicts.py creeping.py ego_standing.py expected_speeds.py rate_variation.py removals.py score_ratios.py setting_off.py traffic_drift.py towns_pictures.py tune_radius.py two_versions.py vehicle_flow.py census_steps.py)
+OF_A_ROOT := $(addprefix benchmarks/,accelerations.py cells.py contacts.py conflicts.py creeping.py ego_standing.py expected_speeds.py rate_variation.py removals.py score_ratios.py setting_off.py simulated_counts.py traffic_drift.py towns_pictures.py tune_radius.py two_versions.py vehicle_flow.py census_steps.py)
 
 bench: $(INSTALLED)
 	for script in $(filter-out $(OF_A_ROOT),$(wildcard benchmarks/*.py)); do \
