@@ -1,8 +1,8 @@
 """Do insertions and removals keep as many agents as there are in logs?
 
 Logs are simulated with the insertions and removals of some weights, while agents of the log
-move as they did, as in closed loop of insertion and removal. That takes seconds where
-rollouts take minutes, and shows the numbers of agents alone::
+move as they did, as in closed loop of insertion and removal. So it shows what these two
+make of the number of agents, whatever agents do, in a few seconds a log::
 
     python benchmarks/simulated_counts.py ROOT [--weights ROOT/latest/train]
         [--split validation] [--scenes 80]
