@@ -9,8 +9,8 @@ make of the number of agents, whatever agents do, in a few seconds a log::
 
 The table has, for each quarter of the logs, means over its token steps: agents within the
 radius of the grid around the ego, and beyond it; agents inserted and removed; in logs and
-simulated. Latent rates vary as in rollouts, half as much as was learned. The last line is
-one JSON object.
+simulated. Agents are inserted as the weights sample them, and latent rates vary as in
+rollouts, half as much as was learned. The last line is one JSON object.
 """
 
 from collections.abc import Sequence
@@ -33,6 +33,7 @@ from pipeline.commands.screen import show_table
 QUARTERS = 4
 FIGURES = ("agents within the radius", "agents beyond it", "inserted", "removed")
 RATE_SCALE = 0.5
+OWN_SHARE = 1.0
 
 
 def look(
@@ -43,7 +44,9 @@ def look(
     if network.cells is None:
         raise SystemExit("these weights insert and remove no agent; see --weights")
     network.eval()
-    simulated = close_population_loop(network, logged, 0, next(seeds), RATE_SCALE)
+    simulated = close_population_loop(
+        network, logged, 0, next(seeds), RATE_SCALE, own_share=OWN_SHARE
+    )
     radius_m = network.grid.radius_m
     found = [figures(batch.agents, radius_m) for batch in (logged, simulated)]
     return torch.stack(found, dim=1).numpy()

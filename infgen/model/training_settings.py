@@ -155,6 +155,10 @@ class TrainSettings:
     """Scenes are simulated with the insertions and removals of the network before they are
     learned from, and it learns to correct their number. Agents that the log has too move as
     `closed_loop_top_k` says, or as logged."""
+    own_insertion_share: Share = 0.0
+    """Share of the insertions that are to be made, in closed loop of insertion and removal,
+    in which an agent is inserted as the network samples it, as in rollouts; in the others
+    an agent of the log is, at its logged pose."""
     latent_rate_scale: NonNegative = 1.0
     """Latent rates (`model.latent_rates`) vary so much beside what has been learned, in the
     loss and in what the network simulates to learn from: where weights are to be simulated

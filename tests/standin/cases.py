@@ -294,7 +294,11 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
             "over_edge_head": True,
             "latent_rates": True,
         },
-        {"motion_noise_neighbours": 5, "closed_loop_population": True},
+        {
+            "motion_noise_neighbours": 5,
+            "closed_loop_population": True,
+            "own_insertion_share": 0.5,
+        },
     ),
     "offset-token": (
         {

@@ -19,7 +19,9 @@ removes agents while the scene is simulated, and learns from the state that it g
   Excess is that within the radius of the grid. Of agents beyond it, where none can be
   inserted, as many are to be removed as there are more than in the log.
 - An insertion that the network makes is that of the next agent to be inserted, at its
-  logged pose; or of one that it samples, and then nothing is learned of later turns.
+  logged pose. If none is to be inserted it is of one that it samples, and then nothing is
+  learned of later turns. In a share of all insertions it samples in any case: agents that
+  it inserts in rollouts leave sooner than those of logs, so more have to be inserted.
 
 To remove all surplus and to insert all missing agents at once, the obvious targets, would
 teach several times the flow of the log: it cannot be seen who is surplus, so all agents
@@ -73,6 +75,7 @@ def close_population_loop(
     seed: int,
     latent_rate_scale: float = 1.0,
     recovery: Recovery = WHOLE_RECOVERY,
+    own_share: float = 0.0,
 ) -> Batch:
     """Simulate a batch with the insertions and removals of the network itself.
 
@@ -84,6 +87,8 @@ def close_population_loop(
         seed: Of everything that is sampled.
         latent_rate_scale: Latent rates vary so much, beside what the network has learned.
         recovery: How much of a deviation is made good in a token step.
+        own_share: Share of the insertions to learn that are simulated as the network
+            samples them, not as logged.
 
     Returns:
         The batch to learn from; it has more rows of agents.
@@ -98,7 +103,9 @@ def close_population_loop(
         )
     learning = network.training
     try:
-        simulation = _PopulationLoop(network, batch, top, seed, latent_rate_scale, recovery)
+        simulation = _PopulationLoop(
+            network, batch, top, seed, latent_rate_scale, recovery, own_share
+        )
         for token in range(1, simulation.logged.pose.shape[1]):
             simulation.rates.advance(token)
             simulation.move(token)
@@ -118,6 +125,7 @@ class _PopulationLoop(Simulation):
     Attributes:
         top: Most likely motion tokens that are chosen from; 0 to follow the batch.
         recovery: How much of a deviation is made good in a token step.
+        own_share: Share of the insertions to learn that are as the network samples them.
         off: Whether agents are not as logged [scene, token, agent].
         fresh_until: Last token step at which each agent is fresh [scene, agent].
         used: Rows in use [scene].
@@ -125,10 +133,12 @@ class _PopulationLoop(Simulation):
             fewer insertions, more removals [scene, 2].
         missing: Who is missing at this token step, in the order of insertion ...
         number: ... and how many of them are to be inserted [scene].
+        wanted: Whether an agent is to be inserted at this turn [scene].
     """
 
     missing: Tensor
     number: Tensor
+    wanted: Tensor
 
     def __init__(
         self,
@@ -138,6 +148,7 @@ class _PopulationLoop(Simulation):
         seed: int,
         latent_rate_scale: float,
         recovery: Recovery,
+        own_share: float,
     ) -> None:
         """Begin with the first token step as logged."""
         super().__init__(network, batch, seed, latent_rate_scale)
@@ -146,6 +157,7 @@ class _PopulationLoop(Simulation):
         fresh_until = torch.where(born > 0, born + FRESH_TOKENS, -1)
         self.top = min(top, self.ends.pose.shape[1])
         self.recovery = recovery
+        self.own_share = own_share
         self.off = torch.zeros_like(visible)
         self.fresh_until = torch.where(visible.any(dim=1), fresh_until, -1)
         rows = batch.agents.presence.shape[2]
@@ -191,17 +203,26 @@ class _PopulationLoop(Simulation):
         fresh = left & (self.fresh_until[active, following] >= token)
         self.turns.add[active, token, turn] = left
         self.turns.agent[active, token, turn] = torch.where(fresh, following, NO_AGENT)
+        self.wanted = torch.zeros_like(self.used, dtype=torch.bool)
+        self.wanted[active] = left
         used = self.used[active]
-        room = left | (used < self.played.presence.shape[2])
-        return NextInsertions(torch.where(left, following, used), left, room)
+        free = used < self.played.presence.shape[2]
+        logged = left & ~self._samples_own(active, free)
+        return NextInsertions(torch.where(logged, following, used), logged, logged | free)
 
     def is_inserted(self, token: int, turn: int, at: tuple[Tensor, Tensor]) -> None:
         """Count the rows in use; agents that the log does not have are not as logged."""
         scene, row = at
         surplus = row == self.used[scene]
-        self.turns.count[scene, token] += (~surplus).long()
+        self.turns.count[scene, token] += self.wanted[scene].long()
         self.off[scene[surplus], token, row[surplus]] = True
         self.used[scene] += surplus.long()
+
+    def _samples_own(self, active: Tensor, free: Tensor) -> Tensor:
+        """Draw in which scenes the network samples an agent in place of a logged one."""
+        if not self.own_share:
+            return torch.zeros_like(free)
+        return free & (self.uniforms.draw(len(active)) < self.own_share)
 
     def _move_freely(self, token: int, who: Tensor, logits: Tensor) -> None:
         """Move agents without a counterpart in the log as the network samples."""

@@ -112,8 +112,10 @@ def _near_log(
     """Simulate a batch near to its log for closed-loop fine-tuning."""
     top, recovery = settings.closed_loop_top_k, Recovery.of(settings)
     if settings.closed_loop_population:
-        scale = settings.latent_rate_scale
-        simulated = close_population_loop(network, here.batch, top, seed, scale, recovery)
+        scale, own = settings.latent_rate_scale, settings.own_insertion_share
+        simulated = close_population_loop(
+            network, here.batch, top, seed, scale, recovery, own
+        )
         return IndexedBatch(simulated, None, None)  # Others are there than in the log.
     if not top:
         return here

@@ -131,6 +131,28 @@ def test_each_insertion_has_its_turn_and_its_place(logged, played, grid_settings
     assert abs(away_m).max() < 1.5 * grid.step_m
 
 
+def test_agents_are_inserted_as_the_network_samples_them_if_the_settings_say_so(
+    restless, logged
+):
+    rows = logged.agents.presence.shape[2]
+
+    played = close_population_loop(restless, logged, 3, seed=5, own_share=1.0)
+
+    agents, entries = played.agents, played.entries
+    inside = (agents.presence == int(Presence.INSERTED)) & (agents.turn >= 0)
+    inside &= (agents.turn < OUTSIDE) & entries.asked[..., None]
+    assert inside[..., rows:].any()
+    assert not inside[..., :rows].any()
+    slot = torch.arange(entries.add.shape[2])
+    assert entries.count.any()
+    assert entries.add[(slot < entries.count[..., None]) & entries.asked[..., None]].all()
+    assert torch.equal(
+        entries.count[entries.asked].clamp(max=1),
+        (inside.any(dim=2) & entries.add[..., 0])[entries.asked].long(),
+    )
+    assert (entries.agent >= 0).any()
+
+
 def test_insertions_to_learn_come_first_and_those_named_are_missing(logged, played):
     entries, agents = played.entries, logged.agents
     slot = torch.arange(entries.add.shape[2])
