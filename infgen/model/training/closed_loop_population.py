@@ -133,12 +133,10 @@ class _PopulationLoop(Simulation):
             fewer insertions, more removals [scene, 2].
         missing: Who is missing at this token step, in the order of insertion ...
         number: ... and how many of them are to be inserted [scene].
-        wanted: Whether an agent is to be inserted at this turn [scene].
     """
 
     missing: Tensor
     number: Tensor
-    wanted: Tensor
 
     def __init__(
         self,
@@ -203,8 +201,6 @@ class _PopulationLoop(Simulation):
         fresh = left & (self.fresh_until[active, following] >= token)
         self.turns.add[active, token, turn] = left
         self.turns.agent[active, token, turn] = torch.where(fresh, following, NO_AGENT)
-        self.wanted = torch.zeros_like(self.used, dtype=torch.bool)
-        self.wanted[active] = left
         used = self.used[active]
         free = used < self.played.presence.shape[2]
         logged = left & ~self._samples_own(active, free)
@@ -214,7 +210,7 @@ class _PopulationLoop(Simulation):
         """Count the rows in use; agents that the log does not have are not as logged."""
         scene, row = at
         surplus = row == self.used[scene]
-        self.turns.count[scene, token] += self.wanted[scene].long()
+        self.turns.count[scene, token] += self.turns.add[scene, token, turn].long()
         self.off[scene[surplus], token, row[surplus]] = True
         self.used[scene] += surplus.long()
 
