@@ -19,6 +19,7 @@ from itertools import count
 
 import numpy as np
 import torch
+from ego_standing import RATE_SCALE
 from jaxtyping import Float64
 from logged_scenes import sum_over_logs, whole
 from torch import Tensor
@@ -32,8 +33,8 @@ from pipeline.commands.screen import show_table
 
 QUARTERS = 4
 FIGURES = ("agents within the radius", "agents beyond it", "inserted", "removed")
-RATE_SCALE = 0.5
 OWN_SHARE = 1.0
+"""Share of insertions as the weights sample them (``train.own_insertion_share``)."""
 
 
 def look(

@@ -20,8 +20,8 @@ removes agents while the scene is simulated, and learns from the state that it g
   inserted, as many are to be removed as there are more than in the log.
 - An insertion that the network makes is that of the next agent to be inserted, at its
   logged pose. If none is to be inserted it is of one that it samples, and then nothing is
-  learned of later turns. In a share of all insertions it samples in any case: agents that
-  it inserts in rollouts leave sooner than those of logs, so more have to be inserted.
+  learned of later turns. In a share of all insertions it samples in any case, as in
+  rollouts, where as many insertions keep fewer agents than at logged poses.
 
 To remove all surplus and to insert all missing agents at once, the obvious targets, would
 teach several times the flow of the log: it cannot be seen who is surplus, so all agents
