@@ -209,7 +209,13 @@ def test_a_dry_run_plans_policy_gradient_from_the_weights_of_the_package(desk, c
     assert code == 0
     runs = json.loads(capsys.readouterr().out)["runs"]
     notes = {run["run"].split(",")[0]: run["note"] for run in runs}
-    assert notes == {"infgen": "", "catk": "after smart", "smart": ""}
+    assert notes == {
+        "infgen": "after closed-loop",
+        "closed-loop": "after insertion-and-removal",
+        "insertion-and-removal": "",
+        "catk": "after smart",
+        "smart": "",
+    }
 
 
 def test_a_failing_arm_is_named_beside_those_that_are_there_and_the_exit_code_is_1(

@@ -301,9 +301,11 @@ def test_the_packaged_presets_compare_all_methods_of_the_paper_and_all_ablations
             assert radius == (arm.published != "InfGen")
         assert preset.arms["catk"].starts_from == "smart"
     tuned = file.preset("womd-mini-fine-tuned")
-    for arm, steps in (("package", 0), ("infgen", 20)):
+    for arm, steps in (("package", 0), ("insertion-and-removal", 160)):
         words = tuned.arms[arm].rollout_sets["long"].words
         assert {"train.initial_weights=builtin", f"train.steps={steps}"} <= set(words)
+    assert tuned.arms["closed-loop"].starts_from == "insertion-and-removal"
+    assert tuned.arms["infgen"].starts_from == "closed-loop"
     assert file.preset("womd-mini").towns == tuned.towns == {}
     towns = file.preset("towns-benchmark").towns
     assert {split: each.seconds for split, each in towns.items()} == {
